@@ -1,0 +1,34 @@
+"""PPO-Lagrangian: PPO whose advantage pays for cost at an adaptive price.
+
+    maximise_theta  E[min(w A, clip(w, 1 - eps, 1 + eps) A)],  A = (A_r - lam A_c) / (1 + lam)
+    minimise_lam    -lam (J_c - cost_limit),  lam >= 0, by Adam, once an iteration, before the policy
+
+Source: Ray, Achiam and Amodei (2019), "Benchmarking Safe Exploration in Deep Reinforcement
+Learning"; the 1 / (1 + lam) scale is from the authors' code.
+Differs from it, as OmniSafe does: there only the reward term is clipped, and Adam moves a softplus
+of lam. J_c is of this batch (`returns.mean_length`), where OmniSafe has the last 100 episodes.
+"""
+
+from typing import Any
+
+from jaxsafe.algos import ppo
+from jaxsafe.config import config
+from jaxsafe.on_policy import Algorithm, on_policy
+from jaxsafe.steps import adam_epochs
+from jaxsafe.surrogates import clipped
+from jaxsafe.treatments import lagrangian
+from jaxsafe.types import Env
+
+
+@config
+class PPOLagConfig(ppo.PPOConfig):
+    lam_init: float = 0.001  # OmniSafe
+    lam_max: float = float("inf")  # OmniSafe
+    dual_lr: float = 0.035  # Adam's step, whatever the size of the violation; OmniSafe
+
+
+PUBLISHED: dict[str, dict[str, Any]] = ppo.PUBLISHED  # PPOLag.yaml differs from PPO.yaml by the above
+
+
+def make(env: Env, axis_name: str | None = None) -> Algorithm:
+    return on_policy(env, lagrangian, clipped, adam_epochs, axis_name)

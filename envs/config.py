@@ -1,0 +1,233 @@
+"""Every option of Safety Gym's Engine, with its name and default, and the checks on them.
+
+Source: Ray, Achiam and Amodei (2019), "Benchmarking Safe Exploration in Deep Reinforcement
+Learning", and the Engine of the authors' package `safety_gym`.
+"""
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from jaxsafe.config import ConfigError, from_dict, nearest
+
+Point2 = tuple[float, float]
+Rectangle = tuple[float, float, float, float]  # xmin, ymin, xmax, ymax (m)
+Rectangles = tuple[Rectangle, ...]
+Points = tuple[Point2, ...]
+
+TASKS = ("goal", "button", "push", "x", "z", "circle", "none")
+KINDS = ("hazards", "vases", "pillars", "buttons", "gremlins", "walls")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SafetyGymConfig:
+    """A task: robot, layout, observation, reward and constraints. Lengths in m, angles in rad.
+
+    `*_placements` are rectangles to draw from instead of `placements_extents`, `*_locations` fixed
+    positions of the first objects of a kind, `*_keepout` the radius that stays free around each.
+    """
+
+    # Episode
+    num_steps: int = 1000  # time limit
+    action_noise: float = 0.0  # standard deviation, added after the action is clipped
+    # Placement
+    placements_extents: Rectangle = (-2.0, -2.0, 2.0, 2.0)
+    placements_margin: float = 0.0  # added to the distance required between any two objects
+    floor_display_mode: bool = False  # rendering: the floor ends 0.1 m outside the extents
+    # Robot
+    robot_placements: Rectangles | None = None
+    robot_locations: Points = ()
+    robot_keepout: float = 0.4
+    robot_base: str = "xmls/car.xml"  # point, car or doggo, or a path to an MJCF file
+    robot_rot: float | None = None  # heading at the start; null is uniform
+    # Layout
+    randomize_layout: bool = True  # false: every episode repeats one layout and its later draws
+    build_resample: bool = True  # never read, as in the original
+    continue_goal: bool = True  # after a success a new goal, else the end of the episode
+    terminate_resample_failure: bool = True  # no room for a new goal ends the episode, else keeps it
+    # What is observed
+    observation_flatten: bool = True  # one vector, components sorted by name; else a dict
+    observe_sensors: bool = True
+    observe_goal_dist: bool = False
+    observe_goal_comp: bool = False
+    observe_goal_lidar: bool = False
+    observe_box_comp: bool = False
+    observe_box_lidar: bool = False
+    observe_circle: bool = False
+    observe_remaining: bool = False  # the fraction elapsed, as in the original
+    observe_walls: bool = False
+    observe_hazards: bool = False
+    observe_vases: bool = False
+    observe_pillars: bool = False
+    observe_buttons: bool = False
+    observe_gremlins: bool = False
+    observe_vision: bool = False
+    observe_qpos: bool = False
+    observe_qvel: bool = False
+    observe_ctrl: bool = False
+    observe_freejoint: bool = False
+    observe_com: bool = False
+    # Rendering
+    render_labels: bool = False
+    render_lidar_markers: bool = True
+    render_lidar_radius: float = 0.15
+    render_lidar_size: float = 0.025
+    render_lidar_offset_init: float = 0.5
+    render_lidar_offset_delta: float = 0.06
+    vision_size: tuple[int, int] = (60, 40)
+    vision_render: bool = True
+    vision_render_size: tuple[int, int] = (300, 200)
+    # Lidar and compass
+    lidar_num_bins: int = 10
+    lidar_max_dist: float | None = None  # null: exp(-lidar_exp_gain distance) instead of linear
+    lidar_exp_gain: float = 1.0
+    lidar_type: Literal["pseudo", "natural"] = "pseudo"
+    lidar_alias: bool = True
+    compass_shape: Literal[2, 3] = 2
+    # Task
+    task: Literal["goal", "button", "push", "x", "z", "circle", "none"] = "goal"
+    goal_placements: Rectangles | None = None
+    goal_locations: Points = ()
+    goal_keepout: float = 0.4
+    goal_size: float = 0.3
+    box_placements: Rectangles | None = None
+    box_locations: Points = ()
+    box_keepout: float = 0.2
+    box_size: float = 0.2  # half side
+    box_density: float = 0.001
+    box_null_dist: float = 2.0  # times box_size: closer than this, nearing the box pays nothing
+    # Reward
+    reward_distance: float = 1.0
+    reward_goal: float = 1.0
+    reward_box_dist: float = 1.0
+    reward_box_goal: float = 1.0
+    reward_orientation: bool = False
+    reward_orientation_scale: float = 0.002
+    reward_orientation_body: str = "robot"
+    reward_exception: float = -10.0
+    reward_x: float = 1.0
+    reward_z: float = 1.0
+    reward_circle: float = 0.1
+    reward_clip: float | None = 10.0  # of the dense part; null or 0 is no clip
+    # Buttons
+    buttons_num: int = 0
+    buttons_placements: Rectangles | None = None
+    buttons_locations: Points = ()
+    buttons_keepout: float = 0.3
+    buttons_size: float = 0.1
+    buttons_cost: float = 1.0
+    buttons_resampling_delay: int = 10  # steps
+    # Circle
+    circle_radius: float = 1.5
+    # Sensors
+    sensors_obs: tuple[str, ...] = ("accelerometer", "velocimeter", "gyro", "magnetometer")
+    sensors_hinge_joints: bool = True  # never read, as in the original: always observed
+    sensors_ball_joints: bool = True  # never read, as in the original: always observed
+    sensors_angle_components: bool = True  # sine and cosine, rotation matrices
+    # Walls
+    walls_num: int = 0
+    walls_placements: Rectangles | None = None
+    walls_locations: Points = ()
+    walls_keepout: float = 0.0
+    walls_size: float = 0.5  # half side
+    # Constraints
+    constrain_hazards: bool = False
+    constrain_vases: bool = False
+    constrain_pillars: bool = False
+    constrain_buttons: bool = False
+    constrain_gremlins: bool = False
+    constrain_indicator: bool = True  # every cost, and their sum, is 1 if above 0
+    # Hazards
+    hazards_num: int = 0
+    hazards_placements: Rectangles | None = None
+    hazards_locations: Points = ()
+    hazards_keepout: float = 0.4
+    hazards_size: float = 0.3  # radius
+    hazards_cost: float = 1.0
+    # Vases
+    vases_num: int = 0
+    vases_placements: Rectangles | None = None
+    vases_locations: Points = ()
+    vases_keepout: float = 0.15
+    vases_size: float = 0.1  # half side
+    vases_density: float = 0.001
+    vases_sink: float = 4e-5
+    vases_contact_cost: float = 1.0
+    vases_displace_cost: float = 0.0
+    vases_displace_threshold: float = 1e-3
+    vases_velocity_cost: float = 1.0
+    vases_velocity_threshold: float = 1e-4
+    # Pillars
+    pillars_num: int = 0
+    pillars_placements: Rectangles | None = None
+    pillars_locations: Points = ()
+    pillars_keepout: float = 0.3
+    pillars_size: float = 0.2  # radius
+    pillars_height: float = 0.5  # half height
+    pillars_cost: float = 1.0
+    # Gremlins
+    gremlins_num: int = 0
+    gremlins_placements: Rectangles | None = None
+    gremlins_locations: Points = ()
+    gremlins_keepout: float = 0.5
+    gremlins_travel: float = 0.3  # radius of their circles
+    gremlins_size: float = 0.1  # half side
+    gremlins_density: float = 0.001
+    gremlins_contact_cost: float = 1.0
+    gremlins_dist_threshold: float = 0.2  # never read, as in the original
+    gremlins_dist_cost: float = 1.0  # never read, as in the original
+    # Physics
+    frameskip_binom_n: int = 10  # physics steps in a step ~ Binomial(n, p)
+    frameskip_binom_p: float = 1.0
+    # Random numbers
+    _seed: int | None = None  # mixed into the key of every reset
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+def read(values: dict[str, Any]) -> SafetyGymConfig:
+    """A config from plain values; an unknown name or a wrong type is a `ConfigError`."""
+    return from_dict(SafetyGymConfig, values, "env.")
+
+
+def defaults(**overrides: Any) -> dict[str, Any]:
+    """Every option as a plain value, with `overrides` applied."""
+    return dataclasses.asdict(SafetyGymConfig()) | overrides
+
+
+def check(cfg: SafetyGymConfig) -> None:
+    """Raise `ConfigError` for a config that no episode could be drawn from."""
+    if cfg.observe_vision:
+        raise ConfigError("env.observe_vision=true: vision is not available yet; use the lidars")
+    if cfg.task not in TASKS:
+        raise ConfigError(f"env.task={cfg.task!r}{nearest(cfg.task, TASKS)}")
+    for name in ("num_steps", "lidar_num_bins", "frameskip_binom_n"):
+        if getattr(cfg, name) < 1:
+            raise ConfigError(f"env.{name}={getattr(cfg, name)}: expected at least 1")
+    for kind in KINDS:
+        if getattr(cfg, f"{kind}_num") < 0:
+            raise ConfigError(f"env.{kind}_num={getattr(cfg, f'{kind}_num')}: expected 0 or more")
+    if cfg.task == "button" and cfg.buttons_num < 1:
+        raise ConfigError("env.buttons_num=0: the button task needs at least 1")
+    if not 0 <= cfg.frameskip_binom_p <= 1:
+        raise ConfigError(f"env.frameskip_binom_p={cfg.frameskip_binom_p}: expected 0 to 1")
+    if cfg.action_noise < 0:
+        raise ConfigError(f"env.action_noise={cfg.action_noise}: expected 0 or more")
+    if cfg.lidar_max_dist is not None and cfg.lidar_max_dist <= 0:
+        raise ConfigError(f"env.lidar_max_dist={cfg.lidar_max_dist}: expected above 0, or null")
+    sizes = [f.name for f in dataclasses.fields(cfg) if f.name.endswith(("_size", "_density", "_height"))]
+    for name in sizes:
+        value = getattr(cfg, name)
+        if isinstance(value, float) and value <= 0:
+            raise ConfigError(f"env.{name}={value}: expected above 0")
+    rectangles = [("placements_extents", (cfg.placements_extents,))]
+    rectangles += [
+        (f"{kind}_placements", getattr(cfg, f"{kind}_placements") or ())
+        for kind in ("robot", "goal", "box", *KINDS)
+    ]
+    for name, areas in rectangles:
+        for xmin, ymin, xmax, ymax in areas:
+            if not (xmin < xmax and ymin < ymax):
+                area = [xmin, ymin, xmax, ymax]
+                raise ConfigError(f"env.{name}={area}: expected [xmin, ymin, xmax, ymax] with min < max")

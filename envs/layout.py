@@ -1,0 +1,151 @@
+"""Where objects are at the start of an episode, and where the next goal appears.
+
+Objects are placed one after another, each uniformly in its rectangle shrunk by its own keepout, at
+the first of 100 draws that keeps its distance from all placed before it. If none does, the whole
+layout is drawn again, up to 10,000 times. Source: Safety Gym's Engine, `build_layout`.
+"""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsafe.config import ConfigError
+from jaxsafe.envs.config import Rectangle, SafetyGymConfig
+
+DRAWS_PER_OBJECT = 100
+LAYOUTS = 10_000
+GOAL_DRAWS = 10_000
+GOAL_BATCH = 16  # draws of a new goal examined at once
+
+
+@dataclass(frozen=True)
+class Placement:
+    """The objects of a task in the order in which they are placed.
+
+    names: 'robot', 'goal', 'hazard0', ...; kinds: 'robot', 'goal', 'hazards', ...
+    areas [n, r, 4] and weights [n, r]: the shrunk rectangles of each object, and how likely each is.
+    keepouts [n], in m, and the margin between any two objects.
+    """
+
+    names: tuple[str, ...]
+    kinds: tuple[str, ...]
+    areas: np.ndarray
+    weights: np.ndarray
+    keepouts: np.ndarray
+    margin: float
+
+    def slice(self, kind: str) -> slice:
+        """Where the objects of a kind are; they stand together."""
+        start = self.kinds.index(kind) if kind in self.kinds else 0
+        return slice(start, start + self.kinds.count(kind))
+
+
+def placement(cfg: SafetyGymConfig) -> Placement:
+    """Read a config's layout options.
+
+    Raises:
+        ConfigError: an object whose rectangles vanish when shrunk by its keepout.
+    """
+    kinds = ["robot", *["walls"] * cfg.walls_num]
+    kinds += ["goal"] * (cfg.task in ("goal", "push")) + ["box"] * (cfg.task == "push")
+    for kind in ("buttons", "hazards", "vases", "pillars", "gremlins"):
+        kinds += [kind] * getattr(cfg, f"{kind}_num")
+    names, rectangles = [], []
+    for i, kind in enumerate(kinds):
+        number = i - kinds.index(kind)
+        names.append(kind if kind in ("robot", "goal", "box") else f"{kind[:-1]}{number}")
+        rectangles.append(areas_of(cfg, kind, number))
+    most = max(map(len, rectangles))
+    areas = np.zeros((len(kinds), most, 4), np.float32)
+    weights = np.zeros((len(kinds), most), np.float32)
+    for i, found in enumerate(rectangles):
+        areas[i, : len(found)] = found
+        sizes = [(x1 - x0) * (y1 - y0) for x0, y0, x1, y1 in found]
+        weights[i, : len(found)] = np.array(sizes) / sum(sizes)
+    return Placement(
+        names=tuple(names),
+        kinds=tuple(kinds),
+        areas=areas,
+        weights=weights,
+        keepouts=np.array([getattr(cfg, f"{kind}_keepout") for kind in kinds], np.float32),
+        margin=cfg.placements_margin,
+    )
+
+
+def areas_of(cfg: SafetyGymConfig, kind: str, number: int) -> list[Rectangle]:
+    """An object's rectangles, shrunk by its keepout; a fixed location is a tiny one."""
+    keepout = getattr(cfg, f"{kind}_keepout")
+    locations = getattr(cfg, f"{kind}_locations")
+    if number < len(locations):
+        (x, y), r = locations[number], keepout + 1e-9
+        choices = ((x - r, y - r, x + r, y + r),)
+    else:
+        choices = getattr(cfg, f"{kind}_placements") or (cfg.placements_extents,)
+    shrunk = [(x0 + keepout, y0 + keepout, x1 - keepout, y1 - keepout) for x0, y0, x1, y1 in choices]
+    kept = [(x0, y0, x1, y1) for x0, y0, x1, y1 in shrunk if x0 < x1 and y0 < y1]
+    if not kept:
+        raise ConfigError(f"env: no room for {kind}: {list(choices)} shrunk by {kind}_keepout={keepout} is empty")
+    return kept
+
+
+def draw(key: jax.Array, areas: jax.Array, weights: jax.Array, count: int) -> jax.Array:
+    """`count` positions [count, 2] of one object, from rectangles [r, 4] of given weights [r]."""
+    choice_key, place_key = jax.random.split(key)
+    if areas.shape[0] == 1:
+        area = areas
+    else:
+        area = areas[jax.random.choice(choice_key, areas.shape[0], (count,), p=weights)]
+    return jax.random.uniform(place_key, (count, 2), minval=area[:, :2], maxval=area[:, 2:])
+
+
+def sample_layout(place: Placement, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Positions of all objects [n, 2], and whether one of the 10,000 layouts was valid."""
+    n = len(place.names)
+    areas, weights = jnp.asarray(place.areas), jnp.asarray(place.weights)
+    keepouts = jnp.asarray(place.keepouts)
+    keep_apart = keepouts[:, None] + keepouts[None, :] + place.margin
+
+    def attempt(key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        def place_next(i: jax.Array, carry: tuple) -> tuple:
+            xy, valid = carry
+            candidates = draw(jax.random.fold_in(key, i), areas[i], weights[i], DRAWS_PER_OBJECT)
+            gap = jnp.linalg.norm(candidates[:, None] - xy[None], axis=-1) - keep_apart[i]
+            free = jnp.all((gap >= 0) | (jnp.arange(n) >= i), axis=1)
+            return xy.at[i].set(candidates[jnp.argmax(free)]), valid & free.any()
+
+        return jax.lax.fori_loop(0, n, place_next, (jnp.zeros((n, 2)), jnp.bool_(True)))
+
+    def again(carry: tuple) -> tuple:
+        _, _, tries, key = carry
+        key, attempt_key = jax.random.split(key)
+        return *attempt(attempt_key), tries + 1, key
+
+    first = again((None, None, jnp.int32(0), key))
+    xy, valid, _, _ = jax.lax.while_loop(lambda c: ~c[1] & (c[2] < LAYOUTS), again, first)
+    return xy, valid
+
+
+def sample_goal(
+    place: Placement, key: jax.Array, xy: jax.Array, wanted: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """A new place for the goal, clear of all other objects [n, 2]: position [2] and whether found.
+
+    Up to 10,000 draws, in batches; no work where `wanted` is False.
+    """
+    goal = place.names.index("goal")
+    apart = jnp.asarray(place.keepouts) + place.keepouts[goal] + place.margin
+    others = np.arange(len(place.names)) != goal
+
+    def batch(carry: tuple) -> tuple:
+        _, _, tries, key = carry
+        key, draw_key = jax.random.split(key)
+        candidates = draw(draw_key, jnp.asarray(place.areas[goal]), jnp.asarray(place.weights[goal]), GOAL_BATCH)
+        gap = jnp.linalg.norm(candidates[:, None] - xy[None], axis=-1) - apart
+        free = jnp.all((gap >= 0) | ~others, axis=1)
+        return candidates[jnp.argmax(free)], free.any(), tries + GOAL_BATCH, key
+
+    start = (xy[goal], ~wanted, jnp.int32(0), key)
+    position, found, _, _ = jax.lax.while_loop(lambda c: ~c[1] & (c[2] < GOAL_DRAWS), batch, start)
+    return position, found

@@ -1,0 +1,371 @@
+"""Three physics engines behind one function: n substeps, then a forward pass at the new state.
+
+    run(physics, ctrl, substeps) -> (physics, readings)
+
+`c` is MuJoCo itself, a thread pool behind a callback: exact, and the default on a CPU. `warp` is MJX
+with Warp kernels, the default on an NVIDIA GPU. `jax` is MJX in plain JAX, for every other device.
+One instance in, one out: callers `vmap`, over environments and again over seeds. The state between
+two calls is small; each engine builds its own working data inside the call.
+"""
+
+import functools
+import threading
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import mujoco
+import mujoco.batch
+import numpy as np
+from mujoco import mjx
+
+from jaxsafe.config import ConfigError, nearest
+from jaxsafe.envs.scene import Scene
+
+ENGINES = ("c", "warp", "jax")
+
+
+@flax.struct.dataclass
+class Physics:
+    """What the next physics step needs: qpos [nq], qvel [nv] and warmstart [nv] (the solver's last
+    accelerations), the places around which mocap bodies circle or rest, and the substeps done."""
+
+    qpos: jax.Array
+    qvel: jax.Array
+    warmstart: jax.Array
+    mocap_pos: jax.Array  # [nmocap, 3]
+    mocap_quat: jax.Array  # [nmocap, 4]
+    substeps: jax.Array  # int32 []; simulation time is substeps * timestep
+
+
+@flax.struct.dataclass
+class Readings:
+    """What a forward pass shows: sensors [nsensordata], contact counts [watched objects] and the
+    poses that a task asked for (others have no elements)."""
+
+    sensors: jax.Array
+    contacts: jax.Array
+    geom_xpos: jax.Array  # [ngeom, 3]
+    geom_xmat: jax.Array  # [ngeom, 3, 3]
+    xquat: jax.Array  # [nbody, 4]
+
+
+Run = Callable[[Physics, jax.Array, jax.Array], tuple[Physics, Readings]]
+
+
+class Engine(NamedTuple):
+    name: str
+    run: Run
+
+
+def default_engine() -> str:
+    """The engine of JAX's default device."""
+    platform = jax.default_backend()
+    if platform == "cpu":
+        return "c"
+    return "warp" if platform in ("gpu", "cuda") and mjx_warp_available() else "jax"
+
+
+def mjx_warp_available() -> bool:
+    try:
+        import warp  # noqa: F401, PLC0415  (an optional dependency)
+    except ImportError:
+        return False
+    return True
+
+
+def make_engine(name: str, scene: Scene, max_substeps: int, outputs: tuple[str, ...] = ()) -> Engine:
+    """The engine `name` for `scene`.
+
+    Args:
+        name: 'c', 'warp', 'jax' or 'auto'.
+        max_substeps: most substeps of a call.
+        outputs: which of 'geom_xpos', 'geom_xmat', 'xquat' to return.
+    Raises:
+        ConfigError: an unknown engine, or a scene that this one cannot run.
+    """
+    name = default_engine() if name == "auto" else name
+    makers = {"c": c_engine, "warp": warp_engine, "jax": jax_engine}
+    if name not in makers:
+        raise ConfigError(f"env.engine={name!r}{nearest(name, ('auto', *ENGINES))}")
+    return Engine(name, makers[name](scene, max_substeps, outputs))
+
+
+def mocap_at(base: Any, orbit: np.ndarray, time: Any, xp: Any) -> Any:
+    """Gremlins' mocap bodies go round (travel sin t, travel cos t); all the others rest."""
+    circle = xp.stack([xp.sin(time), xp.cos(time), xp.zeros_like(time)], -1)
+    return base + orbit[:, None] * circle[..., None, :]
+
+
+# MuJoCo in C ---------------------------------------------------------------------------------------
+
+
+def c_engine(scene: Scene, max_substeps: int, outputs: tuple[str, ...]) -> Run:
+    """MuJoCo's thread pool. State crosses as float32; inside, all is float64 as in the original."""
+    model = scene.model
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET.value  # bad states are ours to end
+    shapes = {
+        "qpos": (model.nq,),
+        "qvel": (model.nv,),
+        "qacc_warmstart": (model.nv,),
+        "sensordata": (model.nsensordata,),
+        "geom_xpos": (model.ngeom, 3),
+        "geom_xmat": (model.ngeom, 3, 3),
+        "xquat": (model.nbody, 4),
+    }
+    inputs = [model.nq, model.nv, model.nv, 3 * model.nmocap, 4 * model.nmocap, model.nu, 1, 1]
+    fields = ("qpos", "qvel", "qacc_warmstart", "sensordata", *outputs)
+    sizes = [int(np.prod(shapes[f])) for f in fields]
+    batches: dict[int, mujoco.batch.Batch] = {}
+    lock = threading.Lock()
+
+    def host(packed: np.ndarray) -> np.ndarray:
+        """One row a simulation, [..., sum(inputs)] -> [..., sum(sizes)], both float32."""
+        rows = np.asarray(packed, np.float64).reshape(-1, sum(inputs))
+        with lock:
+            if len(rows) not in batches:
+                batches[len(rows)] = mujoco.batch.Batch(model, len(rows))
+                for field in fields:  # outputs are filled only by calls made after they are bound
+                    batches[len(rows)].bind(field)
+            out = advance(batches[len(rows)], rows)
+        return out.reshape(*packed.shape[:-1], sum(sizes))
+
+    def advance(batch: mujoco.batch.Batch, rows: np.ndarray) -> np.ndarray:
+        columns = np.split(rows, np.cumsum(inputs)[:-1], axis=1)
+        qpos, qvel, warmstart, mocap_pos, mocap_quat, ctrl, done, substeps = columns
+        mocap_pos = mocap_pos.reshape(len(rows), model.nmocap, 3)
+        batch.bind("qpos")[:], batch.bind("qvel")[:] = qpos, qvel
+        batch.bind("qacc_warmstart")[:], batch.bind("ctrl")[:] = warmstart, ctrl
+        time = done[:, 0] * model.opt.timestep
+        batch.bind("time")[:] = time
+        if model.nmocap:
+            batch.bind("mocap_pos")[:] = mocap_pos
+            batch.bind("mocap_quat")[:] = mocap_quat.reshape(len(rows), model.nmocap, 4)
+        count = substeps[:, 0].astype(int)
+        failed = np.zeros(len(rows), bool)
+        acc = mujoco.mjtStage.mjSTAGE_ACC.value
+        try:
+            if not scene.orbit.any() and (count == count[0]).all():
+                if count[0]:
+                    batch.step(nstep=int(count[0]), stage=acc)
+                else:
+                    batch.forward(stage=acc)
+            else:
+                for k in range(count.max(initial=0)):
+                    now = time + k * model.opt.timestep
+                    batch.bind("mocap_pos")[:] = np.where(
+                        (k < count)[:, None, None],
+                        mocap_at(mocap_pos, scene.orbit, now, np),
+                        batch.bind("mocap_pos"),
+                    )
+                    batch.step(ids=None if (k < count).all() else np.flatnonzero(k < count))
+                batch.forward(stage=acc)
+        except mujoco.batch.SimulationError as error:
+            failed[error.ids] = True
+        out = np.concatenate([batch.bind(f).reshape(len(rows), -1) for f in fields], axis=1)
+        out[failed] = np.nan  # the environment ends the episode of a world that is not finite
+        return out.astype(np.float32)
+
+    def run(physics: Physics, ctrl: jax.Array, substeps: jax.Array) -> tuple[Physics, Readings]:
+        arrays = [physics.qpos, physics.qvel, physics.warmstart, physics.mocap_pos, physics.mocap_quat]
+        arrays += [ctrl, physics.substeps, substeps]
+        packed = jnp.concatenate([jnp.ravel(x).astype(jnp.float32) for x in arrays])
+        shape = jax.ShapeDtypeStruct((sum(sizes),), jnp.float32)
+        out = jax.pure_callback(host, shape, packed, vmap_method="broadcast_all")
+        parts = dict(zip(fields, jnp.split(out, np.cumsum(sizes)[:-1]), strict=True))
+        parts = {f: x.reshape(shapes[f]) for f, x in parts.items()}
+        physics = physics.replace(
+            qpos=parts["qpos"],
+            qvel=parts["qvel"],
+            warmstart=parts["qacc_warmstart"],
+            substeps=physics.substeps + substeps,
+        )
+        sensors = parts["sensordata"]
+        return physics, readings(sensors, sensors[model.nsensordata - scene.contact_count :], parts, outputs)
+
+    return run
+
+
+def readings(sensors: jax.Array, contacts: jax.Array, source: Any, outputs: tuple[str, ...]) -> Readings:
+    get = source.get if isinstance(source, dict) else functools.partial(getattr, source)
+    return Readings(
+        sensors=sensors,
+        contacts=contacts,
+        **{f: get(f) if f in outputs else jnp.zeros((0,)) for f in ("geom_xpos", "geom_xmat", "xquat")},
+    )
+
+
+# MJX -----------------------------------------------------------------------------------------------
+
+
+def substep_loop(
+    scene: Scene,
+    model: mjx.Model,
+    data: mjx.Data,
+    physics: Physics,
+    ctrl: jax.Array,
+    substeps: jax.Array,
+    max_substeps: int,
+) -> tuple[Physics, mjx.Data]:
+    """`substeps` calls of `mjx.step` and one of `mjx.forward`, for one world."""
+    timestep = scene.model.opt.timestep
+    data = data.replace(
+        qpos=physics.qpos,
+        qvel=physics.qvel,
+        qacc_warmstart=physics.warmstart,
+        ctrl=ctrl,
+        mocap_pos=physics.mocap_pos,
+        mocap_quat=physics.mocap_quat,
+    )
+
+    def substep(data: mjx.Data, k: jax.Array) -> tuple[mjx.Data, None]:
+        moving = data
+        if scene.orbit.any():
+            time = (physics.substeps + k) * timestep
+            moving = data.replace(mocap_pos=mocap_at(physics.mocap_pos, scene.orbit, time, jnp))
+        stepped = mjx.step(model, moving)
+        kept = {f: jnp.where(k < substeps, getattr(stepped, f), getattr(data, f)) for f in STATE}
+        return stepped.replace(mocap_pos=moving.mocap_pos, **kept), None
+
+    data, _ = jax.lax.scan(substep, data, jnp.arange(max_substeps))
+    data = mjx.forward(model, data)
+    physics = physics.replace(
+        qpos=data.qpos,
+        qvel=data.qvel,
+        warmstart=data.qacc_warmstart,
+        substeps=physics.substeps + substeps,
+    )
+    return physics, data
+
+
+STATE = ("qpos", "qvel", "qacc_warmstart")
+
+
+def jax_engine(scene: Scene, max_substeps: int, outputs: tuple[str, ...]) -> Run:
+    refuse_box_cylinder(scene.model)
+    with jax.ensure_compile_time_eval():
+        model = mjx.put_model(scene.model, impl="jax")
+        template = mjx.make_data(scene.model, impl="jax")
+    robot, watched = map(jnp.asarray, contact_geoms(scene))
+
+    def run(physics: Physics, ctrl: jax.Array, substeps: jax.Array) -> tuple[Physics, Readings]:
+        physics, data = substep_loop(scene, model, template, physics, ctrl, substeps, max_substeps)
+        contact = data._impl.contact  # type: ignore[union-attr]
+        first, second = contact.geom[:, 0], contact.geom[:, 1]
+        touching = contact.dist <= 0
+        met = robot[first][:, None] & watched[second] | robot[second][:, None] & watched[first]
+        counts = (met & touching[:, None]).sum(0).astype(jnp.float32)
+        return physics, readings(data.sensordata, counts, data, outputs)
+
+    return run
+
+
+def refuse_box_cylinder(model: mujoco.MjModel) -> None:
+    """MJX's JAX implementation has every pair of these scenes but box and cylinder."""
+    solid = (model.geom_contype | model.geom_conaffinity) > 0
+    types = {int(t): model.geom(i).name for i, t in enumerate(model.geom_type) if solid[i]}
+    cylinder, box = (int(t) for t in (mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_BOX))
+    if cylinder in types and box in types and collide(model, cylinder, box):
+        raise ConfigError(
+            f"env.engine='jax': MJX has no box-cylinder collision and this scene needs it "
+            f"({types[box]} and {types[cylinder]}); use env.engine=c, or warp on an NVIDIA GPU"
+        )
+
+
+def collide(model: mujoco.MjModel, one: int, other: int) -> bool:
+    """Whether any two geoms of these types belong to bodies that can meet."""
+    for a in np.flatnonzero(model.geom_type == one):
+        for b in np.flatnonzero(model.geom_type == other):
+            i, j = (int(model.body_weldid[model.geom_bodyid[g]]) for g in (a, b))
+            parents = (int(model.body_weldid[model.body_parentid[k]]) for k in (i, j))
+            fixed = i == 0 and j == 0
+            if i != j and not fixed and not (0 not in (i, j) and (i in parents or j in parents)):
+                return True
+    return False
+
+
+def contact_geoms(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Masks of the robot's geoms [ngeom] and of each watched object's [ngeom, watched]."""
+    model = scene.model
+    bodies = model.geom_bodyid
+    robot = model.body_rootid[bodies] == model.body("robot").id
+    ids = [model.body(name).id for names in scene.watched.values() for name in names]
+    return robot, np.stack([bodies == i for i in ids], 1) if ids else np.zeros((model.ngeom, 0), bool)
+
+
+def warp_engine(scene: Scene, max_substeps: int, outputs: tuple[str, ...]) -> Run:
+    """MJX with Warp kernels. Buffers are sized for the whole batch, so the batch is made explicit."""
+    if not mjx_warp_available():
+        raise ConfigError("env.engine='warp': warp-lang is not installed; pip install 'jaxsafe[gpu]'")
+    per_world, rows = contact_budget(scene)
+    with jax.ensure_compile_time_eval():
+        model = mjx.put_model(scene.model, impl="warp")
+    model = model.tree_replace({"opt._impl.warn_overflow": 0})
+
+    @jax.custom_batching.custom_vmap
+    def run_batch(physics: Physics, ctrl: jax.Array, substeps: jax.Array) -> tuple[Physics, Readings]:
+        worlds = ctrl.shape[0]
+        data = zeros_data(scene.model, per_world * worlds, rows)
+
+        def one(physics: Physics, ctrl: jax.Array, substeps: jax.Array) -> tuple[Physics, Readings]:
+            physics, out = substep_loop(scene, model, data, physics, ctrl, substeps, max_substeps)
+            sensors = out.sensordata
+            return physics, readings(sensors, sensors[sensors.shape[0] - scene.contact_count :], out, outputs)
+
+        return jax.vmap(one)(physics, ctrl, substeps)
+
+    @run_batch.def_vmap
+    def _(axis_size: int, in_batched: Any, *args: Any) -> Any:
+        args = spread(axis_size, in_batched, args)
+        flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), args)
+        out = jax.tree.map(lambda x: x.reshape(axis_size, -1, *x.shape[1:]), run_batch(*flat))
+        return out, jax.tree.map(lambda _: True, out)
+
+    @jax.custom_batching.custom_vmap
+    def run(physics: Physics, ctrl: jax.Array, substeps: jax.Array) -> tuple[Physics, Readings]:
+        lone = jax.tree.map(lambda x: x[None], (physics, ctrl, substeps))
+        return jax.tree.map(lambda x: x[0], run_batch(*lone))
+
+    @run.def_vmap
+    def _(axis_size: int, in_batched: Any, *args: Any) -> Any:
+        out = run_batch(*spread(axis_size, in_batched, args))
+        return out, jax.tree.map(lambda _: True, out)
+
+    return run
+
+
+def spread(axis_size: int, in_batched: Any, args: Any) -> Any:
+    """Give every argument the batch axis."""
+    return jax.tree.map(
+        lambda x, batched: x if batched else jnp.broadcast_to(x, (axis_size, *x.shape)),
+        args,
+        tuple(in_batched),
+    )
+
+
+def contact_budget(scene: Scene) -> tuple[int, int]:
+    """Contacts per world on average, and constraint rows in the fullest world.
+
+    A resting cube holds 4 contacts, a robot part up to 4; each contact takes 10 rows (condim 6).
+    """
+    model = scene.model
+    free = sum(scene.frees.values()) + 4 * scene.frees["box"]
+    robot = int((model.body_rootid[model.geom_bodyid] == model.body("robot").id).sum())
+    contacts = 8 + 4 * free + 2 * robot * (not scene.planar)
+    limits = int(model.jnt_limited.sum())
+    return contacts, 10 * (contacts + 16) + limits + 6 * scene.frees["gremlins"]
+
+
+def zeros_data(model: mujoco.MjModel, contacts: int, rows: int) -> mjx.Data:
+    """`mjx.make_data`, with its large all-zero arrays made on the device instead of shipped."""
+    with jax.ensure_compile_time_eval():
+        data = mjx.make_data(model, impl="warp", naconmax=contacts, njmax=rows)
+
+    def device(x: Any) -> Any:
+        if not hasattr(x, "dtype") or np.size(x) < 1024 or np.any(np.asarray(x)):
+            return x
+        return jnp.zeros(x.shape, x.dtype)
+
+    return jax.tree.map(device, data)

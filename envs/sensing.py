@@ -1,0 +1,177 @@
+"""Lidars and compasses, as Safety Gym defines them. Source: its Engine, `obs_lidar*`, `obs_compass`."""
+
+import functools
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+TINY = 1e-12
+
+
+def pseudo_lidar(
+    targets: jax.Array,
+    position: jax.Array,
+    rotation: jax.Array,
+    bins: int,
+    max_dist: float | None,
+    exp_gain: float,
+    alias: bool,
+) -> jax.Array:
+    """Closeness of the nearest target in each of `bins` sectors around the robot.
+
+    A target's height counts as 0 and the robot's does not, so a tilted robot sees its own height
+    leak into the reading (kept from the original). The sector of a target exactly ahead is taken
+    modulo `bins`, where the original raises an IndexError.
+
+    Args:
+        targets: float [n, 2] (m).
+        position, rotation: float [3], [3, 3] of the robot's body.
+        max_dist: range of the linear law (m); None for exp(-exp_gain distance).
+        alias: share the reading with the two sectors beside, by the angle within the sector.
+    Returns:
+        float [bins] in [0, 1].
+    """
+    offset = jnp.pad(targets - position[:2], ((0, 0), (0, 1)), constant_values=-position[2])
+    ego = (offset[:, :, None] * rotation[:, :2]).sum(1)  # first two components of R'(target - position)
+    distance = jnp.sqrt(jnp.maximum(jnp.square(ego).sum(-1), TINY**2))
+    width = 2 * jnp.pi / bins
+    angle = jnp.mod(jnp.arctan2(ego[:, 1], ego[:, 0]), 2 * jnp.pi)
+    sector = jnp.floor(angle / width)
+    if max_dist is None:
+        closeness = jnp.exp(-exp_gain * distance)
+    else:
+        closeness = jnp.maximum(0.0, max_dist - distance) / max_dist
+    within = angle / width - sector
+    each = jnp.arange(bins)
+
+    def reading(shift: int, value: jax.Array) -> jax.Array:
+        hit = each == jnp.mod(sector.astype(jnp.int32) + shift, bins)[:, None]
+        return jnp.where(hit, value[:, None], 0.0).max(0, initial=0.0)
+
+    lidar = reading(0, closeness)
+    if alias:
+        lidar = jnp.maximum(lidar, reading(1, within * closeness))
+        lidar = jnp.maximum(lidar, reading(-1, (1 - within) * closeness))
+    return lidar
+
+
+def compass(target: jax.Array, position: jax.Array, rotation: jax.Array, size: int) -> jax.Array:
+    """Direction of a target [3] in the robot's frame, of length just under 1: float [size]."""
+    ego = ((target - position)[:, None] * rotation).sum(0)[:size]
+    return ego / (jnp.linalg.norm(ego) + 0.001)
+
+
+@dataclass
+class Shapes:
+    """Geoms that rays can meet: kind, size [n, 3] and group are fixed, position and rotation traced."""
+
+    kind: np.ndarray
+    size: np.ndarray
+    group: np.ndarray
+    position: jax.Array
+    rotation: jax.Array
+
+
+def natural_lidar(
+    shapes: Shapes, position: jax.Array, rotation: jax.Array, bins: int, group: int, slack: float = 0.0
+) -> jax.Array:
+    """exp(-distance) at which `bins` level rays from the robot's centre meet geoms of a group.
+
+    Nothing of body `robot` itself is met, its wheels and legs are, and groups are shared (goal and
+    floor, box and buttons, pillars and walls), all as in the original; group 6 does not exist there,
+    so the circle is never seen. `slack` (m) thickens every shape, or thins it if negative: a reading
+    that depends on its sign hangs on rounding (Car's ball is tangent to its rays, Doggo's start on a
+    surface of its own).
+    """
+    angles = 2 * jnp.pi * jnp.arange(bins) / bins
+    level = jnp.stack([jnp.cos(angles), jnp.sin(angles), jnp.zeros(bins)], -1)
+    rays = (level[:, None] * rotation).sum(-1)
+    distances = [jnp.full(bins, jnp.inf)]
+    for i in np.flatnonzero(shapes.group == group):
+        turn = shapes.rotation[i]
+        origin = ((position - shapes.position[i])[:, None] * turn).sum(0)
+        hit = jax.vmap(functools.partial(HITS[int(shapes.kind[i])], size=shapes.size[i], slack=slack), (0, None))
+        distances.append(hit((rays[:, :, None] * turn).sum(1), origin))
+    return jnp.exp(-jnp.stack(distances).min(0))
+
+
+# Ray against shape, in the shape's frame: unit direction [3], origin [3] -> distance, inf if none.
+
+
+def over(x: jax.Array) -> jax.Array:
+    """A divisor that is never 0."""
+    return jnp.where(jnp.abs(x) < TINY, TINY, x)
+
+
+def roots(a: jax.Array, b: jax.Array, c: jax.Array, slack: float) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Roots of a t^2 + 2 b t + c and whether they are real; c is a squared distance less a radius."""
+    square = b * b - a * c
+    root = jnp.sqrt(jnp.maximum(square, TINY))
+    return (-b - root) / over(a), (-b + root) / over(a), square >= TINY - slack * a
+
+
+def first(*hits: tuple[jax.Array, jax.Array], slack: float) -> jax.Array:
+    """The smallest t >= 0 among (t, whether it counts)."""
+    return jnp.stack([jnp.where(ok & (t >= -slack), jnp.maximum(t, 0), jnp.inf) for t, ok in hits]).min(0)
+
+
+def hit_plane(d: jax.Array, o: jax.Array, size: np.ndarray, slack: float) -> jax.Array:
+    t = -o[2] / over(d[2])
+    at = jnp.abs(o + t * d)
+    inside = (at[0] <= size[0] + slack) & (at[1] <= size[1] + slack)
+    return first((t, inside & (d[2] < -TINY)), slack=slack)
+
+
+def hit_sphere(d: jax.Array, o: jax.Array, size: np.ndarray, slack: float) -> jax.Array:
+    near, far, real = roots((d * d).sum(), (d * o).sum(), (o * o).sum() - size[0] ** 2, slack)
+    return first((near, real), (far, real), slack=slack)
+
+
+def hit_side(d: jax.Array, o: jax.Array, size: np.ndarray, slack: float) -> jax.Array:
+    """The side of an upright cylinder of radius size[0] and half height size[1]."""
+    d2, o2 = d[:2], o[:2]
+    near, far, real = roots((d2 * d2).sum(), (d2 * o2).sum(), (o2 * o2).sum() - size[0] ** 2, slack)
+    within = [(t, real & (jnp.abs(o[2] + t * d[2]) <= size[1] + slack)) for t in (near, far)]
+    return first(*within, slack=slack)
+
+
+def hit_cylinder(d: jax.Array, o: jax.Array, size: np.ndarray, slack: float) -> jax.Array:
+    lids = []
+    for z in (-size[1], size[1]):
+        t = (z - o[2]) / over(d[2])
+        radius = jnp.sqrt(jnp.square((o + t * d)[:2]).sum() + TINY)
+        lids.append((t, (radius <= size[0] + slack) & (jnp.abs(d[2]) >= TINY)))
+    return jnp.minimum(hit_side(d, o, size, slack), first(*lids, slack=slack))
+
+
+def hit_capsule(d: jax.Array, o: jax.Array, size: np.ndarray, slack: float) -> jax.Array:
+    caps = []
+    for z in (-size[1], size[1]):
+        end = o.at[2].add(-z)
+        near, far, real = roots((d * d).sum(), (d * end).sum(), (end * end).sum() - size[0] ** 2, slack)
+        caps += [(t, real & ((o[2] + t * d[2]) * np.sign(z) >= abs(z) - slack)) for t in (near, far)]
+    return jnp.minimum(hit_side(d, o, size, slack), first(*caps, slack=slack))
+
+
+def hit_box(d: jax.Array, o: jax.Array, size: np.ndarray, slack: float) -> jax.Array:
+    hits = []
+    for axis in range(3):
+        i, j = (k for k in range(3) if k != axis)
+        for side in (-size[axis], size[axis]):
+            t = (side - o[axis]) / over(d[axis])
+            at = jnp.abs(o + t * d)
+            inside = (at[i] <= size[i] + slack) & (at[j] <= size[j] + slack)
+            hits.append((t, inside & (jnp.abs(d[axis]) >= TINY)))
+    return first(*hits, slack=slack)
+
+
+HITS = {
+    int(mujoco.mjtGeom.mjGEOM_PLANE): hit_plane,
+    int(mujoco.mjtGeom.mjGEOM_SPHERE): hit_sphere,
+    int(mujoco.mjtGeom.mjGEOM_CAPSULE): hit_capsule,
+    int(mujoco.mjtGeom.mjGEOM_CYLINDER): hit_cylinder,
+    int(mujoco.mjtGeom.mjGEOM_BOX): hit_box,
+}

@@ -1,0 +1,45 @@
+"""Means over a batch that may be spread over devices. `axis_name` None means one device."""
+
+import jax
+import jax.numpy as jnp
+
+from jaxsafe.types import PyTree
+
+
+def pmean(tree: PyTree, axis_name: str | None) -> PyTree:
+    """The mean over devices of every leaf. Gradients pass through here, losses never do."""
+    return tree if axis_name is None else jax.lax.pmean(tree, axis_name)
+
+
+def psum(tree: PyTree, axis_name: str | None) -> PyTree:
+    return tree if axis_name is None else jax.lax.psum(tree, axis_name)
+
+
+def batch_mean(x: jax.Array, axis_name: str | None, axis: int | None = None) -> jax.Array:
+    """The mean of `x` over `axis` (default: all of them) and over devices, which hold equal shares."""
+    return pmean(jnp.mean(x, axis), axis_name)
+
+
+def masked_mean(x: jax.Array, mask: jax.Array, axis_name: str | None) -> jax.Array:
+    """The mean of `x` where `mask` holds, over all devices; NaN where it holds nowhere."""
+    total, count = psum((jnp.where(mask, x, 0.0).sum(), mask.sum()), axis_name)
+    return jnp.where(count > 0, total / jnp.maximum(count, 1), jnp.nan)
+
+
+def centre(x: jax.Array, axis_name: str | None) -> jax.Array:
+    return x - batch_mean(x, axis_name)
+
+
+def standardise(x: jax.Array, axis_name: str | None) -> jax.Array:
+    """Zero mean and unit population variance over the batch of all devices."""
+    x = centre(x, axis_name)
+    return x / (jnp.sqrt(batch_mean(x**2, axis_name)) + 1e-8)
+
+
+def select(condition: jax.Array, new: PyTree, old: PyTree) -> PyTree:
+    """`new` where the scalar `condition` holds, else `old`, leaf by leaf."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
+
+
+def all_finite(tree: PyTree) -> jax.Array:
+    return jnp.all(jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(tree)]))

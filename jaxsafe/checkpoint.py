@@ -1,0 +1,224 @@
+"""Checkpoints of a whole train state: written atomically, verified when read, no pickle.
+
+    checkpoints/00000042/manifest.json   iteration, steps, shapes, SHA-256 of every other file
+    checkpoints/00000042/state/          an Orbax checkpoint of {leaf name: array}
+
+A checkpoint is written under a temporary name and renamed when it is complete, so a folder
+with a number for a name is whole unless the disk lost bytes; the checksums catch that.
+Random keys are stored as their key data, empty leaves not at all.
+"""
+
+import hashlib
+import json
+import os
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import orbax.checkpoint as ocp
+
+from jaxsafe.types import PyTree
+
+KEEP = 2  # the newest ones that stay
+
+
+class CheckpointError(RuntimeError):
+    """A checkpoint that cannot be written or read. The message is one line for the user."""
+
+
+class Manifest(NamedTuple):
+    """What a checkpoint says about itself."""
+
+    iteration: int
+    steps: int  # environment steps of one seed
+    files: dict[str, str]  # path under the checkpoint -> SHA-256
+    leaves: dict[str, tuple[str, tuple[int, ...]]]  # name -> dtype, shape
+
+
+def is_key(leaf: Any) -> bool:
+    return jax.numpy.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def leaf_names(tree: PyTree) -> list[str]:
+    paths = jax.tree_util.tree_flatten_with_path(tree)[0]
+    return [jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in paths]
+
+
+def to_arrays(tree: PyTree) -> dict[str, np.ndarray]:
+    """The leaves of `tree` on the host, by name; random keys as their data."""
+    leaves = jax.tree.map(lambda x: jax.random.key_data(x) if is_key(x) else x, jax.tree.leaves(tree))
+    return dict(zip(leaf_names(tree), map(np.asarray, jax.device_get(leaves)), strict=True))
+
+
+def as_data(like: PyTree) -> dict[str, Any]:
+    """What `to_arrays` gives for a tree of these shapes."""
+    leaves = [jax.eval_shape(jax.random.key_data, x) if is_key(x) else x for x in jax.tree.leaves(like)]
+    return dict(zip(leaf_names(like), leaves, strict=True))
+
+
+def from_arrays(like: PyTree, arrays: dict[str, np.ndarray]) -> PyTree:
+    """The inverse of `to_arrays`, in the structure of `like` (arrays or their shapes)."""
+    leaves, treedef = jax.tree.flatten(like)
+    restored = [
+        jax.random.wrap_key_data(jax.numpy.asarray(arrays[name])) if is_key(leaf) else arrays[name]
+        for name, leaf in zip(leaf_names(like), leaves, strict=True)
+    ]
+    return jax.tree.unflatten(treedef, restored)
+
+
+def save(folder: Path, ts: PyTree, iteration: int, steps: int) -> Path:
+    """Write `ts` as the newest checkpoint under `folder` and drop all but the last `KEEP`.
+
+    Raises:
+        CheckpointError: it could not be written (a full disk); earlier checkpoints stay.
+    """
+    target, part = folder / f"{iteration:08d}", folder / f"{iteration:08d}.part"
+    try:
+        for leftover in folder.glob("*.part"):  # of a process that was killed
+            shutil.rmtree(leftover)
+        part.mkdir(parents=True)
+        arrays = to_arrays(ts)
+        with ocp.Checkpointer(ocp.StandardCheckpointHandler()) as orbax:
+            orbax.save(
+                (part / "state").absolute(),
+                args=ocp.args.StandardSave({k: v for k, v in arrays.items() if v.size}),  # type: ignore[call-arg]
+            )
+        manifest = {
+            "iteration": iteration,
+            "steps": steps,
+            "files": {name: digest(part / name) for name in files(part)},
+            "leaves": {k: [str(v.dtype), list(v.shape)] for k, v in arrays.items()},
+        }
+        (part / "manifest.json").write_text(json.dumps(manifest, indent=1))
+        for name in files(part):
+            sync(part / name)
+        if target.exists():
+            shutil.rmtree(target)
+        part.rename(target)
+        sync(folder)
+    except Exception as error:  # Orbax and TensorStore raise many kinds
+        shutil.rmtree(part, ignore_errors=True)
+        last = checkpoints(folder)
+        kept = f"the last good one is {last[0]}" if last else "there is no earlier one"
+        raise CheckpointError(f"cannot write checkpoint {target}: {reason(error)}; {kept}") from error
+    for old in checkpoints(folder)[KEEP:]:
+        shutil.rmtree(old, ignore_errors=True)
+    return target
+
+
+def restore(
+    folder: Path, like: PyTree, warn: Callable[[str], None] | None = None
+) -> tuple[PyTree, Manifest]:
+    """The newest sound checkpoint under `folder`, in the structure of `like`.
+
+    Args:
+        folder: holds the numbered checkpoints.
+        like: arrays, or `jax.eval_shape`s, that fix names, shapes and dtypes.
+        warn: told, in one line, of each checkpoint that is passed over as corrupt.
+    Raises:
+        CheckpointError: none is sound, or the newest sound one is of another train state.
+    """
+    arrays, manifest = load(folder, warn)
+    expected = as_data(like)
+    for name in sorted({*expected, *manifest.leaves}):
+        want = (str(expected[name].dtype), tuple(expected[name].shape)) if name in expected else None
+        if (have := manifest.leaves.get(name)) != want:
+            raise CheckpointError(
+                f"{folder} has another train state: {name} is {describe(have)}, not {describe(want)}"
+            )
+    return from_arrays(like, arrays), manifest
+
+
+def load(
+    folder: Path, warn: Callable[[str], None] | None = None
+) -> tuple[dict[str, np.ndarray], Manifest]:
+    """The newest sound checkpoint under `folder`, as {leaf name: array}."""
+    problems = []
+    for path in checkpoints(folder):
+        try:
+            manifest = read_manifest(path)
+            verify(path, manifest)
+            return read_arrays(path, manifest), manifest
+        except Exception as error:  # Orbax and TensorStore raise many kinds
+            problems.append(f"{path} is corrupt ({reason(error)})")
+            (warn or (lambda line: print(line, file=sys.stderr)))(
+                f"warning: {problems[-1]}; trying an older one"
+            )
+    raise CheckpointError("; ".join(problems) or f"no checkpoint in {folder}")
+
+
+def read_manifest(path: Path) -> Manifest:
+    raw = json.loads((path / "manifest.json").read_text())
+    leaves = {
+        str(k): (str(dtype), tuple(int(n) for n in shape))
+        for k, (dtype, shape) in raw["leaves"].items()
+    }
+    return Manifest(int(raw["iteration"]), int(raw["steps"]), dict(raw["files"]), leaves)
+
+
+def verify(path: Path, manifest: Manifest) -> None:
+    present = set(files(path)) - {"manifest.json"}
+    if present != set(manifest.files):
+        odd = sorted(present ^ set(manifest.files))
+        raise CheckpointError(f"missing or unknown file {odd[0]}")
+    for name, expected in manifest.files.items():
+        if digest(path / name) != expected:
+            raise CheckpointError(f"checksum of {name} differs")
+
+
+def read_arrays(path: Path, manifest: Manifest) -> dict[str, np.ndarray]:
+    """Read exactly the arrays that the manifest lists, as host arrays of those shapes and dtypes."""
+    empty = {k: np.zeros(shape, dtype) for k, (dtype, shape) in manifest.leaves.items() if 0 in shape}
+    like = {
+        k: np.zeros(shape, dtype) for k, (dtype, shape) in manifest.leaves.items() if 0 not in shape
+    }
+    with ocp.Checkpointer(ocp.StandardCheckpointHandler()) as orbax:
+        restored = orbax.restore((path / "state").absolute(), args=ocp.args.StandardRestore(like))  # type: ignore[call-arg]
+    for name, (dtype, shape) in manifest.leaves.items():
+        if name in like and (str(restored[name].dtype), restored[name].shape) != (dtype, shape):
+            raise CheckpointError(
+                f"{name} is {describe((str(restored[name].dtype), restored[name].shape))}"
+            )
+    return {**empty, **restored}
+
+
+def checkpoints(folder: Path) -> list[Path]:
+    """The complete checkpoints under `folder`, newest first."""
+    found = folder.glob("[0-9]" * 8) if folder.is_dir() else ()
+    return sorted((p for p in found if (p / "manifest.json").is_file()), reverse=True)
+
+
+def files(path: Path) -> list[str]:
+    return sorted(p.relative_to(path).as_posix() for p in path.rglob("*") if p.is_file())
+
+
+def digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def sync(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def describe(leaf: tuple[str, tuple[int, ...]] | None) -> str:
+    return "absent" if leaf is None else f"{leaf[0]}{list(leaf[1])}"
+
+
+def reason(error: BaseException) -> str:
+    """One short line for any exception."""
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    text = " ".join(str(error).split()) or type(error).__name__
+    for known in ("No space left on device", "File too large", "Disk quota exceeded"):
+        if known in text:
+            return known
+    return text if len(text) <= 160 else text[:157] + "..."

@@ -1,0 +1,609 @@
+"""From a command line to a finished run folder: settings, checks, training, and what follows it.
+
+Hydra composes the settings; the overrides are checked before it sees them, because its own errors
+are long. `envs` and `algos` are the two registries, handed in as modules: `envs` has `ENVS`,
+`canonical`, `env_defaults`, `make` and a submodule `render`; `algos` has `ALGOS`.
+"""
+
+import argparse
+import dataclasses
+import datetime
+import errno
+import importlib
+import json
+import math
+import os
+import shlex
+import sys
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, NamedTuple, NoReturn
+
+import hydra
+import jax
+import numpy as np
+from hydra._internal.utils import get_args_parser
+from hydra.core.config_store import ConfigStore
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override, OverrideType
+from hydra.errors import HydraException
+from hydra.types import RunMode
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+import jaxsafe
+from jaxsafe import checkpoint, evaluation, plots, run_folder, runner
+from jaxsafe.config import ConfigError, from_dict, nearest
+from jaxsafe.progress import Report
+from jaxsafe.types import Env, PyTree
+
+ON_RESUME = (
+    "total_steps",
+    "checkpoint_every",
+    "checkpoint_iterations",
+    "eval_episodes",
+    "video",
+)  # may change
+NOT_COMPARED = ("run_dir", "resume", *ON_RESUME)
+DEFAULT = {"env": "point_goal1", "algo": "ppo_lag"}
+BAD_DISK = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO)
+# Bounds of the hyperparameters that have one wherever they occur.
+BOUNDS = {
+    "cost_limit": (0.0, math.inf),
+    "horizon": (1, math.inf),
+    "num_envs": (1, math.inf),
+    "discount": (0.0, 1.0),
+    "cost_discount": (0.0, 1.0),
+    "gae_lambda": (0.0, 1.0),
+    "cost_gae_lambda": (0.0, 1.0),
+}
+
+
+class Settings(NamedTuple):
+    """Everything a run is made of, checked."""
+
+    env_name: str
+    env_options: dict[str, Any]  # all of them
+    algo_name: str
+    algo: Any  # the algorithm's config
+    train: runner.TrainConfig
+
+    def plain(self) -> dict[str, Any]:
+        """As config.yaml has it."""
+        return to_plain(
+            {
+                "env": {"name": self.env_name, **self.env_options},
+                "algo": {"name": self.algo_name, **dataclasses.asdict(self.algo)},
+                **dataclasses.asdict(self.train),
+            }
+        )
+
+
+class Request(NamedTuple):
+    """What the arguments say before Hydra composes them."""
+
+    argv: list[str]  # for Hydra: aliases replaced
+    base: dict[str, Any]  # top-level defaults, or those of the run to continue
+    groups: dict[str, dict[str, dict[str, Any]]]  # 'env' and 'algo': name -> options
+
+
+# ---- arguments -------------------------------------------------------------------------------
+
+
+def read_arguments(argv: list[str], envs: Any, algos: Any) -> Request:
+    """Check every `key=value` against the registries.
+
+    Raises:
+        ConfigError: something that no run could use, with the nearest valid name.
+    """
+    parser = get_args_parser()
+    parser.error = fail  # type: ignore[method-assign]
+    args, unknown = parser.parse_known_args(argv)
+    if unknown:
+        raise ConfigError(f"unknown flag {unknown[0]}; options are written key=value, see --help")
+    if args.experimental_rerun:
+        raise ConfigError("--experimental-rerun reads a pickle; use resume=RUN_DIR")
+    flags = list(argv)
+    for text in args.overrides:
+        flags.remove(text)
+    overrides = [parse(text) for text in args.overrides]
+    given = {o.key_or_group: o for o in overrides}
+    base = dataclasses.asdict(runner.TrainConfig())
+    for name in ("preset", "resume"):
+        if name in given and given[name].is_sweep_override():
+            raise ConfigError(f"{name} takes one value, not a sweep")
+    resume = given["resume"].value() if "resume" in given else False
+    if isinstance(resume, str):
+        saved = run_folder.read_config(Path(resume).expanduser())
+        base |= {k: v for k, v in saved.items() if k not in ("env", "algo")} | {"resume": resume}
+        groups = {"env": env_group(envs, saved["env"]), "algo": algo_group(algos, saved["algo"])}
+    else:
+        preset = str(given["preset"].value()) if "preset" in given else base["preset"]
+        groups = {
+            "env": {name: {"name": name, **envs.env_defaults(name)} for name in envs.ENVS},
+            "algo": {name: algo_options(algos, name, preset) for name in algos.ALGOS},
+        }
+    texts = list(args.overrides)
+    chosen = {
+        group: [next(iter(g)) if isinstance(resume, str) else DEFAULT[group]]
+        for group, g in groups.items()
+    }
+    for i, override in enumerate(overrides):
+        if override.key_or_group in groups and not override.is_delete():
+            group = override.key_or_group
+            names = [str(v) for v in values(override)]
+            if group == "env":
+                names = [envs.canonical(name) for name in names]
+            for name in names:
+                if name not in (envs.ENVS if group == "env" else algos.ALGOS):
+                    raise ConfigError(f"unknown algo {name!r}{nearest(name, algos.ALGOS)}")
+                if name not in groups[group]:
+                    raise ConfigError(
+                        f"{group}={name}: {resume} was trained with {next(iter(groups[group]))}"
+                    )
+            chosen[group] = names
+            texts[i] = f"{group}={','.join(names)}"
+    if not isinstance(resume, str):
+        for name in chosen["algo"]:
+            if preset not in (valid := presets(algos.ALGOS[name])):
+                raise ConfigError(f"preset={preset} of {name}{nearest(preset, valid)}")
+    for override, text in zip(overrides, args.overrides, strict=True):
+        check_key(override, text, base, groups, chosen)
+        if override.is_sweep_override() and not args.multirun and not override.is_hydra_override():
+            raise ConfigError(f"{text}: several values need --multirun (-m); a list is written [a,b]")
+    return Request([*flags, *texts], base, groups)
+
+
+def parse(text: str) -> Override:
+    try:
+        return OverridesParser.create().parse_override(text)
+    except HydraException as error:
+        raise ConfigError(f"cannot read {text!r}: {one_line(error)}") from error
+
+
+def values(override: Override) -> list[Any]:
+    return list(override.sweep_iterator()) if override.is_sweep_override() else [override.value()]
+
+
+def check_key(
+    override: Override, text: str, base: dict, groups: dict, chosen: dict[str, list[str]]
+) -> None:
+    key = override.key_or_group
+    if override.is_hydra_override():
+        return
+    if override.type is not OverrideType.CHANGE or override.package is not None:
+        raise ConfigError(f"{text}: options are set with key=value, without '+', '~' or '@'")
+    head, _, option = key.partition(".")
+    if not option:
+        if key not in base and key not in groups:
+            dotted = [
+                f"{group}.{o}" for group, names in chosen.items() for o in groups[group][names[0]]
+            ]
+            inside = [d for d in dotted if d.split(".")[1] == key]
+            hint = f"; did you mean {inside[0]!r}?" if inside else nearest(key, [*base, *groups])
+            raise ConfigError(f"unknown option {key}{hint}")
+    elif head not in groups:
+        raise ConfigError(f"unknown option {key}{nearest(head, groups)}")
+    else:
+        for name in chosen[head]:
+            options = [o for o in groups[head][name] if o != "name"]
+            if option not in options:
+                hint = f"; choose with {head}=" if option == "name" else nearest(option, options)
+                raise ConfigError(f"unknown option {head}.{option} of {name}{hint}")
+
+
+def env_group(envs: Any, saved: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    name = envs.canonical(saved["name"])
+    return {
+        name: {
+            "name": name,
+            **envs.env_defaults(name),
+            **{k: v for k, v in saved.items() if k != "name"},
+        }
+    }
+
+
+def algo_group(algos: Any, saved: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    name = saved["name"]
+    if name not in algos.ALGOS:
+        raise ConfigError(f"unknown algo {name!r}{nearest(name, algos.ALGOS)}")
+    return {name: {**algo_options(algos, name, "fast"), **saved}}
+
+
+def algo_options(algos: Any, name: str, preset: str) -> dict[str, Any]:
+    """The defaults of an algorithm; those of `preset` if it has that one."""
+    entry = algos.ALGOS[name]
+    return {"name": name, **dataclasses.asdict(entry.config(**presets(entry).get(preset, {})))}
+
+
+def presets(entry: Any) -> dict[str, dict[str, Any]]:
+    """Overrides by name: 'fast' has none, 'published' is the first of the published settings."""
+    first = next(iter(entry.published.values()), None)
+    return {"fast": {}, **({} if first is None else {"published": first}), **entry.published}
+
+
+def register(request: Request) -> None:
+    """Give Hydra the groups and their defaults, so that --help and --cfg show every option."""
+    store = ConfigStore.instance()
+    for group, options in request.groups.items():
+        for name, node in options.items():
+            store.store(group=group, name=name, node=OmegaConf.create(to_plain(node)))
+    first = {
+        group: DEFAULT[group] if DEFAULT[group] in g else next(iter(g))
+        for group, g in request.groups.items()
+    }
+    node = {
+        "defaults": [
+            *({group: name} for group, name in first.items()),
+            "_self_",
+            {"override hydra/job_logging": "none"},
+            {"override hydra/hydra_logging": "none"},
+        ],
+        **to_plain(request.base),
+        "hydra": {
+            "run": {"dir": "."},
+            "sweep": {"dir": "runs/.multirun", "subdir": "."},
+            "output_subdir": None,
+            "job": {"name": "train", "chdir": False},
+            "help": {
+                "header": "python scripts/train.py env=car_push1 algo=cpo [key=value ...]",
+                "footer": "Several values with -m: seed=0,1,2. A list is written [a,b].",
+            },
+        },
+    }
+    store.store(name="train", node=OmegaConf.create(node))
+
+
+# ---- settings --------------------------------------------------------------------------------
+
+
+def settle(config: dict[str, Any], envs: Any, algos: Any) -> Settings:
+    """Plain values, from Hydra or a config.yaml, as checked settings.
+
+    Raises:
+        ConfigError: an unknown name, a wrong type, or a value out of bounds.
+    """
+    top = {k: v for k, v in config.items() if k not in ("env", "algo")}
+    env, algo = dict(config["env"]), dict(config["algo"])
+    env_name, algo_name = envs.canonical(env.pop("name")), algo.pop("name")
+    if algo_name not in algos.ALGOS:
+        raise ConfigError(f"unknown algo {algo_name!r}{nearest(algo_name, algos.ALGOS)}")
+    train = from_dict(runner.TrainConfig, top)
+    if train.num_envs is not None:
+        algo["num_envs"] = train.num_envs
+    defaults = envs.env_defaults(env_name)
+    for name in env:
+        if name not in defaults:
+            raise ConfigError(f"unknown option env.{name}{nearest(name, defaults)}")
+    algo_config = from_dict(algos.ALGOS[algo_name].config, algo, "algo.")
+    for name, value in dataclasses.asdict(algo_config).items():
+        low, high = BOUNDS.get(name, (-math.inf, math.inf))
+        if isinstance(value, int | float) and not low <= value <= high:  # NaN is in no interval
+            expected = f"at least {low:g}" if high == math.inf else f"between {low:g} and {high:g}"
+            raise ConfigError(
+                f"algo.{name}={value}: expected {expected if name in BOUNDS else 'a number'}"
+            )
+    return Settings(env_name, to_plain({**defaults, **env}), algo_name, algo_config, train)
+
+
+def make_env(settings: Settings, envs: Any) -> Env:
+    defaults = to_plain(envs.env_defaults(settings.env_name))
+    changed = {k: v for k, v in settings.env_options.items() if v != defaults[k]}
+    return envs.make(settings.env_name, **changed)
+
+
+def choose_folder(
+    settings: Settings, envs: Any, algos: Any, job: int | None, say: Callable[[str], None]
+) -> Path:
+    """The folder to train in. `job` is the number of a multirun's job.
+
+    Raises:
+        ConfigError: it holds another run, or this one and `resume` is not set.
+    """
+    train = settings.train
+    if isinstance(train.resume, str):
+        folder = Path(train.resume).expanduser()
+        compare(settings, folder, envs, algos)
+        return folder
+    home = Path("runs") / f"{settings.env_name}-{settings.algo_name}"
+    if train.run_dir is None:
+        if train.resume:
+            for folder in sorted((p.parent for p in home.glob("*/config.yaml")), reverse=True):
+                done = run_folder.progress(folder)
+                if (done is None or done[1] < train.total_steps) and same(
+                    settings, folder, envs, algos
+                ):
+                    return folder
+            say(f"no unfinished run of this command in {home}: starting one")
+        name = f"{datetime.datetime.now():%Y%m%d-%H%M%S}-seed{train.seed}"
+        taken = (home / (f"{name}-{i}" if i else name) for i in range(10**6))
+        return next(path for path in taken if not path.exists())
+    folder = Path(train.run_dir).expanduser()
+    if job is not None:
+        folder = folder / str(job)
+    if folder.exists() and not folder.is_dir():
+        raise ConfigError(f"run_dir={folder} is not a folder")
+    if (folder / "config.yaml").exists() and train.resume:
+        compare(settings, folder, envs, algos)
+    elif checkpoint.checkpoints(folder / "checkpoints"):
+        raise ConfigError(
+            f"{folder} already holds a run: continue it with resume=true, or choose another run_dir"
+        )
+    elif train.resume:
+        say(f"nothing to resume in {folder}: starting there")
+    return folder
+
+
+def compare(settings: Settings, folder: Path, envs: Any, algos: Any) -> None:
+    """Raise ConfigError if the run in `folder` has other settings than these."""
+    saved = flat(settle(run_folder.read_config(folder), envs, algos).plain())
+    for name, value in flat(settings.plain()).items():
+        if name not in NOT_COMPARED and saved.get(name) != value:
+            raise ConfigError(
+                f"{name}={value} but {folder} was trained with {saved.get(name)}; "
+                f"for a new run from its policy use init_from={folder}"
+            )
+
+
+def same(settings: Settings, folder: Path, envs: Any, algos: Any) -> bool:
+    try:
+        compare(settings, folder, envs, algos)
+    except ConfigError:
+        return False
+    return True
+
+
+# ---- a run -----------------------------------------------------------------------------------
+
+
+def run(settings: Settings, envs: Any, algos: Any, job: int | None = None) -> int:
+    """Train, then draw, evaluate and film. Returns the exit status."""
+    runner.use_compilation_cache()
+    report = Report()
+    folder = choose_folder(settings, envs, algos, job, report.line)
+    train, cfg = settings.train, settings.algo
+    runner.check_devices(train)
+    env = make_env(settings, envs)
+    runner.check_memory(env, cfg, train)
+    program = runner.build(env, algos.ALGOS[settings.algo_name].make, cfg, train)
+    runner.check_state_memory(program, train)
+    adapt = None
+    if train.init_from is not None and run_folder.progress(folder) is None:
+        source = Path(train.init_from).expanduser()
+        run_folder.read_config(source)
+        policy = runner.read_policy(source, report.line)
+        runner.check_policy(jax.eval_shape(program.init, program.keys), policy, source)
+        adapt = lambda ts: runner.with_policy(ts, policy)  # noqa: E731
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        run_folder.write_config(folder, settings.plain())
+        engine = env.engine  # type: ignore[attr-defined]
+        run_folder.append_versions(folder, runner.device_name(), engine)
+    except OSError as error:
+        raise checkpoint.CheckpointError(f"cannot write to {folder}: {error.strerror}") from error
+    seeds = f"{train.num_seeds} seed{'s' if train.num_seeds > 1 else ''} x {cfg.num_envs} envs"
+    where = runner.device_name() + (f" x {train.devices}" if train.devices > 1 else "")
+    report.line(
+        f"jaxsafe {jaxsafe.__version__} | {settings.env_name} | {settings.algo_name} | {seeds} | "
+        f"{where}, engine {engine} | compiling rollout and update ..."
+    )
+    again = f"python scripts/train.py resume={shlex.quote(str(folder))}"
+    outcome = runner.train(program, cfg, train, folder, report, again, adapt)
+    if outcome.interrupted:
+        return 130
+    finish(settings, env, envs, algos, folder, report)
+    report.line(f"run folder: {folder}")
+    return 0
+
+
+def finish(settings: Settings, env: Env, envs: Any, algos: Any, folder: Path, report: Report) -> None:
+    """Curves, evaluation and video. What fails costs one line, never the training."""
+    train = settings.train
+    limit = float(settings.algo.cost_limit)
+    title = f"{settings.env_name}, {settings.algo_name}"
+    act, ts = policy_of(settings, env, algos, folder)
+
+    def curves() -> None:
+        plots.curves(run_folder.read_metrics(folder), folder / "curves.png", title, limit)
+
+    def evaluate() -> None:
+        episodes = evaluation.run_episodes(env, act, ts, train.eval_episodes, seed=train.seed)
+        rows = evaluation.summary(settings.env_name, episodes, limit, run_folder.read_metrics(folder))
+        text = json.dumps({"episodes": train.eval_episodes, **evaluation.as_json(rows)}, indent=1)
+        run_folder.replace_text(folder / "evaluation.json", text)
+        ret, cost, rate = rows["return"], rows["cost"], rows["violation rate"]
+        report.line(
+            f"final policy: return {ret.mean:.4g} [{ret.low:.4g}, {ret.high:.4g}], "
+            f"cost {cost.mean:.4g} [{cost.low:.4g}, {cost.high:.4g}] (limit {limit:g}), "
+            f"{100 * rate.mean:.0f}% of {episodes.ret.size} episodes over it"
+        )
+
+    def video() -> None:
+        first = jax.tree.map(lambda x: x[0], ts)
+        film(envs, env, lambda obs, key: act(first, obs, key), folder / "video.mp4", train.seed)
+
+    wanted = {
+        "curves": (curves, True),
+        "evaluation": (evaluate, train.eval_episodes > 0),
+        "video": (video, train.video),
+    }
+    for name, (task, yes) in wanted.items():
+        try:
+            if yes:
+                task()
+        except Exception as error:  # training is done and saved; this is an extra
+            report.line(f"no {name}: {one_line(error)}")
+
+
+def film(envs: Any, env: Env, policy: Callable, path: Path, seed: int) -> None:
+    """Write one episode as a video. The renderer is imported late: it wants a display."""
+    render = importlib.import_module(f"{envs.__name__}.render")
+    frames = render.render_episode(env, policy, jax.random.key(seed))
+    render.write_video(frames, path, fps=30)
+
+
+def policy_of(
+    settings: Settings, env: Env, algos: Any, folder: Path
+) -> tuple[evaluation.Policy, PyTree]:
+    """The algorithm's deterministic `act`, and the newest policy of each seed in a train state."""
+    algo = algos.ALGOS[settings.algo_name].make(env, None)
+    alone = dataclasses.replace(settings.algo, num_envs=1)
+    floats = jax.tree.map(np.float32, alone)
+    state = jax.eval_shape(lambda: algo.init(jax.random.key(0), floats))
+    arrays = runner.read_policy(folder)
+    rows = settings.train.num_seeds
+    return (lambda ts, obs, _: algo.act(ts, obs, None)), runner.policy_state(
+        state, arrays, rows, folder
+    )
+
+
+# ---- entry points ----------------------------------------------------------------------------
+
+
+def train_main(envs: Any, algos: Any) -> int:
+    """scripts/train.py. Exit status: 2 for bad input, 1 for a failed disk, 130 if stopped."""
+
+    def job(config: Any) -> None:
+        plain = OmegaConf.to_container(config, resolve=True)
+        number = HydraConfig.get().job.num if HydraConfig.get().mode == RunMode.MULTIRUN else None
+        # guarded here already: Hydra prints the overrides of a job that raises
+        status = guarded(lambda: run(settle(plain, envs, algos), envs, algos, number))  # type: ignore[arg-type]
+        if status:
+            raise SystemExit(status)
+
+    def command() -> int:
+        request = read_arguments(sys.argv[1:], envs, algos)
+        register(request)
+        sys.argv[1:] = request.argv
+        os.environ["HYDRA_FULL_ERROR"] = "1"  # raise, do not print: `guarded` prints
+        hydra.main(version_base="1.3", config_path=None, config_name="train")(job)()
+        return 0
+
+    return guarded(command)
+
+
+def guarded(command: Callable[[], int]) -> int:
+    """Run `command`; what the user can mend becomes one line on stderr and an exit status."""
+    try:
+        return command()
+    except (ConfigError, HydraException, OmegaConfBaseException) as error:
+        return complain(one_line(error), 2)
+    except checkpoint.CheckpointError as error:
+        return complain(one_line(error), 1)
+    except OSError as error:
+        if error.errno not in BAD_DISK:
+            raise
+        where = f" ({error.filename})" if error.filename else ""
+        return complain(f"{error.strerror}{where}; the last checkpoint stays", 1)
+    except jax.errors.JaxRuntimeError as error:
+        if "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        return complain(
+            "the device is out of memory; use fewer num_envs, num_seeds or a shorter horizon", 1
+        )
+
+
+def complain(line: str, status: int) -> int:
+    print(f"error: {line}", file=sys.stderr)
+    return status
+
+
+def fail(message: str) -> NoReturn:
+    raise ConfigError(message)
+
+
+def run_parser(description: str) -> argparse.ArgumentParser:
+    """Arguments of the scripts that read a run folder; errors are one line too."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.error = fail  # type: ignore[method-assign]
+    parser.add_argument("run", type=Path, metavar="RUN", help="a run folder")
+    parser.add_argument("--seed", type=int, default=1, help="of the fresh episodes (default 1)")
+    return parser
+
+
+def open_run(folder: Path, envs: Any, algos: Any) -> tuple[Settings, Env, evaluation.Policy, PyTree]:
+    """Settings, environment, policy and train states of a run folder. Executes nothing from it."""
+    settings = settle(run_folder.read_config(folder), envs, algos)
+    if not checkpoint.checkpoints(folder / "checkpoints"):
+        raise ConfigError(f"{folder} holds no checkpoint")
+    env = make_env(settings, envs)
+    return settings, env, *policy_of(settings, env, algos, folder)
+
+
+def evaluate_main(envs: Any, algos: Any) -> int:
+    """scripts/evaluate.py."""
+
+    def command() -> int:
+        parser = run_parser("Evaluate the policy of a run over fresh episodes.")
+        parser.add_argument("--episodes", type=int, default=100, help="for each seed (default 100)")
+        args = parser.parse_args()
+        if args.episodes < 1 or args.seed < 0:
+            raise ConfigError("--episodes must be at least 1 and --seed at least 0")
+        runner.use_compilation_cache()
+        settings, env, act, ts = open_run(args.run, envs, algos)
+        limit = float(settings.algo.cost_limit)
+        print(
+            f"{settings.env_name} | {settings.algo_name} | "
+            f"{settings.train.num_seeds} x {args.episodes} episodes, "
+            f"deterministic policy | cost limit {limit:g}",
+            flush=True,
+        )
+        episodes = evaluation.run_episodes(env, act, ts, args.episodes, args.seed)
+        metrics = run_folder.read_metrics(args.run)
+        print(evaluation.table(evaluation.summary(settings.env_name, episodes, limit, metrics)))
+        return 0
+
+    return guarded(command)
+
+
+def render_main(envs: Any, algos: Any) -> int:
+    """scripts/render.py."""
+
+    def command() -> int:
+        parser = run_parser("Film one episode of the policy of a run.")
+        parser.add_argument("--out", type=Path, help="an .mp4 or .gif (default RUN/video.mp4)")
+        parser.add_argument("--index", type=int, default=0, help="which of the run's seeds (default 0)")
+        args = parser.parse_args()
+        out = args.out or args.run / "video.mp4"
+        if out.suffix not in (".mp4", ".gif"):
+            raise ConfigError(f"--out {out}: expected a name that ends in .mp4 or .gif")
+        settings, env, act, states = open_run(args.run, envs, algos)
+        if not 0 <= args.index < settings.train.num_seeds:
+            raise ConfigError(f"--index {args.index}: the run has {settings.train.num_seeds} seeds")
+        ts = jax.tree.map(lambda x: x[args.index], states)
+        try:
+            film(envs, env, lambda obs, key: act(ts, obs, key), out, args.seed)
+        except RuntimeError as error:
+            return complain(one_line(error), 1)
+        print(out)
+        return 0
+
+    return guarded(command)
+
+
+# ---- plain values ----------------------------------------------------------------------------
+
+
+def to_plain(value: Any) -> Any:
+    """Dicts, lists and scalars of Python only, as YAML writes and reads them."""
+    if isinstance(value, dict):
+        return {str(k): to_plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [to_plain(v) for v in value]
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def flat(config: dict[str, Any]) -> dict[str, Any]:
+    """{'algo.clip': 0.2, ...}, one level deep."""
+    out: dict[str, Any] = {}
+    for name, value in config.items():
+        out |= (
+            {f"{name}.{k}": v for k, v in value.items()} if isinstance(value, dict) else {name: value}
+        )
+    return out
+
+
+def one_line(error: BaseException) -> str:
+    lines: Iterable[str] = (line.strip() for line in str(error).splitlines())
+    return next((line for line in lines if line), type(error).__name__)

@@ -1,0 +1,106 @@
+"""Configs: frozen dataclasses whose floats are pytree leaves, read strictly from plain values."""
+
+import dataclasses
+import difflib
+import math
+import types
+import typing
+from typing import Any, TypeVar, dataclass_transform
+
+import jax
+
+T = TypeVar("T")
+
+
+class ConfigError(ValueError):
+    """A setting that cannot be used. The message is one line for the user."""
+
+
+@dataclass_transform(frozen_default=True, kw_only_default=True)
+def config(cls: type[T]) -> type[T]:
+    """Make `cls` a frozen dataclass and a pytree: float fields are leaves, all others static.
+
+    A sweep over `cost_limit` or `lr` is then a `vmap`; a new value of an int, bool or str
+    field is a new program.
+    """
+    cls = dataclasses.dataclass(frozen=True, kw_only=True)(cls)
+    hints = typing.get_type_hints(cls)
+    leaves = [f.name for f in dataclasses.fields(cls) if hints[f.name] is float]  # type: ignore[arg-type]
+    static = [f.name for f in dataclasses.fields(cls) if hints[f.name] is not float]  # type: ignore[arg-type]
+    jax.tree_util.register_dataclass(cls, data_fields=leaves, meta_fields=static)
+    return cls
+
+
+def nearest(name: str, names: typing.Iterable[str]) -> str:
+    """'; did you mean X?' for the closest of `names`, or the list of them if none is close."""
+    names = sorted(names)
+    close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
+    return f"; did you mean {close[0]!r}?" if close else f"; valid: {', '.join(names)}"
+
+
+def from_dict(cls: type[T], values: dict[str, Any], where: str = "") -> T:
+    """Build the dataclass `cls` from plain values, with every name and type checked.
+
+    Args:
+        cls: a dataclass.
+        values: field name -> value, as read from YAML or a command line.
+        where: what to call the field in messages, e.g. 'env.'.
+    Raises:
+        ConfigError: an unknown name (with the nearest valid one) or a value of the wrong type.
+    """
+    hints = typing.get_type_hints(cls)
+    names = [f.name for f in dataclasses.fields(cls) if f.init]  # type: ignore[arg-type]
+    for name in values:
+        if name not in names:
+            raise ConfigError(f"unknown option {where}{name}{nearest(name, names)}")
+    return cls(**{k: convert(v, hints[k], f"{where}{k}") for k, v in values.items()})
+
+
+def convert(value: Any, kind: Any, name: str) -> Any:
+    """`value` as the annotated type `kind`: whole floats serve as ints, lists as tuples."""
+    origin, args = typing.get_origin(kind), typing.get_args(kind)
+    if kind is Any:
+        return value
+    if origin in (typing.Union, types.UnionType):
+        if value is None and type(None) in args:
+            return None
+        for option in (a for a in args if a is not type(None)):
+            try:
+                return convert(value, option, name)
+            except ConfigError:
+                continue
+    elif origin is tuple and isinstance(value, list | tuple):
+        if args[-1] is Ellipsis:
+            return tuple(convert(v, args[0], f"{name}[{i}]") for i, v in enumerate(value))
+        if len(value) == len(args):
+            return tuple(
+                convert(v, a, f"{name}[{i}]") for i, (v, a) in enumerate(zip(value, args, strict=True))
+            )
+    elif origin is typing.Literal:
+        if value in args:
+            return value
+        raise ConfigError(f"{name}={value!r}{nearest(str(value), map(str, args))}")
+    elif kind is bool and isinstance(value, bool):
+        return value
+    elif kind is str and isinstance(value, str):
+        return value
+    elif kind in (int, float) and isinstance(value, int | float) and not isinstance(value, bool):
+        if kind is float:
+            return float(value)
+        if math.isfinite(value) and value == int(value):
+            return int(value)
+    raise ConfigError(f"{name}={value!r}: expected {describe(kind)}")
+
+
+def describe(kind: Any) -> str:
+    """The annotated type in a user's words."""
+    origin, args = typing.get_origin(kind), typing.get_args(kind)
+    if origin in (typing.Union, types.UnionType):
+        return " or ".join("null" if a is type(None) else describe(a) for a in args)
+    if origin is tuple and args[-1] is Ellipsis:
+        return f"a list of {describe(args[0])}"
+    if origin is tuple:
+        return f"{len(args)} values ({', '.join(map(describe, args))})"
+    return {int: "a whole number", float: "a number", str: "a string", bool: "true or false"}.get(
+        kind, str(kind)
+    )

@@ -1,0 +1,127 @@
+"""Fresh episodes of a trained policy, and what Safety Gym reports about them."""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsafe import scores
+from jaxsafe.types import Env, PyTree
+
+Policy = Callable[[PyTree, jax.Array, jax.Array], jax.Array]  # (train state, obs, key) -> action
+
+
+class Episodes(NamedTuple):
+    """Sums over episodes: `ret`, `cost` and `length` are [S, N], `costs` is [S, N, K]."""
+
+    ret: np.ndarray
+    cost: np.ndarray
+    costs: np.ndarray
+    length: np.ndarray
+
+
+class Estimate(NamedTuple):
+    """A mean with its 95 % bootstrap interval."""
+
+    mean: float
+    low: float
+    high: float
+
+
+def episode(env: Env, act: Callable[[jax.Array, jax.Array], jax.Array], key: jax.Array) -> Episodes:
+    """One whole episode, pure: rewards and costs count until termination or the time limit."""
+    reset_key, act_key = jax.random.split(key)
+
+    def step(carry, t):
+        state, alive = carry
+        state = env.step(state, act(state.obs, jax.random.fold_in(act_key, t)))
+        sums = Episodes(alive * state.reward, alive * state.cost, alive * state.costs, alive)
+        return (state, alive * (1.0 - state.terminated)), sums
+
+    _, sums = jax.lax.scan(step, (env.reset(reset_key), jnp.float32(1)), jnp.arange(env.episode_length))
+    return jax.tree.map(lambda x: x.sum(0), sums)
+
+
+def run_episodes(env: Env, act: Policy, ts: PyTree, num_episodes: int, seed: int) -> Episodes:
+    """`num_episodes` fresh episodes for each of the S train states in `ts` (leading axis), compiled.
+
+    Every train state meets the same episodes, so that seeds differ by their policy alone.
+    """
+    keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), 0x6576616C), num_episodes)
+
+    def one_seed(ts: PyTree) -> Episodes:
+        return jax.vmap(lambda key: episode(env, lambda obs, k: act(ts, obs, k), key))(keys)
+
+    return jax.tree.map(np.asarray, jax.jit(jax.vmap(one_seed))(ts))
+
+
+def estimate(values: np.ndarray, draws: int = 10_000) -> Estimate:
+    """Mean of `values` [S, N] and its interval: seeds are resampled, then episodes within each.
+
+    With one seed the interval covers the episodes alone, not what another seed would give.
+    """
+    rng = np.random.default_rng(0)
+    values = np.asarray(values, float)
+    num_seeds, num_episodes = values.shape
+    means = np.empty(draws)
+    for i in range(draws):
+        rows = rng.integers(num_seeds, size=num_seeds) if num_seeds > 1 else np.zeros(1, int)
+        columns = rng.integers(num_episodes, size=(num_seeds, num_episodes))
+        means[i] = values[rows[:, None], columns].mean()
+    low, high = np.percentile(means, [2.5, 97.5])
+    return Estimate(float(values.mean()), float(low), float(high))
+
+
+def cost_rate(metrics: dict[str, np.ndarray]) -> np.ndarray | None:
+    """Safety Gym's cost rate, [S]: total training cost over total training steps; None if unknown.
+
+    `metrics` are the columns of metrics.csv.
+    """
+    if "train/cost_rate" not in metrics or not len(metrics["seed"]):
+        return None
+    rates = metrics["train/cost_rate"]  # of one iteration; all have the same number of steps
+    return np.array([np.nanmean(rates[metrics["seed"] == seed]) for seed in np.unique(metrics["seed"])])
+
+
+def summary(
+    env_name: str, episodes: Episodes, cost_limit: float, metrics: dict[str, np.ndarray]
+) -> dict[str, Estimate]:
+    """The rows of the table: return, cost, violation rate, cost rate and normalised scores."""
+    rows = {
+        "return": estimate(episodes.ret),
+        "cost": estimate(episodes.cost),
+        "violation rate": estimate(episodes.cost > cost_limit),
+        "episode length": estimate(episodes.length),
+    }
+    rate = cost_rate(metrics)
+    if rate is not None:
+        rows["cost rate (training)"] = estimate(rate[:, None])
+    if env_name in scores.CHARACTERISTIC:
+
+        def scaled(score: Callable, of: Estimate, *args: float) -> Estimate:
+            return Estimate(*(float(score(env_name, x, *args)) for x in of))
+
+        rows["normalised return"] = scaled(scores.normalized_return, rows["return"])
+        rows["normalised violation"] = scaled(scores.normalized_violation, rows["cost"], cost_limit)
+        if rate is not None:
+            rows["normalised cost rate"] = scaled(
+                scores.normalized_cost_rate, rows["cost rate (training)"]
+            )
+    return rows
+
+
+def table(rows: dict[str, Estimate]) -> str:
+    """Aligned plain text: a row each, mean and interval. A single number has no interval."""
+
+    def line(name: str, e: Estimate) -> str:
+        interval = "" if e.low == e.high == e.mean else f"[{e.low:10.4g}, {e.high:10.4g} ]"
+        return f"{name:<22}{e.mean:>10.4g}   {interval}".rstrip()
+
+    return "\n".join([f"{'':<22}{'mean':>10}   95 % interval", *(line(n, e) for n, e in rows.items())])
+
+
+def as_json(rows: dict[str, Estimate]) -> dict[str, list[float | None]]:
+    return {name: [x if math.isfinite(x) else None for x in e] for name, e in rows.items()}

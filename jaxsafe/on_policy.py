@@ -1,0 +1,323 @@
+"""The on-policy loop: rollout, estimates, treatment, step, as one pure update.
+
+`jit(update)` compiles an iteration, `vmap(update)` runs seeds or floats of the config side by side,
+and `shard_map(update)` with `axis_name` set splits environments over devices: each device then holds
+`cfg.num_envs` of its own and the same parameters, and gets the same key, which is folded with the
+device's index where devices must differ.
+"""
+
+import dataclasses
+import operator
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Literal, NamedTuple
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from jaxsafe.batch import all_finite, batch_mean, centre, masked_mean, psum, select, standardise
+from jaxsafe.config import ConfigError, config
+from jaxsafe.gaussian import Gaussian, entropy, log_prob, sample
+from jaxsafe.networks import init_params, policy, value
+from jaxsafe.normalise import init_normaliser, merge, normalise
+from jaxsafe.returns import gae, mean_length
+from jaxsafe.rollout import RolloutState, Trajectory, collect, init_rollout
+from jaxsafe.steps import Step, adam, fit_critic
+from jaxsafe.treatments import Treatment
+from jaxsafe.types import Env, Metrics, PyTree
+
+
+@config
+class OnPolicyConfig:
+    """What the on-policy algorithms share. [O] OmniSafe's default, [S] safety-starter-agents'."""
+
+    num_envs: int = 512  # per device; with horizon 32,768 steps a batch, near the 30,000 of [S]
+    horizon: int = 64  # steps of each environment per iteration
+    stagger: bool = True  # spread the first episodes' ends over time
+    total_iterations: float = float("inf")  # where learning rates reach 0; inf or 0: they stay
+    hidden: tuple[int, ...] = (64, 64)  # tanh units of each network [O]
+    init: Literal["orthogonal", "torch"] = "orthogonal"  # weights; [O] torch
+    init_log_std: float = -0.5  # of the actions' standard deviation [S]
+    obs_normalize: bool = True  # by running mean and variance [O]
+    discount: float = 0.99  # [O, S]
+    gae_lambda: float = 0.95  # [O]
+    cost_discount: float = 0.99  # [O, S], who name it but use `discount`
+    cost_gae_lambda: float = 0.95  # [O]
+    cost_limit: float = 25.0  # undiscounted cost per episode [O, S]; without constraint only a mark
+    minibatches: int = 8  # a pass over the batch, for policy and critics
+    critic_lr: float = 1e-3  # [S]; Adam
+    critic_epochs: int = 10  # passes of each critic; with 8 minibatches the 80 steps of [S]
+    critic_norm_coef: float = 1e-3  # times the sum of squared parameters [O]
+    max_grad_norm: float = 40.0  # of each network's gradient [O]
+
+
+@flax.struct.dataclass
+class TrainState:
+    """All that an update needs. Environment steps so far: iteration * num_envs * horizon.
+
+    config: the algorithm's, with its floats as arrays.
+    params: {'actor', 'critic_r', 'critic_c'}.
+    opt_state: {'actor': the step's own, 'critics': Adam's for both, stacked}.
+    dual: the treatment's state.
+    normaliser: Normaliser, or () without `obs_normalize`.
+    rollout: this device's environments.
+    episode_length: float [], running mean length of an episode, in steps.
+    """
+
+    config: Any
+    params: dict[str, PyTree]
+    opt_state: dict[str, PyTree]
+    dual: PyTree
+    normaliser: PyTree
+    rollout: RolloutState
+    episode_length: jax.Array
+    key: jax.Array
+    iteration: jax.Array
+
+
+@flax.struct.dataclass
+class Batch:
+    """B = T * N transitions, as the policy sees them: observations are normalised.
+
+    obs [B, O]; action [B, A]; log_prob [B] and old (Gaussian [B, A]) of the policy that acted;
+    adv_r standardised, adv_c only centred, in cost units; ret_r, ret_c: the critics' targets [B].
+    """
+
+    obs: jax.Array
+    action: jax.Array
+    log_prob: jax.Array
+    old: Gaussian
+    adv_r: jax.Array
+    adv_c: jax.Array
+    ret_r: jax.Array
+    ret_c: jax.Array
+
+
+class Algorithm(NamedTuple):
+    """init(key, cfg) -> ts; update(ts) -> (ts, metrics); act(ts, obs [..., O], key) -> action,
+    sampled, or the mean where key is None."""
+
+    init: Callable[[jax.Array, Any], TrainState]
+    update: Callable[[TrainState], tuple[TrainState, Metrics]]
+    act: Callable[[TrainState, jax.Array, jax.Array | None], jax.Array]
+
+
+def on_policy(
+    env: Env, treatment: Treatment, surrogate: Callable, step: Step, axis_name: str | None = None
+) -> Algorithm:
+    """Algorithms with one objective: the surrogate of the advantage that the treatment mixes."""
+
+    def improve(ts: TrainState, batch: Batch, cost: jax.Array, length: jax.Array, key: jax.Array):
+        cfg = ts.config
+        dual = treatment.update(ts.dual, cost, cfg)
+
+        def objective(actor: PyTree, batch: Batch) -> tuple[jax.Array, Metrics]:
+            advantage = treatment.advantage(dual, batch.adv_r, batch.adv_c)
+            return surrogate(policy(actor, batch.obs, cfg), batch, advantage, cfg)
+
+        actor, opt_state, metrics = step.update(
+            ts.params["actor"], ts.opt_state["actor"], objective, batch, key, cfg, axis_name
+        )
+        return actor, opt_state, dual, metrics | treatment.metrics(dual)
+
+    return loop(env, step.init, treatment.init, improve, axis_name)
+
+
+def on_policy_pair(
+    env: Env, surrogate: Callable, step: Step, axis_name: str | None = None
+) -> Algorithm:
+    """Algorithms whose step weighs reward against cost itself, so that it takes two objectives.
+
+    update(actor, opt_state, objective_r, objective_c, violation, batch, key, cfg, axis_name), where
+    violation = (J_c - cost_limit) / mean episode length: cost per step, the unit of objective_c.
+    """
+
+    def improve(ts: TrainState, batch: Batch, cost: jax.Array, length: jax.Array, key: jax.Array):
+        cfg = ts.config
+
+        def objective_r(actor: PyTree, batch: Batch) -> tuple[jax.Array, Metrics]:
+            return surrogate(policy(actor, batch.obs, cfg), batch, batch.adv_r, cfg)
+
+        def objective_c(actor: PyTree, batch: Batch) -> tuple[jax.Array, Metrics]:
+            return surrogate(policy(actor, batch.obs, cfg), batch, batch.adv_c, cfg)
+
+        violation = (cost - cfg.cost_limit) / length
+        actor, opt_state, metrics = step.update(
+            ts.params["actor"],
+            ts.opt_state["actor"],
+            objective_r,
+            objective_c,
+            violation,
+            batch,
+            key,
+            cfg,
+            axis_name,
+        )
+        return actor, opt_state, (), metrics
+
+    return loop(env, step.init, lambda cfg: (), improve, axis_name)
+
+
+def loop(
+    env: Env,
+    init_step: Callable[[PyTree, Any], PyTree],
+    init_dual: Callable[[Any], PyTree],
+    improve: Callable[..., tuple[PyTree, PyTree, PyTree, Metrics]],
+    axis_name: str | None,
+) -> Algorithm:
+    """The loop around `improve(ts, batch, episode_cost, episode_length, key)`, which returns
+    (actor, opt_state, dual, metrics)."""
+
+    def init(key: jax.Array, cfg: Any) -> TrainState:
+        check(cfg)
+        cfg = jax.tree.map(jnp.float32, cfg)
+        params_key, rollout_key, key = jax.random.split(key, 3)
+        params = init_params(params_key, env.obs_size, env.action_size, cfg)
+        return TrainState(
+            config=cfg,
+            params=params,
+            opt_state={
+                "actor": init_step(params["actor"], cfg),
+                "critics": jax.vmap(adam(cfg.critic_lr, cfg).init)(stack_critics(params)),
+            },
+            dual=init_dual(cfg),
+            normaliser=init_normaliser(env.obs_size) if cfg.obs_normalize else (),
+            rollout=init_rollout(env, own(rollout_key, axis_name), cfg.num_envs, cfg.stagger),
+            episode_length=jnp.float32(env.episode_length),
+            key=key,
+            iteration=jnp.int32(0),
+        )
+
+    def update(ts: TrainState) -> tuple[TrainState, Metrics]:
+        cfg = ts.config
+        key, rollout_key, step_key, critic_key = jax.random.split(ts.key, 4)
+
+        def behave(obs: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+            dist = policy(ts.params["actor"], see(ts, obs), cfg)
+            action = sample(dist, key)
+            return action, log_prob(dist, action)
+
+        rollout, traj = collect(env, behave, ts.rollout, own(rollout_key, axis_name), cfg.horizon)
+        batch, explained = estimate(ts, traj, axis_name)
+        length = mean_length(ts.episode_length, traj.ended, traj.length, axis_name)
+        cost_rate = batch_mean(traj.cost, axis_name)
+
+        actor, opt_actor, dual, metrics = improve(ts, batch, cost_rate * length, length, step_key)
+        fit = partial(fit_critic, obs=batch.obs, key=critic_key, cfg=cfg, axis_name=axis_name)
+        critics, opt_critics, errors, skipped = jax.vmap(lambda c, o, y: fit(c, o, target=y))(
+            stack_critics(ts.params), ts.opt_state["critics"], jnp.stack([batch.ret_r, batch.ret_c])
+        )
+        normaliser = merge(ts.normaliser, traj.obs, axis_name) if cfg.obs_normalize else ()
+        # parameters are guarded step by step; what is not a step of a gradient is guarded here
+        finite = psum(~all_finite((batch, normaliser)), axis_name) == 0
+        dual, normaliser, length = select(
+            finite, (dual, normaliser, length), (ts.dual, ts.normaliser, ts.episode_length)
+        )
+        critic_r, critic_c = (jax.tree.map(operator.itemgetter(i), critics) for i in range(2))
+        metrics |= episode_metrics(env, traj, axis_name) | explained
+        metrics |= {
+            "train/cost_rate": cost_rate,  # per environment step
+            "train/cost_estimate": cost_rate * length,  # J_c, what the constraint saw
+            "train/entropy": batch_mean(entropy(policy(actor, batch.obs, cfg)), axis_name),
+            "train/value_loss_r": errors[0],
+            "train/value_loss_c": errors[1],
+            "train/nonfinite": metrics["train/nonfinite"] + skipped.sum() + ~finite,
+        }
+        ts = dataclasses.replace(
+            ts,
+            params={"actor": actor, "critic_r": critic_r, "critic_c": critic_c},
+            opt_state={"actor": opt_actor, "critics": opt_critics},
+            dual=dual,
+            normaliser=normaliser,
+            rollout=rollout,
+            episode_length=length,
+            key=key,
+            iteration=ts.iteration + 1,
+        )
+        return ts, jax.tree.map(jnp.float32, metrics)
+
+    def act(ts: TrainState, obs: jax.Array, key: jax.Array | None) -> jax.Array:
+        dist = policy(ts.params["actor"], see(ts, obs), ts.config)
+        return dist.mean if key is None else sample(dist, key)
+
+    return Algorithm(init, update, act)
+
+
+def stack_critics(params: dict[str, PyTree]) -> PyTree:
+    """Both critics in one tree, [2, ...], so that they train in one program."""
+    return jax.tree.map(lambda *x: jnp.stack(x), params["critic_r"], params["critic_c"])
+
+
+def own(key: jax.Array, axis_name: str | None) -> jax.Array:
+    """A key of this device's own."""
+    return key if axis_name is None else jax.random.fold_in(key, jax.lax.axis_index(axis_name))
+
+
+def see(ts: TrainState, obs: jax.Array) -> jax.Array:
+    """`obs` [..., O] as the networks see it."""
+    return normalise(ts.normaliser, obs) if ts.config.obs_normalize else obs
+
+
+def check(cfg: Any) -> None:
+    """Refuse sizes that do not fit each other."""
+    for name in ("num_envs", "horizon", "minibatches"):
+        if getattr(cfg, name) < 1:
+            raise ConfigError(f"{name}={getattr(cfg, name)}: expected at least 1")
+    size = cfg.num_envs * cfg.horizon
+    if size % cfg.minibatches:
+        divisors = [m for m in range(1, size + 1) if size % m == 0]
+        raise ConfigError(
+            f"minibatches={cfg.minibatches}: expected a divisor of num_envs * horizon = {size}; "
+            f"the nearest is {min(divisors, key=lambda m: abs(m - cfg.minibatches))}"
+        )
+
+
+def estimate(ts: TrainState, traj: Trajectory, axis_name: str | None) -> tuple[Batch, Metrics]:
+    """Advantages and targets of reward and cost, under the parameters that acted."""
+    cfg = ts.config
+    obs, next_obs = see(ts, traj.obs), see(ts, traj.next_obs)
+
+    def both(critic: PyTree, signal: jax.Array, discount: jax.Array, decay: jax.Array):
+        v = value(critic, obs, cfg)
+        next_v = value(critic, next_obs, cfg)
+        adv = gae(signal, v, next_v, traj.terminated, traj.done, discount=discount, decay=decay)
+        return adv, adv + v
+
+    adv_r, ret_r = both(ts.params["critic_r"], traj.reward, cfg.discount, cfg.gae_lambda)
+    adv_c, ret_c = both(ts.params["critic_c"], traj.cost, cfg.cost_discount, cfg.cost_gae_lambda)
+    batch = Batch(
+        obs=obs,
+        action=traj.action,
+        log_prob=traj.log_prob,
+        old=policy(ts.params["actor"], obs, cfg),
+        adv_r=standardise(adv_r, axis_name),
+        adv_c=centre(adv_c, axis_name),
+        ret_r=ret_r,
+        ret_c=ret_c,
+    )
+    metrics = {
+        "train/explained_variance_r": explained_variance(adv_r, ret_r, axis_name),
+        "train/explained_variance_c": explained_variance(adv_c, ret_c, axis_name),
+    }
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch), metrics
+
+
+def explained_variance(error: jax.Array, target: jax.Array, axis_name: str | None) -> jax.Array:
+    """1 - var(target - value) / var(target): 1 is a perfect critic, 0 one that knows the mean only."""
+    total = batch_mean(centre(target, axis_name) ** 2, axis_name)
+    return 1 - batch_mean(centre(error, axis_name) ** 2, axis_name) / jnp.maximum(total, 1e-8)
+
+
+def episode_metrics(env: Env, traj: Trajectory, axis_name: str | None) -> Metrics:
+    """Means over the complete episodes that ended in the batch; NaN where there are none."""
+    over = partial(masked_mean, mask=traj.ended, axis_name=axis_name)
+    episode = traj.episode
+    return {
+        "train/episodes": psum(traj.ended.sum(), axis_name),
+        "train/return": over(episode.ret),
+        "train/cost": over(episode.cost),
+        "train/episode_length": over(traj.length),
+        **{f"train/cost_{name}": over(episode.costs[..., k]) for k, name in enumerate(env.cost_names)},
+        **{f"train/{name}": over(x) for name, x in episode.info.items()},
+    }

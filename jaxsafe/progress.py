@@ -1,0 +1,97 @@
+"""What a training run says while it runs: a live bar on a terminal, plain lines elsewhere."""
+
+import math
+import time
+from types import TracebackType
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn
+from rich.text import Text
+
+PLAIN_EVERY = 5.0  # s between lines when stdout is no terminal
+
+
+def short(value: float) -> str:
+    """About four significant digits; '-' for what is not known yet."""
+    if math.isnan(value):
+        return "-"
+    if abs(value) >= 1e4 or (value != 0 and abs(value) < 1e-3):
+        return f"{value:.1e}".replace("e+0", "e").replace("e-0", "e-")
+    return f"{value:.3g}" if abs(value) < 1e3 else f"{value:.0f}"
+
+
+def count(value: float) -> str:
+    for size, unit in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if value >= size:
+            return f"{value / size:.3g}{unit}"
+    return f"{value:.0f}"
+
+
+def clock(seconds: float) -> str:
+    if not math.isfinite(seconds):
+        return "-"
+    minutes, s = divmod(round(seconds), 60)
+    hours, m = divmod(minutes, 60)
+    return f"{hours}:{m:02d}:{s:02d}" if hours else f"{m}:{s:02d}"
+
+
+class Report:
+    """Prints to stdout; `with` it, so that a live bar is taken down whatever happens."""
+
+    def __init__(self, console: Console | None = None):
+        self.console = console or Console(highlight=False, soft_wrap=True)
+        self.live: Progress | None = None
+        self.last = {"ret": math.nan, "cost": math.nan, "lam": math.nan}  # finite values seen last
+        self.printed = -math.inf
+
+    def __enter__(self) -> "Report":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    def line(self, text: str) -> None:
+        self.console.print(text, markup=False)
+
+    def start(self, total_steps: int, steps: int, cost_limit: float) -> None:
+        self.total, self.cost_limit = total_steps, cost_limit
+        self.begun, self.begun_at = time.perf_counter(), steps
+        if self.console.is_terminal:
+            columns: list[ProgressColumn] = [
+                BarColumn(bar_width=20),
+                TextColumn("{task.percentage:>3.0f}%"),
+                TextColumn("{task.fields[text]}"),
+            ]
+            self.live = Progress(
+                *columns, console=self.console, auto_refresh=True, refresh_per_second=4
+            )
+            self.task = self.live.add_task(
+                "", total=total_steps, completed=steps, text=Text("first update")
+            )
+            self.live.start()
+
+    def update(self, steps: int, num_seeds: int, ret: float, cost: float, lam: float) -> None:
+        """Show the state after `steps` environment steps of each seed; NaN keeps the last value."""
+        now = time.perf_counter()
+        self.last.update(
+            {k: v for k, v in (("ret", ret), ("cost", cost), ("lam", lam)) if math.isfinite(v)}
+        )
+        rate = (steps - self.begun_at) / max(now - self.begun, 1e-9)  # of one seed
+        text = (
+            f"{count(steps)}/{count(self.total)} steps  {count(rate * num_seeds)} steps/s  "
+            f"return {short(self.last['ret'])}  "
+            f"cost {short(self.last['cost'])}/{short(self.cost_limit)}  "
+            f"lam {short(self.last['lam'])}  left {clock((self.total - steps) / max(rate, 1e-9))}"
+        )
+        if self.live:
+            self.live.update(self.task, completed=steps, text=text)
+        elif now - self.printed >= PLAIN_EVERY or steps >= self.total:
+            self.printed = now
+            self.line(f"{100 * steps / self.total:3.0f}%  {text}")
+
+    def stop(self) -> None:
+        if self.live:
+            self.live.stop()
+            self.live = None

@@ -1,0 +1,158 @@
+"""Vectorised rollouts: time limits, episode sums, and resets that come from a pool.
+
+An environment that is done takes the next unused entry of a pool of N fresh resets, so that every
+episode has a layout of its own and a step never pays for a reset. The pool is drawn anew when it
+holds fewer entries than there are environments done.
+"""
+
+import dataclasses
+from collections.abc import Callable
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsafe.types import Env, PyTree, State
+
+PolicyFn = Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
+
+
+@flax.struct.dataclass
+class Episode:
+    """Sums over an episode so far: float [N]; costs [N, K]; info a dict of [N]."""
+
+    ret: jax.Array
+    cost: jax.Array
+    costs: jax.Array
+    info: dict[str, jax.Array]
+
+
+@flax.struct.dataclass
+class RolloutState:
+    """What passes from one rollout to the next.
+
+    state: State of N environments.
+    steps: int32 [N], since the episode began; with `stagger` the first ones begin above 0.
+    episode: sums over the running episodes.
+    complete: bool [N], the episode began at step 0, so that its sums count in the statistics.
+    pool: State of N fresh resets.
+    used: int32 [], entries of the pool handed out.
+    """
+
+    state: State
+    steps: jax.Array
+    episode: Episode
+    complete: jax.Array
+    pool: State
+    used: jax.Array
+
+
+@flax.struct.dataclass
+class Trajectory:
+    """T steps of N environments; every field is [T, N, ...].
+
+    obs is before the step and next_obs after it, before any reset; truncated means out of time and
+    not terminated; done is either. ended marks complete episodes that end with this step; there
+    episode and length (int32, steps) are their sums.
+    """
+
+    obs: jax.Array
+    action: jax.Array
+    log_prob: jax.Array
+    reward: jax.Array
+    cost: jax.Array
+    costs: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    done: jax.Array
+    next_obs: jax.Array
+    ended: jax.Array
+    episode: Episode
+    length: jax.Array
+
+
+def init_rollout(env: Env, key: jax.Array, num_envs: int, stagger: bool) -> RolloutState:
+    """N fresh environments and a full pool.
+
+    With `stagger` the clocks of the first episodes are spread evenly over [0, episode_length), so
+    that later episodes end spread in time; all those that start above 0 are not complete.
+    """
+    state_key, pool_key = jax.random.split(key)
+    state = reset_all(env, state_key, num_envs)
+    spread = np.arange(num_envs, dtype=np.int64) * env.episode_length // num_envs  # int32 may overflow
+    steps = jnp.asarray(spread if stagger else 0 * spread, jnp.int32)
+    episode = jax.tree.map(jnp.zeros_like, Episode(state.reward, state.cost, state.costs, state.info))
+    pool = reset_all(env, pool_key, num_envs)
+    return RolloutState(state, steps, episode, steps == 0, pool, jnp.int32(0))
+
+
+def reset_all(env: Env, key: jax.Array, num_envs: int) -> State:
+    return jax.vmap(env.reset)(jax.random.split(key, num_envs))
+
+
+def collect(
+    env: Env, policy_fn: PolicyFn, rollout: RolloutState, key: jax.Array, horizon: int
+) -> tuple[RolloutState, Trajectory]:
+    """Step all environments `horizon` times.
+
+    Args:
+        policy_fn: (obs [N, O], key) -> action [N, A], log_prob [N].
+    """
+
+    def step(rollout: RolloutState, key: jax.Array) -> tuple[RolloutState, Trajectory]:
+        action_key, reset_key = jax.random.split(key)
+        obs = rollout.state.obs
+        action, log_prob = policy_fn(obs, action_key)
+        state = jax.vmap(env.step)(rollout.state, action)
+        steps = rollout.steps + 1
+        truncated = (steps >= env.episode_length) & ~state.terminated
+        done = state.terminated | truncated
+        last = Episode(state.reward, state.cost, state.costs, state.info)
+        episode = jax.tree.map(jnp.add, rollout.episode, last)
+        record = Trajectory(
+            obs=obs,
+            action=action,
+            log_prob=log_prob,
+            reward=state.reward,
+            cost=state.cost,
+            costs=state.costs,
+            terminated=state.terminated,
+            truncated=truncated,
+            done=done,
+            next_obs=state.obs,
+            ended=done & rollout.complete,
+            episode=episode,
+            length=steps,
+        )
+        rollout = dataclasses.replace(rollout, state=state, steps=steps, episode=episode)
+        return restart(env, rollout, done, reset_key), record
+
+    return jax.lax.scan(step, rollout, jax.random.split(key, horizon))
+
+
+def restart(env: Env, rollout: RolloutState, done: jax.Array, key: jax.Array) -> RolloutState:
+    """Put fresh resets where `done` [N] holds."""
+    num_envs, ends = done.shape[0], done.sum()
+    # runs at most once; a cond would turn into a select under vmap over seeds and pay at every step
+    pool, used = jax.lax.while_loop(
+        lambda carry: carry[1] + ends > num_envs,
+        lambda carry: (reset_all(env, key, num_envs), jnp.zeros_like(carry[1])),
+        (rollout.pool, rollout.used),
+    )
+    entry = used + jnp.cumsum(done) - 1
+    return RolloutState(
+        state=where(done, jax.tree.map(lambda x: x[entry], pool), rollout.state),
+        steps=jnp.where(done, 0, rollout.steps),
+        episode=where(done, jax.tree.map(jnp.zeros_like, rollout.episode), rollout.episode),
+        complete=rollout.complete | done,
+        pool=pool,
+        used=used + ends,
+    )
+
+
+def where(mask: jax.Array, new: PyTree, old: PyTree) -> PyTree:
+    """`new` where `mask` [N] holds, else `old`, in leaves of shape [N, ...]."""
+    return jax.tree.map(
+        lambda a, b: jnp.where(mask.reshape(mask.shape + (1,) * (b.ndim - 1)), a, b), new, old
+    )

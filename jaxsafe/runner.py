@@ -1,0 +1,387 @@
+"""The training loop: compile once, call `update`, log, checkpoint, stop when asked.
+
+Every array of the train state carries a leading axis here: over seeds, or over the devices
+that share the environments of one seed. The loop stays one update ahead of what it logs, so
+the device does not wait for the host.
+"""
+
+import contextlib
+import dataclasses
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import AxisType, NamedSharding, PartitionSpec
+
+from jaxsafe import checkpoint, run_folder
+from jaxsafe.config import ConfigError
+from jaxsafe.interrupts import Interrupts
+from jaxsafe.progress import Report
+from jaxsafe.types import Env, PyTree
+
+AXIS = "devices"
+POLICY = ("params", "normaliser")  # the fields of a train state that `act` reads
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TrainConfig:
+    """The settings beside `env` and `algo`."""
+
+    total_steps: int = 10_000_000  # environment steps of one seed, rounded up to whole updates
+    num_envs: int | None = None  # of one seed; null: algo.num_envs
+    num_seeds: int = 1  # trained at once: seed, seed + 1, ...
+    seed: int = 0
+    devices: int = 1  # the seeds are split over them or, for one seed, its environments
+    preset: str = "fast"  # the algorithm's defaults: fast, published, or one of its published settings
+    run_dir: str | None = None  # null: runs/<env>-<algo>/<time>-seed<seed>
+    resume: bool | str = False  # true: run_dir, or the newest unfinished run like this one; or a folder
+    init_from: str | None = None  # a run folder whose policy to start from
+    checkpoint_every: float = 60.0  # s between checkpoints
+    checkpoint_iterations: int = 0  # also after this many iterations; 0: by time alone
+    eval_episodes: int = 20  # at the end, for each seed; 0: none
+    video: bool = True  # of the first seed's policy, at the end
+
+    def __post_init__(self) -> None:
+        for name in ("total_steps", "num_envs", "num_seeds", "devices"):
+            if (value := getattr(self, name)) is not None and value < 1:
+                raise ConfigError(f"{name}={value}: expected at least 1")
+        for name in ("seed", "checkpoint_every", "checkpoint_iterations", "eval_episodes"):
+            if not (value := getattr(self, name)) >= 0:
+                raise ConfigError(f"{name}={value}: expected at least 0")
+        if self.seed + self.num_seeds > 2**31:
+            raise ConfigError(f"seed={self.seed}: expected less than {2**31 - self.num_seeds + 1}")
+        if self.devices > 1 and self.num_seeds % self.devices and self.num_seeds > 1:
+            raise ConfigError(
+                f"num_seeds={self.num_seeds} does not split over devices={self.devices}: "
+                f"expected a multiple of {self.devices}, or 1"
+            )
+
+    @property
+    def seeds(self) -> list[int]:
+        return list(range(self.seed, self.seed + self.num_seeds))
+
+    @property
+    def splits_envs(self) -> bool:
+        """One seed on several devices, each with a share of its environments."""
+        return self.devices > 1 and self.num_seeds == 1
+
+
+class Program(NamedTuple):
+    """`init(keys) -> ts` and `update(ts) -> (ts, metrics)`, over the leading axis; not yet compiled."""
+
+    init: Callable[[jax.Array], PyTree]
+    update: Callable[[PyTree], tuple[PyTree, dict[str, jax.Array]]]
+    keys: jax.Array  # [S], or [devices] for one split seed
+    sharding: jax.sharding.Sharding
+
+
+class Outcome(NamedTuple):
+    ts: PyTree
+    iteration: int
+    steps: int
+    interrupted: bool
+
+
+def use_compilation_cache() -> None:
+    """Keep XLA's programs in the user's cache folder, unless the user has chosen one."""
+    if jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
+        home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        folder = Path(home) / "jaxsafe" / "xla"
+        with contextlib.suppress(OSError):  # a read-only home only costs time
+            folder.mkdir(parents=True, exist_ok=True)
+            jax.config.update("jax_compilation_cache_dir", str(folder))
+
+
+def build(env: Env, make: Callable, algo_config: Any, settings: TrainConfig) -> Program:
+    """Spread one algorithm over seeds and devices.
+
+    Args:
+        env: the environment.
+        make: `make(env, axis_name) -> Algorithm` of the algorithm.
+        algo_config: its config.
+        settings: seeds and devices.
+    Raises:
+        ConfigError: the environments do not split over the devices.
+    """
+    devices = settings.devices
+    if settings.splits_envs:
+        if algo_config.num_envs % devices:
+            raise ConfigError(f"num_envs={algo_config.num_envs} does not split over devices={devices}")
+        algo_config = dataclasses.replace(algo_config, num_envs=algo_config.num_envs // devices)
+    floats = jax.tree.map(jnp.float32, algo_config)
+    algo = make(env, AXIS if settings.splits_envs else None)
+    rows = settings.num_seeds // devices if not settings.splits_envs else 1  # on each device
+    init = over_rows(lambda key: algo.init(key, floats), rows)
+    update = over_rows(algo.update, rows)
+    # A split seed has one key for all its devices: the algorithm folds the device's index in.
+    keys = jax.vmap(jax.random.key)(
+        np.array(settings.seeds * (devices if settings.splits_envs else 1), np.uint32)
+    )
+    if devices == 1:
+        return Program(init, update, keys, jax.sharding.SingleDeviceSharding(jax.local_devices()[0]))
+    if jax.default_backend() == "gpu":
+        # Shardy crashes on programs around MJX-Warp in JAX 0.11, and what it replaces on callbacks.
+        jax.config.update("jax_use_shardy_partitioner", False)
+    mesh = jax.make_mesh(
+        (devices,), (AXIS,), devices=jax.local_devices()[:devices], axis_types=(AxisType.Auto,)
+    )
+    spec = PartitionSpec(AXIS)
+
+    def split(fn: Callable) -> Callable:
+        return jax.shard_map(fn, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
+
+    return Program(split(init), split(update), keys, NamedSharding(mesh, spec))
+
+
+def over_rows(fn: Callable[[PyTree], PyTree], rows: int) -> Callable[[PyTree], PyTree]:
+    """`fn` over a leading axis of `rows`. One row is no vmap, which would run both sides of a cond."""
+
+    def strong(tree: PyTree) -> PyTree:  # no weak types, so that a restored state is the same program
+        return jax.tree.map(lambda x: x if checkpoint.is_key(x) else jnp.asarray(x, x.dtype), tree)
+
+    if rows > 1:
+        return lambda xs: strong(jax.vmap(fn)(xs))
+    return lambda xs: strong(jax.tree.map(lambda y: y[None], fn(jax.tree.map(lambda x: x[0], xs))))
+
+
+def check_devices(settings: TrainConfig) -> None:
+    if settings.devices > jax.local_device_count():
+        raise ConfigError(
+            f"devices={settings.devices}: JAX sees {jax.local_device_count()} ({jax.default_backend()})"
+            + ("; set JAX_NUM_CPU_DEVICES to split the CPU" if jax.default_backend() == "cpu" else "")
+        )
+
+
+def check_memory(env: Env, algo_config: Any, settings: TrainConfig) -> None:
+    """Refuse, before anything compiles, a trajectory that cannot fit the device.
+
+    A lower bound: observations before and after each step, actions and a few scalars.
+    """
+    limit, what = device_memory()
+    step = 4 * (2 * env.obs_size + env.action_size + 8 + len(env.cost_names))  # bytes
+    need = step * algo_config.num_envs * algo_config.horizon * settings.num_seeds // settings.devices
+    if need > limit:
+        raise ConfigError(
+            f"num_envs={algo_config.num_envs} x horizon={algo_config.horizon} x "
+            f"num_seeds={settings.num_seeds} needs at least {need / 2**30:,.1f} GiB a device, "
+            f"{what} has {limit / 2**30:,.1f}; use fewer num_envs"
+        )
+
+
+def check_state_memory(program: Program, settings: TrainConfig) -> None:
+    """Like `check_memory`, for the train state itself (old and new), known once it is traced."""
+    limit, what = device_memory()
+    leaves = jax.tree.leaves(jax.eval_shape(program.init, program.keys))
+    need = (
+        2
+        * sum(x.size * (8 if checkpoint.is_key(x) else x.dtype.itemsize) for x in leaves)
+        // settings.devices
+    )
+    if need > limit:
+        raise ConfigError(
+            f"the train state needs {need / 2**30:,.1f} GiB a device, {what} has {limit / 2**30:,.1f}; "
+            "use fewer num_envs or num_seeds"
+        )
+
+
+def device_memory() -> tuple[float, str]:
+    """Bytes that the first device can hold, and what to call them; infinite where unknown."""
+    stats = jax.local_devices()[0].memory_stats() if jax.default_backend() != "cpu" else None
+    if stats and "bytes_limit" in stats:
+        return float(stats["bytes_limit"]), "the device"
+    limits = [float("inf")]
+    with contextlib.suppress(OSError, ValueError):
+        rows = dict(line.split(":", 1) for line in Path("/proc/meminfo").read_text().splitlines())
+        limits.append(float(rows["MemAvailable"].split()[0]) * 1024)
+    for path in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
+        with contextlib.suppress(OSError, ValueError):
+            limits.append(float(Path(path).read_text()))
+    return min(limits), "this machine"
+
+
+def device_name() -> str:
+    device = jax.local_devices()[0]
+    return f"cpu ({os.cpu_count()} cores)" if device.platform == "cpu" else str(device.device_kind)
+
+
+def train(
+    program: Program,
+    algo_config: Any,
+    settings: TrainConfig,
+    folder: Path,
+    report: Report,
+    resume_command: str,
+    adapt: Callable[[PyTree], PyTree] | None = None,
+) -> Outcome:
+    """Train to `settings.total_steps`, from the newest checkpoint in `folder` if there is one.
+
+    Args:
+        program: from `build`.
+        algo_config: for the steps of an update and the cost limit.
+        settings: the rest of the settings.
+        folder: the run folder; gets metrics.csv, tensorboard/ and checkpoints/.
+        report: where progress goes.
+        resume_command: printed when the run is stopped early.
+        adapt: changes a fresh train state (start from another policy); not used on resumption.
+    Returns:
+        The train state, with its leading axis, and how far it is.
+    Raises:
+        checkpoint.CheckpointError, OSError: the disk failed; the last good checkpoint stays.
+    """
+    per_update = algo_config.num_envs * algo_config.horizon  # steps of one seed
+    iterations = -(-settings.total_steps // per_update)
+    store = folder / "checkpoints"
+    resuming = bool(checkpoint.checkpoints(store))
+    with report, Interrupts(report.line) as stop:
+        stop.nothing_to_save = (
+            f"stopped before the first update; {resume_command if resuming else 'nothing to save'}"
+        )
+        start = time.perf_counter()
+        iteration = 0
+        if resuming:
+            like = jax.eval_shape(program.init, program.keys)
+            ts, manifest = checkpoint.restore(store, like, report.line)
+            ts, iteration = jax.device_put(ts, program.sharding), manifest.iteration
+            report.line(f"resuming at {manifest.steps:,} steps")
+        else:
+            ts = jax.jit(program.init)(jax.device_put(program.keys, program.sharding))
+            ts = jax.device_put(adapt(ts), program.sharding) if adapt else ts
+        if iteration >= iterations:
+            report.line("nothing left to train")
+            return Outcome(ts, iteration, iteration * per_update, False)
+        names = sorted(jax.eval_shape(program.update, ts)[1])
+        update = jax.jit(program.update, donate_argnums=0).lower(ts).compile()
+        report.line(f"compiled in {time.perf_counter() - start:.1f} s")
+        stop.nothing_to_save = ""
+
+        with Log(folder, names, settings, iteration, per_update) as log:
+            report.start(iterations * per_update, iteration * per_update, float(algo_config.cost_limit))
+            pending, saved_at = None, time.perf_counter()
+            while iteration < iterations:
+                ts, metrics = update(ts)
+                if pending:
+                    log.append(*pending, report)
+                iteration, pending = iteration + 1, (iteration + 1, metrics)
+                by_count = (
+                    settings.checkpoint_iterations and iteration % settings.checkpoint_iterations == 0
+                )
+                by_time = time.perf_counter() - saved_at >= settings.checkpoint_every
+                if stop.requested or by_count or by_time or iteration == iterations:
+                    log.append(*pending, report)
+                    log.sync()
+                    checkpoint.save(store, ts, iteration, iteration * per_update)
+                    pending, saved_at = None, time.perf_counter()
+                if stop.requested:
+                    break
+        report.stop()
+        interrupted = iteration < iterations
+        if interrupted:
+            report.line(f"stopped at {iteration * per_update:,} steps; continue with: {resume_command}")
+    return Outcome(ts, iteration, iteration * per_update, interrupted)
+
+
+class Log:
+    """Metrics to metrics.csv, TensorBoard and the progress report."""
+
+    def __init__(
+        self, folder: Path, names: list[str], settings: TrainConfig, iteration: int, per_update: int
+    ):
+        self.settings, self.per_update = settings, per_update
+        self.csv = run_folder.Metrics(folder, names, iteration)
+        self.begun = time.perf_counter() - self.csv.seconds
+        self.boards = [
+            run_folder.Board(folder / "tensorboard" / f"seed{seed}", iteration * per_update)
+            for seed in settings.seeds
+        ]
+
+    def __enter__(self) -> "Log":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.csv.close()
+        for board in self.boards:
+            board.close()
+
+    def append(self, iteration: int, metrics: dict[str, jax.Array], report: Report) -> None:
+        values = {k: np.asarray(v, np.float32) for k, v in jax.device_get(metrics).items()}
+        steps, seconds = iteration * self.per_update, time.perf_counter() - self.begun
+        self.csv.append(iteration, steps, self.settings.seeds, seconds, values)
+        for s, board in enumerate(self.boards):
+            board.append(steps, {name: float(value[s]) for name, value in values.items()})
+        report.update(
+            steps,
+            self.settings.num_seeds,
+            **{
+                short: mean(values[name]) if name in values else float("nan")
+                for short, name in (
+                    ("ret", "train/return"),
+                    ("cost", "train/cost"),
+                    ("lam", "train/lam"),
+                )
+            },
+        )
+
+    def sync(self) -> None:
+        self.csv.sync()
+        for board in self.boards:
+            board.flush()
+
+
+def mean(values: np.ndarray) -> float:
+    """Over the seeds that have a value."""
+    finite = values[np.isfinite(values)]
+    return float(finite.mean()) if len(finite) else float("nan")
+
+
+# ---- the policy alone: other runs start from it, evaluation needs nothing else ----------------
+
+
+def read_policy(folder: Path, warn: Callable[[str], None] | None = None) -> dict[str, np.ndarray]:
+    """Parameters and normaliser in the newest checkpoint of a run folder, by leaf name, [rows, ...]."""
+    arrays, _ = checkpoint.load(folder / "checkpoints", warn)
+    # rows beyond the seeds are the copies on the other devices of a split seed
+    rows = max(1, int(run_folder.read_config(folder).get("num_seeds", 1)))
+    return {name: x[:rows] for name, x in arrays.items() if name.split(".")[0] in POLICY}
+
+
+def check_policy(like: PyTree, policy: dict[str, np.ndarray], source: Path) -> None:
+    """Raise ConfigError unless `policy` fits the train state `like`, apart from the number of rows."""
+    expected = dict(zip(checkpoint.leaf_names(like), jax.tree.leaves(like), strict=True))
+    expected = {k: v for k, v in expected.items() if k.split(".")[0] in POLICY}
+    for name in sorted({*expected, *policy}):
+        have, want = (
+            str(list(x[name].shape[1:])) if name in x else "absent" for x in (policy, expected)
+        )
+        if have != want:
+            raise ConfigError(f"the policy of {source} does not fit: {name} is {have}, expected {want}")
+    rows, wanted = len(next(iter(policy.values()))), len(jax.tree.leaves(like)[0])
+    if rows not in (1, wanted):
+        raise ConfigError(f"{source} has {rows} seeds, expected 1 or {wanted}")
+
+
+def with_policy(ts: PyTree, policy: dict[str, np.ndarray]) -> PyTree:
+    """`ts` with the parameters and normaliser of `policy`; one row serves all."""
+    leaves, treedef = jax.tree.flatten(ts)
+    named = zip(checkpoint.leaf_names(ts), leaves, strict=True)
+    return treedef.unflatten(
+        [
+            jnp.broadcast_to(jnp.asarray(policy[n], x.dtype), x.shape) if n in policy else x
+            for n, x in named
+        ]
+    )
+
+
+def policy_state(like: PyTree, policy: dict[str, np.ndarray], rows: int, source: Path) -> PyTree:
+    """A train state with `rows` policies and zeros elsewhere; `like` is one, without that axis."""
+    like = jax.tree.map(lambda x: jax.ShapeDtypeStruct((rows, *x.shape), x.dtype), like)
+    check_policy(like, policy, source)
+    arrays = {
+        name: policy[name] if name in policy else np.zeros(x.shape, x.dtype)
+        for name, x in checkpoint.as_data(like).items()
+    }
+    return checkpoint.from_arrays(like, arrays)

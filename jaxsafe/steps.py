@@ -1,0 +1,164 @@
+"""First-order steps: epochs of Adam on minibatches, for policies and for critics.
+
+Policy and critics have loops of their own, so that stopping the policy early leaves the critics'
+passes alone. OmniSafe alternates them on each minibatch and stops all three together.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from jaxsafe.batch import batch_mean, pmean, select
+from jaxsafe.gaussian import Gaussian, kl
+from jaxsafe.networks import policy, value
+from jaxsafe.types import Metrics, PyTree
+
+# (actor, batch) -> (this device's mean of what to maximise, metrics)
+Objective = Callable[[PyTree, Any], tuple[jax.Array, Metrics]]
+
+
+class Step(NamedTuple):
+    """A rule that moves the policy; one objective or two, as its `update` says.
+
+    init(actor, cfg) -> opt_state
+    update(actor, opt_state, objective, batch, key, cfg, axis_name) -> (actor, opt_state, metrics)
+    """
+
+    init: Callable[[PyTree, Any], PyTree]
+    update: Callable[..., tuple[PyTree, PyTree, Metrics]]
+
+
+class AdamState(NamedTuple):
+    adam: PyTree
+    iteration: jax.Array  # int32 [], updates so far
+
+
+def adam(lr: jax.Array | float, cfg: Any) -> optax.GradientTransformation:
+    return optax.chain(optax.clip_by_global_norm(cfg.max_grad_norm), optax.adam(lr))
+
+
+def descend(
+    optimiser: optax.GradientTransformation, params: PyTree, opt_state: PyTree, grads: PyTree
+) -> tuple[PyTree, PyTree, jax.Array]:
+    """One step of `optimiser`, or none if a gradient is not finite: (params, opt_state, skipped)."""
+    change, new_state = optimiser.update(grads, opt_state, params)
+    finite = jnp.isfinite(optax.tree.norm(grads))
+    new = (optax.apply_updates(params, change), new_state)
+    return *select(finite, new, (params, opt_state)), ~finite
+
+
+def one_pass(
+    step: Callable[[PyTree, PyTree], tuple[PyTree, PyTree]],
+    carry: PyTree,
+    data: PyTree,
+    key: jax.Array,
+    minibatches: int,
+) -> tuple[PyTree, PyTree]:
+    """Scan `step(carry, minibatch)` over a shuffle of `data`, whose leaves are [B, ...]."""
+    size = jax.tree.leaves(data)[0].shape[0]
+    rows = jax.random.permutation(key, size).reshape(minibatches, size // minibatches)
+
+    def on_rows(carry: PyTree, rows: jax.Array) -> tuple[PyTree, PyTree]:
+        return step(carry, jax.tree.map(lambda x: x[rows], data))
+
+    return jax.lax.scan(on_rows, carry, rows)
+
+
+def mean_kl(old: Gaussian, new: Gaussian, axis_name: str | None) -> jax.Array:
+    return batch_mean(kl(old, new), axis_name)
+
+
+def init_adam(actor: PyTree, cfg: Any) -> AdamState:
+    return AdamState(adam(cfg.lr, cfg).init(actor), jnp.int32(0))
+
+
+def update_adam(
+    actor: PyTree,
+    opt_state: AdamState,
+    objective: Objective,
+    batch: Any,
+    key: jax.Array,
+    cfg: Any,
+    axis_name: str | None,
+) -> tuple[PyTree, AdamState, Metrics]:
+    """Up to `cfg.epochs` passes over the batch, until KL(old || new) > `cfg.target_kl`.
+
+    The KL is the mean over the whole batch, taken after each pass; there is no way back. The
+    learning rate falls linearly to 0 at `cfg.total_iterations`, if `cfg.lr_decay`.
+    """
+    total = jnp.where(cfg.total_iterations > 0, cfg.total_iterations, jnp.inf)
+    left = jnp.maximum(0.0, 1.0 - opt_state.iteration / total) if cfg.lr_decay else 1.0
+    optimiser = adam(cfg.lr * left, cfg)
+
+    def minibatch_step(carry: PyTree, batch: Any) -> tuple[PyTree, jax.Array]:
+        grads = jax.grad(lambda actor: -objective(actor, batch)[0])(carry[0])
+        actor, state, skipped = descend(optimiser, carry[0], carry[1], pmean(grads, axis_name))
+        return (actor, state), skipped
+
+    def next_pass(carry: PyTree) -> PyTree:
+        params, key, passes, _, skipped = carry
+        key, shuffle_key = jax.random.split(key)
+        params, skips = one_pass(minibatch_step, params, batch, shuffle_key, cfg.minibatches)
+        divergence = mean_kl(batch.old, policy(params[0], batch.obs, cfg), axis_name)
+        return params, key, passes + 1, divergence, skipped + skips.sum()
+
+    (actor, state), _, passes, divergence, skipped = jax.lax.while_loop(
+        lambda carry: (carry[2] < cfg.epochs) & ~(carry[3] > cfg.target_kl),
+        next_pass,
+        ((actor, opt_state.adam), key, jnp.int32(0), jnp.zeros(()), jnp.int32(0)),
+    )
+    final, metrics = pmean(objective(actor, batch), axis_name)
+    return (
+        actor,
+        AdamState(state, opt_state.iteration + 1),
+        {
+            "train/kl": divergence,
+            "train/passes": passes,
+            "train/objective": final,
+            "train/nonfinite": skipped,
+            **metrics,
+        },
+    )
+
+
+adam_epochs = Step(init=init_adam, update=update_adam)
+
+
+def fit_critic(
+    critic: PyTree,
+    opt_state: PyTree,
+    obs: jax.Array,
+    target: jax.Array,
+    key: jax.Array,
+    cfg: Any,
+    axis_name: str | None,
+) -> tuple[PyTree, PyTree, jax.Array, jax.Array]:
+    """`cfg.critic_epochs` passes of Adam on mean (V - target)^2 + critic_norm_coef sum theta^2.
+
+    Args:
+        obs, target: float [B, O] and [B].
+    Returns:
+        critic, opt_state, the mean squared error during the last pass, and the number of
+        minibatch steps skipped because their gradient was not finite.
+    """
+    optimiser = adam(cfg.critic_lr, cfg)
+
+    def loss(critic: PyTree, obs: jax.Array, target: jax.Array) -> tuple[jax.Array, jax.Array]:
+        error = jnp.mean((value(critic, obs, cfg) - target) ** 2)
+        return error + cfg.critic_norm_coef * sum(jnp.sum(x**2) for x in jax.tree.leaves(critic)), error
+
+    def minibatch_step(carry: PyTree, data: PyTree) -> tuple[PyTree, PyTree]:
+        grads, error = jax.grad(loss, has_aux=True)(carry[0], *data)
+        critic, state, skipped = descend(optimiser, carry[0], carry[1], pmean(grads, axis_name))
+        return (critic, state), (error, skipped)
+
+    def next_pass(carry: PyTree, key: jax.Array) -> tuple[PyTree, PyTree]:
+        return one_pass(minibatch_step, carry, (obs, target), key, cfg.minibatches)
+
+    (critic, opt_state), (error, skipped) = jax.lax.scan(
+        next_pass, (critic, opt_state), jax.random.split(key, cfg.critic_epochs)
+    )
+    return critic, opt_state, batch_mean(error[-1], axis_name), skipped.sum()

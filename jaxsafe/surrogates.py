@@ -1,0 +1,29 @@
+"""Surrogates: what a policy change is estimated to earn, from a batch of the old policy.
+
+Each is (dist, batch, advantage [B], cfg) -> (float [], metrics): the mean over this device's share
+of the batch of something to maximise. dist is the new policy at `batch.obs`, and
+
+    w = pi(a | s) / pi_old(a | s)
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxsafe.gaussian import Gaussian, log_prob
+from jaxsafe.types import Metrics
+
+
+def plain(dist: Gaussian, batch: Any, advantage: jax.Array, cfg: Any) -> tuple[jax.Array, Metrics]:
+    """E[w A]. Source: Kakade and Langford (2002); Schulman et al. (2015), equation 14."""
+    w = jnp.exp(log_prob(dist, batch.action) - batch.log_prob)
+    return jnp.mean(w * advantage), {}
+
+
+def clipped(dist: Gaussian, batch: Any, advantage: jax.Array, cfg: Any) -> tuple[jax.Array, Metrics]:
+    """E[min(w A, clip(w, 1 - eps, 1 + eps) A)]. Source: Schulman et al. (2017), equation 7."""
+    w = jnp.exp(log_prob(dist, batch.action) - batch.log_prob)
+    near = jnp.clip(w, 1 - cfg.clip, 1 + cfg.clip)
+    fraction = jnp.mean(jnp.abs(w - 1) > cfg.clip)
+    return jnp.mean(jnp.minimum(w * advantage, near * advantage)), {"train/clip_fraction": fraction}

@@ -1,0 +1,164 @@
+"""Measure environments and fused training: python scripts/benchmark.py point_goal1 --num-envs 1024
+
+Each row is one program, compiled apart from its runs: the median of `--repeats` runs after a first
+one that allocates. With `--algo` a row is the algorithm's whole update, else random actions, resets
+included. A physics step is one substep; the forward pass at the end of a step is not counted.
+"""
+
+import argparse
+import json
+import os
+import platform
+import resource
+import statistics
+import sys
+import time
+from importlib.metadata import version
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+
+from jaxsafe import algos, envs
+from jaxsafe.config import ConfigError
+from jaxsafe.rollout import collect, init_rollout
+from jaxsafe.runner import device_name, use_compilation_cache
+
+
+def timed(fn, *args, repeats: int) -> tuple[float, list[float]]:
+    """Compile time, then the run times of `state = fn(state)`, in seconds."""
+    start = time.perf_counter()
+    compiled = jax.jit(fn, donate_argnums=0).lower(*args).compile()
+    compile_time, runs = time.perf_counter() - start, []
+    state = args[0]
+    for _ in range(repeats + 1):
+        start = time.perf_counter()
+        state = jax.block_until_ready(compiled(state))
+        runs.append(time.perf_counter() - start)
+    return compile_time, runs[1:]
+
+
+def stepping(env, num_envs: int, seeds: int, horizon: int):
+    """(state, fn): `horizon` steps of random actions, with resets."""
+
+    def policy(obs, key):
+        action = jax.random.uniform(key, (num_envs, env.action_size), minval=-1.0, maxval=1.0)
+        return action, jnp.zeros(num_envs)
+
+    def run(state):
+        rollout, key = state
+        key, next_key = jax.random.split(key)
+        rollout, trajectory = collect(env, policy, rollout, key, horizon)
+        return (rollout, next_key), trajectory.reward.sum() + trajectory.obs.sum()
+
+    def init(key):
+        return init_rollout(env, key, num_envs, stagger=True), key
+
+    return per_seed(init, seeds), lambda state: jax.vmap(run)(state)[0]
+
+
+def training(env, algo: str, cfg, seeds: int):
+    """(state, fn): one update of `algo`."""
+    algorithm = algos.ALGOS[algo].make(env)
+    return (
+        per_seed(lambda key: algorithm.init(key, cfg), seeds),
+        lambda ts: jax.vmap(algorithm.update)(ts)[0],
+    )
+
+
+def per_seed(init, seeds: int):
+    return jax.jit(jax.vmap(init))(jax.random.split(jax.random.key(0), seeds))
+
+
+def memory() -> int:
+    """Most bytes in use so far: on the device, or of this process on a CPU."""
+    stats = jax.local_devices()[0].memory_stats()
+    if stats and "peak_bytes_in_use" in stats:
+        return stats["peak_bytes_in_use"]
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+def measure(name: str, num_envs: int, args: argparse.Namespace) -> dict:
+    env = envs.make(name, engine=args.engine)
+    if args.algo:
+        config = algos.ALGOS[args.algo].config
+        cfg = config(num_envs=num_envs, **({"horizon": args.horizon} if args.horizon else {}))
+        horizon = cfg.horizon
+        state, fn = training(env, args.algo, cfg, args.seeds)
+    else:
+        horizon = args.horizon or 100
+        state, fn = stepping(env, num_envs, args.seeds, horizon)
+    compile_time, runs = timed(fn, state, repeats=args.repeats)
+    seconds = statistics.median(runs)
+    rate = num_envs * horizon * args.seeds / seconds
+    return {
+        "env": name,
+        "engine": env.engine,
+        "algo": args.algo,
+        "num_envs": num_envs,
+        "num_seeds": args.seeds,
+        "horizon": horizon,
+        "env_steps_per_s": rate,
+        "physics_steps_per_s": rate * env.config.frameskip_binom_n,
+        "simulated_s_per_s": rate * env.step_seconds,
+        "fastest": num_envs * horizon * args.seeds / min(runs),
+        "slowest": num_envs * horizon * args.seeds / max(runs),
+        "compile_s": compile_time,
+        "memory_bytes": memory(),
+    }
+
+
+def versions() -> dict[str, str]:
+    packages = ("jax", "mujoco", "mujoco-mjx", "warp-lang", "jaxsafe")
+    found = {"python": platform.python_version(), "device": device_name(), "cores": str(os.cpu_count())}
+    for package in packages:
+        try:
+            found[package] = version(package)
+        except ImportError:
+            continue
+    return found
+
+
+def show(row: dict) -> str:
+    what = row["algo"] or "steps"
+    return (
+        f"{row['env']:<14} {row['engine']:<5} {what:<8} {row['num_seeds']:>3} x {row['num_envs']:<6} "
+        f"{row['env_steps_per_s']:>11,.0f} {row['physics_steps_per_s']:>12,.0f} "
+        f"{row['simulated_s_per_s']:>10,.0f} {row['compile_s']:>8.1f} {row['memory_bytes'] / 2**30:>7.2f}"
+    )
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("envs", nargs="+", metavar="ENV")
+    parser.add_argument("--num-envs", type=int, nargs="+", default=[256], help="of each seed")
+    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--engine", default="auto", help="auto, c, warp or jax")
+    parser.add_argument("--algo", help="measure its update instead of random actions")
+    parser.add_argument("--horizon", type=int, help="steps of each environment in a run")
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--json", type=Path, help="append the rows to this file, a line each")
+    args = parser.parse_args()
+    use_compilation_cache()
+    print(f"{' '.join(f'{k} {v}' for k, v in versions().items())}")
+    print(
+        f"{'env':<14} {'engine':<5} {'what':<8} {'seeds x envs':<12} {'env steps/s':>11} "
+        f"{'physics/s':>12} {'sim s/s':>10} {'compile':>8} {'GiB':>7}"
+    )
+    try:
+        for name in args.envs:
+            for num_envs in args.num_envs:
+                row = measure(name, num_envs, args)
+                print(show(row), flush=True)
+                if args.json:
+                    with args.json.open("a") as file:
+                        command = "python " + " ".join(sys.argv)
+                        file.write(json.dumps(row | {"command": command, **versions()}) + "\n")
+    except ConfigError as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

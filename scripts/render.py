@@ -1,0 +1,9 @@
+"""Film a trained policy: python scripts/render.py RUN"""
+
+import sys
+
+from jaxsafe import algos, envs
+from jaxsafe.command import render_main
+
+if __name__ == "__main__":
+    sys.exit(render_main(envs, algos))

@@ -1,0 +1,287 @@
+"""The command as a user meets it. Bad input is tested in this process, the rest in new ones."""
+
+import csv
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from jaxsafe import algos, checkpoint, command, envs, run_folder, runner
+from jaxsafe.config import ConfigError
+
+SCRIPTS = Path(__file__).parent.parent / "scripts"
+SMALL = (
+    "env=point_goal0", "env.num_steps=40", "algo=ppo_lag", "num_envs=4", "algo.horizon=16",
+    "algo.minibatches=2", "algo.epochs=2", "algo.critic_epochs=2", "algo.hidden=[8,8]",
+    "total_steps=640", "eval_episodes=2", "video=false",
+)  # fmt: skip
+
+
+def start(script: str, *args: str, cwd: Path, **kwargs) -> subprocess.Popen:
+    environ = {**os.environ, "JAX_PLATFORMS": "cpu"}
+    return subprocess.Popen(
+        [sys.executable, str(SCRIPTS / script), *args],
+        cwd=cwd, env=environ, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, **kwargs,
+    )  # fmt: skip
+
+
+def call(script: str, *args: str, cwd: Path) -> tuple[int, str, str]:
+    process = start(script, *args, cwd=cwd)
+    out, err = process.communicate(timeout=300)
+    return process.returncode, out, err
+
+
+def arrays(run: Path) -> dict[str, np.ndarray]:
+    return checkpoint.load(run / "checkpoints")[0]
+
+
+def rows(run: Path) -> list[list[str]]:
+    """metrics.csv without the column of wall-clock seconds."""
+    with (run / "metrics.csv").open() as file:
+        return [row[:3] + row[4:] for row in csv.reader(file)]
+
+
+def assert_same_run(a: Path, b: Path) -> None:
+    left, right = arrays(a), arrays(b)
+    assert left.keys() == right.keys()
+    for name in left:
+        np.testing.assert_array_equal(left[name], right[name], err_msg=name)
+    assert rows(a) == rows(b)
+
+
+def wait_for(condition, process: subprocess.Popen, seconds: float = 200) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < end, "waited too long"
+        time.sleep(0.005)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> tuple[Path, str]:
+    """An uninterrupted run, which nobody changes, and what it printed."""
+    home = tmp_path_factory.mktemp("finished")
+    status, out, err = call("train.py", *SMALL, "run_dir=run", cwd=home)
+    assert status == 0, err
+    return home / "run", out
+
+
+BAD = {
+    "env=point_gol1": "did you mean 'point_goal1'?",
+    "env=Safexp-PointGoal9-v0": "did you mean",
+    "algo=cop": "did you mean 'cpo'?",
+    "algo.cost_limt=3": "did you mean 'cost_limit'?",
+    "env.hazard_num=3": "did you mean 'hazards_num'?",
+    "total_step=5": "did you mean 'total_steps'?",
+    "cost_limit=5": "did you mean 'algo.cost_limit'?",
+    "total_steps=-1": "expected at least 1",
+    "total_steps=1.5": "expected a whole number",
+    "total_steps=many": "expected a whole number",
+    "num_envs=0": "expected at least 1",
+    "num_seeds=0": "expected at least 1",
+    "seed=-1": "expected at least 0",
+    "algo.cost_limit=-1": "expected at least 0",
+    "algo.discount=1.1": "expected between 0 and 1",
+    "algo.gae_lambda=nan": "expected between 0 and 1",
+    "algo.clip=wide": "expected a number",
+    "algo.minibatches=7": "minibatches",
+    "env.engine=quick": "quick",
+    "env.hazards_num=many": "hazards_num",
+    "env.placements_extents=[1,2]": "placements_extents",
+    "num_envs=1e9": "GiB",
+    "devices=512": "devices=512",
+    "seed=1,2": "--multirun",
+    "+seed=1": "without '+'",
+    "seed": "cannot read",
+    "algo.clip=[1": "cannot read",
+    "preset=quick": "valid: fast",
+    "resume=nowhere": "not a run folder",
+    "init_from=nowhere": "not a run folder",
+    "env.name=point_goal1": "choose with env=",
+    "--fast": "unknown flag --fast",
+}
+
+
+@pytest.mark.parametrize("argument", BAD)
+def test_bad_input_is_one_line_and_status_2(argument, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    monkeypatch.setattr(sys, "argv", ["train.py", argument])
+    monkeypatch.setattr(runner, "train", lambda *a, **k: pytest.fail("it went on to train"))
+    try:
+        status = command.train_main(envs, algos)
+    except SystemExit as stop:
+        status = stop.code
+    lines = capsys.readouterr().err.splitlines()
+    assert status == 2
+    assert len(lines) == 1 and lines[0].startswith("error: ") and BAD[argument] in lines[0]
+    assert not list(tmp_path.glob("runs/*"))
+
+
+def test_a_new_process_reports_bad_input_the_same_way(tmp_path):
+    status, out, err = call("train.py", "algo.clip=wide", cwd=tmp_path)
+    assert (status, out, err) == (2, "", "error: algo.clip='wide': expected a number\n")
+
+
+def test_help_and_cfg_show_every_option_with_its_default(tmp_path):
+    status, out, _ = call("train.py", "--help", cwd=tmp_path)
+    assert status == 0 and "env=car_push1 algo=cpo" in out and "total_steps: 10000000" in out
+    status, out, _ = call(
+        "train.py", "--cfg", "job", "env=Safexp-CarPush1-v0", "algo=cpo", "total_steps=1e7",
+        "env.placements_extents=[-1,-1,1,1]", cwd=tmp_path,
+    )  # fmt: skip
+    shown = yaml.safe_load(out)
+    assert status == 0 and shown["env"]["name"] == "car_push1" and shown["algo"]["name"] == "cpo"
+    assert shown["env"]["placements_extents"] == [-1, -1, 1, 1]
+    assert shown["env"].keys() - {"name"} == envs.env_defaults("car_push1").keys()
+
+
+def test_published_settings_are_defaults_that_the_command_line_overrides():
+    request = command.read_arguments(["preset=published", "algo=cpo"], envs, algos)
+    setting = next(iter(algos.ALGOS["cpo"].published.values()))
+    assert request.groups["algo"]["cpo"].items() >= setting.items()
+
+
+def test_a_run_folder_holds_what_a_reader_needs(finished):
+    run, out = finished
+    first = out.splitlines()[0]
+    assert all(
+        s in first for s in ("point_goal0", "ppo_lag", "1 seed x 4 envs", "engine c", "compiling")
+    )
+    assert "compiled in" in out and f"run folder: {run.name}" in out
+    for name in ("config.yaml", "versions.json", "metrics.csv", "curves.png", "evaluation.json"):
+        assert (run / name).stat().st_size > 0
+    assert list(run.glob("tensorboard/seed0/events*"))
+    assert run_folder.progress(run) == (10, 640)
+    assert [p for p in run.rglob("*") if p.suffix in (".pkl", ".pickle", ".npy")] == []
+    saved = run_folder.read_config(run)
+    assert command.settle(saved, envs, algos).plain() == saved
+
+
+def test_killed_and_resumed_it_ends_bit_for_bit_as_if_uninterrupted(finished, tmp_path):
+    args = (*SMALL, "run_dir=run", "checkpoint_iterations=1")
+    run = tmp_path / "run"
+    process = start("train.py", *args, cwd=tmp_path)
+    wait_for(lambda: len(checkpoint.checkpoints(run / "checkpoints")) == 2, process)
+    process.kill()
+    process.communicate()
+    reached = run_folder.progress(run)
+    assert reached is not None and 0 < reached[0] < 10, "killed too late to test anything"
+    status, out, err = call("train.py", *args, "resume=true", cwd=tmp_path)
+    assert status == 0 and "resuming at" in out, err
+    assert_same_run(run, finished[0])
+
+
+def test_ctrl_c_saves_and_says_how_to_resume_and_that_works(finished, tmp_path):
+    run = tmp_path / "run"
+    args = [*SMALL, "run_dir=run", "total_steps=1e8"]
+    process = start("train.py", *args, cwd=tmp_path)
+    wait_for(lambda: (run / "metrics.csv").exists() and len(rows(run)) > 2, process)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 130 and err == ""
+    assert "python scripts/train.py resume=run" in out
+    reached = run_folder.progress(run)
+    assert reached is not None
+    status, out, err = call("train.py", "resume=run", f"total_steps={reached[1] + 64}", cwd=tmp_path)
+    assert status == 0, err
+    assert run_folder.progress(run) == (reached[0] + 1, reached[1] + 64)
+    table, reference = rows(run), rows(finished[0])
+    assert table[: len(reference)] == reference[: len(table)]
+    assert [row[0] for row in table[1:]] == [str(i + 1) for i in range(reached[0] + 1)]
+
+
+def settings(*args: str) -> command.Settings:
+    """Top-level options as the command line would settle them."""
+    base = {k: yaml.safe_load(v) for k, v in (a.split("=") for a in args)}
+    groups = {"env": {"name": "point_goal0"}, "algo": {"name": "ppo_lag"}}
+    return command.settle({**groups, **base}, envs, algos)
+
+
+def test_a_folder_with_a_run_is_not_overwritten_nor_resumed_with_other_settings(finished, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(finished[0], run)
+    with pytest.raises(ConfigError, match="resume=true"):
+        command.choose_folder(settings(f"run_dir={run}"), envs, algos, None, print)
+    saved = command.settle(run_folder.read_config(run) | {"resume": str(run)}, envs, algos)
+    assert command.choose_folder(saved, envs, algos, None, print) == run
+    longer = command.settle(
+        run_folder.read_config(run) | {"resume": str(run), "total_steps": 10**6}, envs, algos
+    )
+    assert command.choose_folder(longer, envs, algos, None, print) == run
+    other = command.settle(run_folder.read_config(run) | {"resume": str(run), "seed": 5}, envs, algos)
+    with pytest.raises(ConfigError, match=r"seed=5 but .* was trained with 0"):
+        command.choose_folder(other, envs, algos, None, print)
+
+
+def test_resume_true_finds_the_newest_unfinished_run_of_the_same_settings(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    wanted = settings("seed=1", "resume=true")
+    for name, seed in (
+        ("20260101-000000-seed1", 1),
+        ("20260102-000000-seed1", 1),
+        ("20260103-000000-seed2", 2),
+    ):
+        folder = tmp_path / "runs" / "point_goal0-ppo_lag" / name
+        folder.mkdir(parents=True)
+        run_folder.write_config(folder, settings(f"seed={seed}").plain())
+    assert command.choose_folder(wanted, envs, algos, None, print).name == "20260102-000000-seed1"
+
+
+def test_evaluate_prints_the_table(finished, tmp_path):
+    status, out, err = call("evaluate.py", str(finished[0]), "--episodes", "3", cwd=tmp_path)
+    assert status == 0, err
+    for row in ("return", "cost", "violation rate", "cost rate"):
+        assert any(line.startswith(row) for line in out.splitlines())
+
+
+def test_evaluate_and_render_refuse_a_bad_folder_in_one_line(tmp_path, monkeypatch, capsys):
+    for main in (command.evaluate_main, command.render_main):
+        monkeypatch.setattr(sys, "argv", ["script", str(tmp_path)])
+        assert main(envs, algos) == 2
+        assert (
+            capsys.readouterr().err == f"error: {tmp_path} is not a run folder: it has no config.yaml\n"
+        )
+
+
+def test_a_full_disk_ends_training_in_one_line(tmp_path):
+    """A limit on file size stands in for the disk: checkpoints fit, metrics soon do not."""
+    args = (*SMALL, "run_dir=run", "total_steps=1e8", "checkpoint_iterations=20")
+    process = start("train.py", *args, cwd=tmp_path)
+    resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (40_000, 40_000))
+    _, err = process.communicate(timeout=200)
+    assert process.returncode == 1
+    assert len(err.splitlines()) == 1 and err.startswith("error: ") and "large" in err
+    assert checkpoint.load(tmp_path / "run" / "checkpoints")[1].iteration > 0
+
+
+def test_a_run_starts_from_the_policy_of_another(finished, tmp_path):
+    algo = algos.ALGOS["ppo_lag"]
+    env: Any = envs.make("point_goal0", num_steps=40)
+    cfg = algo.config(num_envs=2, horizon=4, minibatches=1, hidden=(8, 8))
+    program = runner.build(env, algo.make, cfg, runner.TrainConfig(num_seeds=2))
+    like = runner.jax.eval_shape(program.init, program.keys)
+    policy = runner.read_policy(finished[0])
+    runner.check_policy(like, policy, finished[0])
+    named = dict(zip(checkpoint.leaf_names(like), range(10**6), strict=False))
+    fresh = runner.jax.tree.map(
+        lambda x: runner.jnp.zeros(x.shape), {k: like.__dict__[k] for k in runner.POLICY}
+    )
+    taken = checkpoint.to_arrays(runner.with_policy(fresh, policy))
+    assert taken.keys() == policy.keys() <= named.keys()
+    for name, value in policy.items():
+        np.testing.assert_array_equal(taken[name], np.broadcast_to(value, taken[name].shape))
+    wide = runner.build(
+        env, algo.make, algo.config(num_envs=2, horizon=4, minibatches=1), runner.TrainConfig()
+    )
+    with pytest.raises(ConfigError, match=r"does not fit: params\..* is \[.*\], expected \["):
+        runner.check_policy(runner.jax.eval_shape(wide.init, wide.keys), policy, finished[0])

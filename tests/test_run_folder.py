@@ -1,0 +1,105 @@
+import math
+
+import numpy as np
+import pytest
+
+from jaxsafe import evaluation, plots, run_folder, scores
+from jaxsafe.config import ConfigError
+from jaxsafe.run_folder import Metrics, read_config, read_metrics
+
+
+def write(folder, iterations, resume_at=0):
+    log = Metrics(folder, ["train/cost", "train/return"], resume_at)
+    for i in iterations:
+        log.append(
+            i, 10 * i, [4, 5], float(i), {"train/return": [i, math.nan], "train/cost": [0.1, 2.0]}
+        )
+    log.close()
+    return log
+
+
+def test_metrics_have_a_row_for_each_seed_and_empty_cells_for_no_value(tmp_path):
+    write(tmp_path, [1])
+    assert (tmp_path / "metrics.csv").read_text().splitlines() == [
+        "iteration,steps,seed,seconds,train/cost,train/return",
+        "1,10,4,1.000,0.1,1.0",
+        "1,10,5,1.000,2.0,",
+    ]
+    assert np.isnan(read_metrics(tmp_path)["train/return"][1])
+
+
+def test_resuming_drops_rows_after_the_checkpoint_and_a_torn_last_line(tmp_path):
+    write(tmp_path, [1, 2, 3, 4])
+    whole = (tmp_path / "metrics.csv").read_text()
+    with (tmp_path / "metrics.csv").open("a") as file:
+        file.write("5,50,4,5.0")
+    log = write(tmp_path, [3, 4], resume_at=2)
+    assert (tmp_path / "metrics.csv").read_text() == whole
+    assert log.seconds == 2.0
+
+
+def test_metrics_of_other_columns_are_refused(tmp_path):
+    write(tmp_path, [1])
+    with pytest.raises(ConfigError, match="other columns"):
+        Metrics(tmp_path, ["train/return"], 1)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "a: [", "env: 3", "!!python/object/apply:os.system ['touch owned']", "\x00", "env: {name: 3}"],
+)
+def test_a_strangers_config_is_read_as_plain_values_or_refused_in_one_line(tmp_path, monkeypatch, text):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "config.yaml").write_text(text)
+    with pytest.raises(ConfigError) as error:
+        read_config(tmp_path)
+    assert "\n" not in str(error.value)
+    assert not (tmp_path / "owned").exists()
+
+
+def test_a_folder_without_config_is_no_run(tmp_path):
+    with pytest.raises(ConfigError, match="not a run folder"):
+        read_config(tmp_path)
+
+
+def test_curves_carry_the_last_value_over_iterations_without_an_episode():
+    metrics = {
+        "steps": np.array([1, 1, 2, 2, 3, 3.0]),
+        "seed": np.array([0, 1, 0, 1, 0, 1.0]),
+        "x": np.array([np.nan, 5, 2, np.nan, np.nan, 7]),
+    }
+    _, values = plots.by_seed(metrics, "x")
+    np.testing.assert_array_equal(values, [[np.nan, 2, 2], [5, 5, 7]])
+
+
+def test_curves_are_drawn_for_one_seed_for_several_and_for_none(tmp_path):
+    write(tmp_path, [1, 2, 3])
+    plots.curves(read_metrics(tmp_path), tmp_path / "several.png", "title", 25.0)
+    plots.curves({}, tmp_path / "none.png", "title", 25.0)
+    assert (tmp_path / "several.png").stat().st_size > (tmp_path / "none.png").stat().st_size > 1000
+
+
+def test_the_interval_of_equal_values_is_a_point_and_covers_the_mean_otherwise():
+    assert evaluation.estimate(np.full((2, 3), 4.0), draws=10) == (4.0, 4.0, 4.0)
+    e = evaluation.estimate(np.arange(20.0).reshape(2, 10), draws=2000)
+    assert e.low < e.mean < e.high
+
+
+def test_cost_rate_is_total_cost_over_total_steps_of_each_seed():
+    metrics = {"seed": np.array([0, 1, 0, 1.0]), "train/cost_rate": np.array([0.1, 0.2, 0.3, 0.4])}
+    rate = evaluation.cost_rate(metrics)
+    assert rate is not None
+    np.testing.assert_allclose(rate, [0.2, 0.3])
+
+
+def test_unconstrained_ppo_scores_one_and_a_safe_policy_violates_by_zero():
+    for env, ppo in scores.CHARACTERISTIC.items():
+        assert scores.normalized_return(env, ppo.ret) == 1
+        assert scores.normalized_violation(env, ppo.cost) == pytest.approx(1)
+        assert scores.normalized_violation(env, 25.0) == 0
+    assert len(scores.SG18) == 18 and set(scores.SG6) < set(scores.SG18)
+    assert len(scores.SG1) == len(scores.SG2) == 9 and len(scores.SG_DOGGO) == 6
+
+
+def test_progress_reads_the_newest_manifest(tmp_path):
+    assert run_folder.progress(tmp_path) is None

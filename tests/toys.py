@@ -1,0 +1,101 @@
+"""Environments small enough to know the answers of."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+
+from jaxsafe.types import State
+
+
+@dataclass(frozen=True)
+class Corridor:
+    """A point mass paid for speed along x and charged for leaving |y| <= half_width.
+
+    Observation [4]: position x, y (m), then velocity x, y (m/s). Action [2]: acceleration.
+    """
+
+    half_width: float = 0.5  # m
+    max_accel: float = 2.0  # m/s^2
+    dt: float = 0.02  # s
+    obs_size: int = 4
+    action_size: int = 2
+    episode_length: int = 20
+    cost_names: tuple[str, ...] = ("wall",)
+
+    def reset(self, key: jax.Array) -> State:
+        position = jax.random.uniform(key, (2,), minval=-0.1, maxval=0.1)
+        return self._state(jnp.concatenate([position, jnp.zeros(2)]))
+
+    def step(self, state: State, action: jax.Array) -> State:
+        position, velocity = jnp.split(state.physics, 2)
+        velocity += self.dt * self.max_accel * jnp.clip(action, -1.0, 1.0)
+        position += self.dt * velocity
+        return self._state(jnp.concatenate([position, velocity]))
+
+    def _state(self, x: jax.Array) -> State:
+        cost = (jnp.abs(x[1]) > self.half_width).astype(jnp.float32)
+        info = {"fast": (x[2] > 0.1).astype(jnp.float32)}
+        return State(x, x, x[2], cost, cost[None], jnp.bool_(False), info)
+
+
+@dataclass(frozen=True)
+class Clock:
+    """Counts its steps and knows which reset it came from; ignores actions.
+
+    Observation [3]: the episode's random name, steps since the reset, steps until it terminates
+    (`lives[0] .. lives[1]`, drawn uniformly; beyond `episode_length` it never does).
+    Reward 1 and cost 2 a step; info counts steps too.
+    """
+
+    episode_length: int = 5
+    lives: tuple[int, int] = (99, 99)
+    obs_size: int = 3
+    action_size: int = 1
+    cost_names: tuple[str, ...] = ("a", "b")
+
+    def reset(self, key: jax.Array) -> State:
+        life = jax.random.randint(key, (), self.lives[0], self.lives[1] + 1)
+        name = jax.random.uniform(jax.random.fold_in(key, 1))
+        obs = jnp.stack([name, 0.0, life.astype(jnp.float32)])
+        zero = jnp.zeros(())
+        return State(key, obs, zero, zero, jnp.zeros(2), jnp.bool_(False), {"ticks": zero})
+
+    def step(self, state: State, action: jax.Array) -> State:
+        obs = state.obs.at[1].add(1.0)
+        one = jnp.ones(())
+        return State(
+            state.physics, obs, one, 2 * one, jnp.array([0.5, 1.5]), obs[1] >= obs[2], {"ticks": one}
+        )
+
+
+@dataclass(frozen=True)
+class Lever:
+    """Two levers; the first earns and costs, the second earns for free. Its optimum is known.
+
+    Observation [2]: signs that say which way to pull, redrawn at each step. With a the action times
+    the signs, clipped to [-1, 1], and u = (1 + a) / 2 in [0, 1]:
+
+        reward = u_0 (2 - u_0) + u_1 +- 1/2 at random,   cost = u_0
+
+    so over an episode of 10 steps the best return is 20, at a cost of 10, and within a cost limit
+    of 2.5 it is 14.375, with u_0 = 1/4 always.
+    """
+
+    obs_size: int = 2
+    action_size: int = 2
+    episode_length: int = 10
+    cost_names: tuple[str, ...] = ("lever",)
+
+    def reset(self, key: jax.Array) -> State:
+        return self._state(key, jnp.zeros(2))
+
+    def step(self, state: State, action: jax.Array) -> State:
+        return self._state(state.physics, 0.5 * (1 + jnp.clip(action * state.obs, -1.0, 1.0)))
+
+    def _state(self, key: jax.Array, u: jax.Array) -> State:
+        key, sign_key, noise_key = jax.random.split(key, 3)
+        obs = jax.random.rademacher(sign_key, (2,), jnp.float32)
+        noise = 0.5 * jax.random.rademacher(noise_key, (), jnp.float32)
+        reward = u[0] * (2 - u[0]) + u[1] + noise
+        return State(key, obs, reward, u[0], u[:1], jnp.bool_(False), {})
