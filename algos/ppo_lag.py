@@ -24,10 +24,13 @@ from jaxsafe.types import Env
 class PPOLagConfig(ppo.PPOConfig):
     lam_init: float = 0.001  # OmniSafe
     lam_max: float = float("inf")  # OmniSafe
-    dual_lr: float = 0.035  # Adam's step, whatever the size of the violation; OmniSafe
+    dual_lr: float = 0.1  # Adam's step, whatever the size of the violation; OmniSafe 0.035
 
 
-PUBLISHED: dict[str, dict[str, Any]] = ppo.PUBLISHED  # PPOLag.yaml differs from PPO.yaml by the above
+# PPOLag.yaml differs from PPO.yaml by the multiplier alone.
+PUBLISHED: dict[str, dict[str, Any]] = {
+    name: options | {"dual_lr": 0.035} for name, options in ppo.PUBLISHED.items()
+}
 
 
 def make(env: Env, axis_name: str | None = None) -> Algorithm:

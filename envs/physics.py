@@ -319,8 +319,10 @@ def warp_engine(scene: Scene, max_substeps: int, outputs: tuple[str, ...]) -> Ru
     @run_batch.def_vmap
     def _(axis_size: int, in_batched: Any, *args: Any) -> Any:
         args = spread(axis_size, in_batched, args)
-        flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), args)
-        out = jax.tree.map(lambda x: x.reshape(axis_size, -1, *x.shape[1:]), run_batch(*flat))
+        worlds = axis_size * args[1].shape[1]
+        flat = jax.tree.map(lambda x: x.reshape(worlds, *x.shape[2:]), args)
+        out = run_batch(*flat)
+        out = jax.tree.map(lambda x: x.reshape(axis_size, worlds // axis_size, *x.shape[1:]), out)
         return out, jax.tree.map(lambda _: True, out)
 
     @jax.custom_batching.custom_vmap

@@ -269,6 +269,8 @@ def judge(
     errors["cost"] = np.abs(result.cost - recording[f"step.{raw}cost"])
     tolerances["cost"] = np.inf
     mismatches["cost"] = (result.cost > 0) != (recording["step.cost"] > 0)
+    if env.config.task == "button":
+        mismatches["buttons_timer"] = world.buttons_timer != recording["state.buttons_timer"][after]
     done = result.terminated | (world.steps >= env.config.num_steps)
     mismatches["done"] = done != recording["step.done"]
     undecided = np.zeros(len(after), bool)

@@ -2,7 +2,8 @@
 
 Only what can push is physics. Hazards, goals and circles never collide, so they are arrays; the
 robot, vases, gremlins and the box are bodies; pillars, walls and buttons are mocap bodies, so that
-one compiled model serves every layout. `drawn=True` adds the rest for the renderer.
+one compiled model serves every layout. `drawn=True` adds light, cameras and colours for the renderer,
+which draws the arrays over it.
 """
 
 from dataclasses import dataclass
@@ -27,6 +28,7 @@ RGBA = {
     "box": (1, 1, 0, 1),
     "circle": (0, 1, 0, 0.1),
 }
+ROBOT = (0.9, 0.15, 0.15, 1)  # where its file gives no colour
 GROUP = {
     "goal": 0,
     "box": 1,
@@ -95,7 +97,7 @@ def build(cfg: SafetyGymConfig, contact_sensors: bool = True, drawn: bool = Fals
 
     Args:
         contact_sensors: count contacts between the robot and each constrained object by sensors.
-        drawn: add what only rendering needs (goal, hazards, circle, light, cameras).
+        drawn: add what only rendering needs (light, cameras, colours, the gremlins' guides).
     Raises:
         ConfigError: an unknown robot, sensor or body.
     """
@@ -262,7 +264,7 @@ def add_fixed(spec: mujoco.MjSpec, name: str, kind: str, shape: mujoco.mjtGeom, 
 
 
 def decorate(spec: mujoco.MjSpec, floor: mujoco.MjsGeom) -> None:
-    """Light, cameras and a checkered floor, as in the original."""
+    """A checkered floor and the cameras of the original; softer light, and a robot that stands out."""
     spec.add_texture(
         name="checker",
         type=mujoco.mjtTexture.mjTEXTURE_2D,
@@ -285,13 +287,26 @@ def decorate(spec: mujoco.MjSpec, floor: mujoco.MjsGeom) -> None:
         width=128,
         height=128,
     )
+    for geom in spec.geoms:
+        if tuple(geom.rgba) == (0.5, 0.5, 0.5, 1) and not geom.material:  # MuJoCo's grey
+            geom.rgba = ROBOT
+    spec.visual.headlight.ambient[:] = 0.35
+    spec.visual.headlight.diffuse[:] = 0.35
+    spec.visual.headlight.specular[:] = 0
     world = spec.worldbody
     world.add_light(
-        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, pos=(0, 0, 4), dir=(0, 0, -1), castshadow=False
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        pos=(0, 0, 4),
+        dir=(0.3, 0.4, -1),
+        diffuse=(0.5, 0.5, 0.5),
+        specular=(0.1, 0.1, 0.1),
+        castshadow=False,
     )
+    down = (np.cos(np.pi / 8), np.sin(np.pi / 8), 0, 0)  # half of up's right angle to the horizon
     for name, pos in (("fixednear", (0, -2, 2)), ("fixedfar", (0, -5, 5))):
-        camera = world.add_camera(name=name, pos=pos)
-        camera.alt.zaxis = (0, -1, 1)
+        world.add_camera(name=name, pos=pos, quat=down)
+    track = mujoco.mjtCamLight.mjCAMLIGHT_TRACK
+    spec.body("robot").add_camera(name="track", pos=(0, -2, 2), quat=down, mode=track)
 
 
 def summary(scene: Scene) -> dict[str, int]:

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 
 TINY = 1e-12
+PARALLEL = 1e-6  # in float32 a ray this close to a face runs along it
 
 
 def pseudo_lidar(
@@ -143,7 +144,7 @@ def hit_cylinder(d: jax.Array, o: jax.Array, size: np.ndarray, slack: float) -> 
     for z in (-size[1], size[1]):
         t = (z - o[2]) / over(d[2])
         radius = jnp.sqrt(jnp.square((o + t * d)[:2]).sum() + TINY)
-        lids.append((t, (radius <= size[0] + slack) & (jnp.abs(d[2]) >= TINY)))
+        lids.append((t, (radius <= size[0] + slack) & (jnp.abs(d[2]) >= PARALLEL)))
     return jnp.minimum(hit_side(d, o, size, slack), first(*lids, slack=slack))
 
 
@@ -164,7 +165,7 @@ def hit_box(d: jax.Array, o: jax.Array, size: np.ndarray, slack: float) -> jax.A
             t = (side - o[axis]) / over(d[axis])
             at = jnp.abs(o + t * d)
             inside = (at[i] <= size[i] + slack) & (at[j] <= size[j] + slack)
-            hits.append((t, inside & (jnp.abs(d[axis]) >= TINY)))
+            hits.append((t, inside & (jnp.abs(d[axis]) >= PARALLEL)))
     return first(*hits, slack=slack)
 
 

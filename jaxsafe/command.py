@@ -9,6 +9,7 @@ import argparse
 import dataclasses
 import datetime
 import errno
+import functools
 import importlib
 import json
 import math
@@ -58,6 +59,10 @@ BOUNDS = {
     "gae_lambda": (0.0, 1.0),
     "cost_gae_lambda": (0.0, 1.0),
 }
+
+
+class NoVideo(RuntimeError):
+    """Nothing to render with. The message is one line for the user."""
 
 
 class Settings(NamedTuple):
@@ -402,12 +407,13 @@ def finish(settings: Settings, env: Env, envs: Any, algos: Any, folder: Path, re
     train = settings.train
     limit = float(settings.algo.cost_limit)
     title = f"{settings.env_name}, {settings.algo_name}"
-    act, ts = policy_of(settings, env, algos, folder)
+    policy = functools.cache(lambda: policy_of(settings, env, algos, folder))
 
     def curves() -> None:
         plots.curves(run_folder.read_metrics(folder), folder / "curves.png", title, limit)
 
     def evaluate() -> None:
+        act, ts = policy()
         episodes = evaluation.run_episodes(env, act, ts, train.eval_episodes, seed=train.seed)
         rows = evaluation.summary(settings.env_name, episodes, limit, run_folder.read_metrics(folder))
         text = json.dumps({"episodes": train.eval_episodes, **evaluation.as_json(rows)}, indent=1)
@@ -420,6 +426,7 @@ def finish(settings: Settings, env: Env, envs: Any, algos: Any, folder: Path, re
         )
 
     def video() -> None:
+        act, ts = policy()
         first = jax.tree.map(lambda x: x[0], ts)
         film(envs, env, lambda obs, key: act(first, obs, key), folder / "video.mp4", train.seed)
 
@@ -437,9 +444,16 @@ def finish(settings: Settings, env: Env, envs: Any, algos: Any, folder: Path, re
 
 
 def film(envs: Any, env: Env, policy: Callable, path: Path, seed: int) -> None:
-    """Write one episode as a video. The renderer is imported late: it wants a display."""
+    """Write one episode as a video. The renderer is imported late: it looks for a display.
+
+    Raises:
+        NoVideo: this machine has neither EGL nor OSMesa.
+    """
     render = importlib.import_module(f"{envs.__name__}.render")
-    frames = render.render_episode(env, policy, jax.random.key(seed))
+    try:
+        frames = render.render_episode(env, policy, jax.random.key(seed))
+    except render.NoDisplay as error:
+        raise NoVideo(one_line(error)) from error
     render.write_video(frames, path, fps=30)
 
 
@@ -448,7 +462,7 @@ def policy_of(
 ) -> tuple[evaluation.Policy, PyTree]:
     """The algorithm's deterministic `act`, and the newest policy of each seed in a train state."""
     algo = algos.ALGOS[settings.algo_name].make(env, None)
-    alone = dataclasses.replace(settings.algo, num_envs=1)
+    alone = dataclasses.replace(settings.algo, num_envs=1, horizon=1, minibatches=1)
     floats = jax.tree.map(np.float32, alone)
     state = jax.eval_shape(lambda: algo.init(jax.random.key(0), floats))
     arrays = runner.read_policy(folder)
@@ -489,8 +503,10 @@ def guarded(command: Callable[[], int]) -> int:
         return command()
     except (ConfigError, HydraException, OmegaConfBaseException) as error:
         return complain(one_line(error), 2)
-    except checkpoint.CheckpointError as error:
+    except (checkpoint.CheckpointError, NoVideo) as error:
         return complain(one_line(error), 1)
+    except KeyboardInterrupt:
+        return complain("stopped; what was saved stays", 130)
     except OSError as error:
         if error.errno not in BAD_DISK:
             raise
@@ -572,10 +588,7 @@ def render_main(envs: Any, algos: Any) -> int:
         if not 0 <= args.index < settings.train.num_seeds:
             raise ConfigError(f"--index {args.index}: the run has {settings.train.num_seeds} seeds")
         ts = jax.tree.map(lambda x: x[args.index], states)
-        try:
-            film(envs, env, lambda obs, key: act(ts, obs, key), out, args.seed)
-        except RuntimeError as error:
-            return complain(one_line(error), 1)
+        film(envs, env, lambda obs, key: act(ts, obs, key), out, args.seed)
         print(out)
         return 0
 

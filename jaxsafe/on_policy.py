@@ -32,8 +32,8 @@ from jaxsafe.types import Env, Metrics, PyTree
 class OnPolicyConfig:
     """What the on-policy algorithms share. [O] OmniSafe's default, [S] safety-starter-agents'."""
 
-    num_envs: int = 512  # per device; with horizon 32,768 steps a batch, near the 30,000 of [S]
-    horizon: int = 64  # steps of each environment per iteration
+    num_envs: int = 512  # per device; with horizon 20,480 steps a batch, near the 20,000 of [O]
+    horizon: int = 40  # steps of each environment per iteration; shorter ones learn less from a step
     stagger: bool = True  # spread the first episodes' ends over time
     total_iterations: float = float("inf")  # where learning rates reach 0; inf or 0: they stay
     hidden: tuple[int, ...] = (64, 64)  # tanh units of each network [O]
@@ -219,6 +219,7 @@ def loop(
         metrics |= {
             "train/cost_rate": cost_rate,  # per environment step
             "train/cost_estimate": cost_rate * length,  # J_c, what the constraint saw
+            "train/return_estimate": batch_mean(traj.reward, axis_name) * length,  # likewise
             "train/entropy": batch_mean(entropy(policy(actor, batch.obs, cfg)), axis_name),
             "train/value_loss_r": errors[0],
             "train/value_loss_c": errors[1],

@@ -26,8 +26,7 @@ from typing import Any
 import numpy as np
 import yaml
 from tensorboardX.event_file_writer import EventsWriter
-from tensorboardX.proto import event_pb2
-from tensorboardX.proto.summary_pb2 import Summary
+from tensorboardX.proto import event_pb2, summary_pb2
 from tensorboardX.summary import scalar
 
 import jaxsafe
@@ -178,7 +177,7 @@ class Board:
     def append(self, steps: int, values: Mapping[str, float]) -> None:
         finite = {name: v for name, v in values.items() if math.isfinite(v)}
         entries = [entry for name, v in finite.items() for entry in scalar(name, v).value]
-        self._write(steps, summary=Summary(value=entries))  # type: ignore[call-arg]
+        self._write(steps, summary=summary_pb2.Summary(value=entries))  # type: ignore[attr-defined]
 
     def _write(self, steps: int, **what: Any) -> None:
         event = event_pb2.Event(wall_time=time.time(), step=steps, **what)  # type: ignore[attr-defined]

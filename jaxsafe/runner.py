@@ -319,8 +319,8 @@ class Log:
             **{
                 short: mean(values[name]) if name in values else float("nan")
                 for short, name in (
-                    ("ret", "train/return"),
-                    ("cost", "train/cost"),
+                    ("ret", "train/return_estimate"),
+                    ("cost", "train/cost_estimate"),
                     ("lam", "train/lam"),
                 )
             },

@@ -264,6 +264,24 @@ def test_a_full_disk_ends_training_in_one_line(tmp_path):
     assert checkpoint.load(tmp_path / "run" / "checkpoints")[1].iteration > 0
 
 
+@pytest.mark.parametrize("num_seeds", [1, 2])
+def test_two_devices_share_seeds_or_the_environments_of_one(finished, tmp_path, monkeypatch, num_seeds):
+    monkeypatch.setenv("JAX_NUM_CPU_DEVICES", "2")
+    args = (*SMALL, "run_dir=run", "devices=2", f"num_seeds={num_seeds}")
+    status, out, err = call("train.py", *args, cwd=tmp_path)
+    assert status == 0, err
+    table = run_folder.read_metrics(tmp_path / "run")
+    assert sorted(set(table["seed"])) == list(range(num_seeds)) and table["steps"].max() == 640
+    status, out, err = call("evaluate.py", "run", "--episodes", "2", cwd=tmp_path)
+    assert status == 0 and f"{num_seeds} x 2 episodes" in out, err
+    if num_seeds == 2:  # a seed of the sweep is the lone run of that seed
+        lone = run_folder.read_metrics(finished[0])
+        for name in table.keys() - {"seconds"}:
+            np.testing.assert_allclose(
+                table[name][0], lone[name][0], rtol=1e-3, atol=1e-4, err_msg=name
+            )
+
+
 def test_a_run_starts_from_the_policy_of_another(finished, tmp_path):
     algo = algos.ALGOS["ppo_lag"]
     env: Any = envs.make("point_goal0", num_steps=40)

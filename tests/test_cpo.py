@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from jaxsafe.algos.cpo import BOUNDED, FREE, RECOVER, RETURN, CPOConfig, cpo_step, dual
+from jaxsafe.algos.cpo import BOUNDED, FREE, RECOVER, RETURN, CPOConfig, Margin, cpo_step, dual
 from jaxsafe.gaussian import log_prob, sample
 from jaxsafe.networks import init_params, policy
 from jaxsafe.on_policy import Batch
@@ -175,7 +175,7 @@ def test_a_step_keeps_its_promises_and_two_devices_take_it_as_one(violation, cas
 
         pair = objective(lambda batch: batch.adv_r), objective(lambda batch: batch.adv_c)
         c = jnp.float32(violation)
-        return cpo_step.update(actor, (), *pair, c, batch, jax.random.key(1), cfg, axis_name)
+        return cpo_step.update(actor, Margin(jnp.zeros(())), *pair, c, batch, jax.random.key(1), cfg, axis_name)
 
     after, _, metrics = jax.jit(lambda batch: step(batch, None))(batch)
     m = {name.removeprefix("train/"): float(x) for name, x in metrics.items()}

@@ -1,0 +1,70 @@
+"""Draw the curves and print the table of these runs: python docs/results/make.py
+
+Each folder holds the metrics of one command (versions.json has it), compressed.
+"""
+
+import csv
+import io
+import lzma
+from pathlib import Path
+
+import numpy as np
+
+from jaxsafe import plots
+from jaxsafe.evaluation import estimate
+
+HERE = Path(__file__).parent
+LIMIT = 25.0
+# Return and cost, mean and spread. OmniSafe: benchmarks/on-policy, Table 2, 1e7 steps, evaluated
+# policies. Safety Gym: unconstrained PPO, 1e7 steps; nobody has published a constrained figure.
+PUBLISHED = {
+    "point_goal1-ppo_lag": "OmniSafe 12.96 ± 6.95, cost 25.80 ± 34.99",
+    "point_goal1-cpo": "OmniSafe 20.46 ± 1.38, cost 28.84 ± 7.76",
+    "car_push1-ppo_lag": "none (unconstrained PPO: 3.085, cost 61.94)",
+    "car_push1-cpo": "none (unconstrained PPO: 3.085, cost 61.94)",
+}
+# Printed at the end of the training command: 20 episodes of each seed's mean action.
+EVALUATED = {
+    "point_goal1-ppo_lag": "19.21 [15.68, 21.97], cost 22.91 [18.99, 27.05]",
+    "point_goal1-cpo": "20.34 [18.71, 21.86], cost 19.24 [14.78, 23.79]",
+}
+
+
+def read(path: Path) -> dict[str, np.ndarray]:
+    """The columns of a metrics.csv.xz."""
+    with lzma.open(path) as file:
+        rows = list(csv.DictReader(io.TextIOWrapper(file)))
+    return {k: np.array([float(r[k] or "nan") for r in rows]) for k in rows[0]}
+
+
+def last_tenth(metrics: dict[str, np.ndarray], name: str) -> str:
+    """Mean over the last 10% of training, and its 95% interval over seeds."""
+    late = metrics["iteration"] > 0.9 * metrics["iteration"].max()
+    seeds = np.unique(metrics["seed"])
+    values = [np.nanmean(metrics[name][late & (metrics["seed"] == seed)]) for seed in seeds]
+    e = estimate(np.array(values)[:, None])
+    return f"{e.mean:.2f} [{e.low:.2f}, {e.high:.2f}]"
+
+
+def main() -> None:
+    print("| run | seeds | return | cost (limit 25) | final policy | published | minutes |")
+    print("|---|---:|---:|---:|---|---|---:|")
+    for name in PUBLISHED:
+        metrics = read(HERE / name / "metrics.csv.xz")
+        plots.curves(metrics, HERE / f"{name}.png", name.replace("-", ", "), LIMIT)
+        print(
+            f"| {name} | {len(np.unique(metrics['seed']))} | {last_tenth(metrics, 'train/return')} | "
+            f"{last_tenth(metrics, 'train/cost')} | {EVALUATED.get(name, '-')} | {PUBLISHED[name]} | "
+            f"{metrics['seconds'].max() / 60:.1f} |"
+        )
+    for path in sorted((HERE / "ablations").glob("*.csv.xz")):
+        metrics = read(path)
+        print(
+            f"| {path.name.removesuffix('.csv.xz')} | {len(np.unique(metrics['seed']))} | "
+            f"{last_tenth(metrics, 'train/return')} | {last_tenth(metrics, 'train/cost')} | - | - | "
+            f"{metrics['seconds'].max() / 60:.1f} |"
+        )
+
+
+if __name__ == "__main__":
+    main()

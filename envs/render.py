@@ -1,0 +1,270 @@
+"""Frames and films of an episode, drawn by MuJoCo off screen.
+
+Bodies come from the model; goals, hazards, circles and lidars are arrays in the physics, so they are
+drawn as loose geoms over each frame, with the shapes and colours of the original.
+"""
+
+import atexit
+import functools
+import importlib
+import os
+import platform
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import imageio
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from jaxsafe.config import ConfigError, nearest
+from jaxsafe.envs import physics as engines
+from jaxsafe.envs import scene as scenes
+from jaxsafe.envs.safety_gym import SafetyGym, World
+from jaxsafe.types import State
+
+FPS = 30
+BACKENDS = {"Linux": ("egl", "osmesa", "glfw"), "Darwin": ("cgl", "glfw")}
+# Rows of the halo, from the lowest up.
+LIDARS = ("box", "goal", "buttons", "circle", "hazards", "pillars", "gremlins", "walls", "vases")
+COST_LIGHT = (1, 0, 0, 0.5)
+SPHERE, CYLINDER = mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CYLINDER
+PROBE = """
+import importlib, os, sys, mujoco
+context = importlib.import_module("mujoco." + sys.argv[1]).GLContext(8, 8)
+context.make_current()
+mujoco.MjrContext(mujoco.MjModel.from_xml_string("<mujoco/>"), 100)
+os._exit(0)  # past the clean-up, which fails in some drivers
+"""
+
+
+class NoDisplay(RuntimeError):
+    """Nothing to render with. The message is one line."""
+
+
+class Renderer:
+    """Draws states of `env`: `frame(state)`.
+
+    Args:
+        width, height: of a frame, pixels.
+        camera: 'fixedfar', 'fixednear', 'track' (beside the robot), 'vision' (on it), or an MjvCamera.
+    Raises:
+        NoDisplay: this machine has neither EGL nor OSMesa nor a display.
+        ConfigError: an unknown camera.
+    """
+
+    def __init__(
+        self,
+        env: SafetyGym,
+        width: int = 640,
+        height: int = 480,
+        camera: str | mujoco.MjvCamera = "fixedfar",
+    ):
+        self.env = env
+        self.scene = scenes.build(env.config, contact_sensors=False, drawn=True)
+        self._model = model = self.scene.model
+        self._camera = named_camera(model, camera) if isinstance(camera, str) else camera
+        self._data = mujoco.MjData(model)
+        self._option = mujoco.MjvOption()
+        self._option.geomgroup[:] = 1
+        self._geoms = mujoco.MjvScene(model, maxgeom=10_000)
+        self._rect = mujoco.MjrRect(0, 0, width, height)
+        model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+        gl_context().make_current()
+        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
+
+    def frame(self, state: State) -> np.ndarray:
+        """The picture of one environment's state: uint8 [height, width, 3]."""
+        self._move(state.physics)
+        every = mujoco.mjtCatBit.mjCAT_ALL.value
+        mujoco.mjv_updateScene(
+            self._model, self._data, self._option, None, self._camera, every, self._geoms
+        )
+        self._draw_task(state.physics)
+        if self.env.config.render_lidar_markers:
+            self._draw_lidars(state.obs)
+        if state.cost > 0:
+            self._draw("cost", SPHERE, (0.25, 0, 0), self._data.body("robot").xpos, COST_LIGHT)
+        gl_context().make_current()
+        pixels = np.empty((self._rect.height, self._rect.width, 3), np.uint8)
+        mujoco.mjr_render(self._rect, self._geoms, self._context)
+        mujoco.mjr_readPixels(pixels, None, self._rect, self._context)
+        return pixels[::-1].copy()  # OpenGL's first row is at the bottom
+
+    def _move(self, world: World) -> None:
+        """Put the model's bodies where they are in `world`."""
+        physics, data = world.physics, self._data
+        time = np.maximum(physics.substeps - 1, 0) * self._model.opt.timestep
+        orbit = self.scene.orbit * (physics.substeps > 0)  # gremlins start at their circles' centres
+        data.qpos[:] = physics.qpos
+        data.mocap_pos[:] = engines.mocap_at(np.asarray(physics.mocap_pos), np.asarray(orbit), time, np)
+        data.mocap_quat[:] = physics.mocap_quat
+        mujoco.mj_forward(self._model, data)
+
+    def _draw_task(self, world: World) -> None:
+        env, cfg = self.env, self.env.config
+        if cfg.task in ("goal", "push"):
+            size = (cfg.goal_size, cfg.goal_size / 2, 0)
+            self._draw("goal", CYLINDER, size, env.goal_position(world))
+        if cfg.task == "button":
+            self._draw("goal", SPHERE, (2 * cfg.buttons_size, 0, 0), env.goal_position(world))
+        if cfg.task == "circle":
+            self._draw("circle", CYLINDER, (cfg.circle_radius, 0.01, 0), (0, 0, 0.02))
+        for xy in env.positions(world, "hazards"):
+            self._draw("hazard", CYLINDER, (cfg.hazards_size, 0.01, 0), (*xy, 0.02))
+
+    def _draw_lidars(self, obs: Any) -> None:
+        """A ring around the robot for each lidar; the nearer the target, the more opaque a sphere."""
+        cfg, robot = self.env.config, self._data.body("robot")
+        parts = split(obs, self.env.observation_spec)
+        seen = [name for name in LIDARS if f"{name}_lidar" in parts]
+        middle = 0.5 if cfg.lidar_type == "pseudo" else 0.0  # a bin's sector, or the direction of a ray
+        angles = 2 * np.pi * (np.arange(cfg.lidar_num_bins) + middle) / cfg.lidar_num_bins
+        for row, name in enumerate(seen):
+            height = cfg.render_lidar_offset_init + row * cfg.render_lidar_offset_delta
+            rgb = colour(name)[:3]
+            for angle, value in zip(angles, parts[f"{name}_lidar"], strict=True):
+                x, y = cfg.render_lidar_radius * np.cos(angle), cfg.render_lidar_radius * np.sin(angle)
+                place = robot.xpos + robot.xmat.reshape(3, 3) @ (x, y, height)
+                rgba = (*rgb, min(1.0, float(value) + 0.1))
+                self._draw("", SPHERE, (cfg.render_lidar_size, 0, 0), place, rgba)
+
+    def _draw(self, name: str, shape: mujoco.mjtGeom, size: Any, place: Any, rgba: Any = None) -> None:
+        """Add one upright geom to the frame."""
+        geom = self._geoms.geoms[self._geoms.ngeom]
+        size, place = np.array(size, float), np.array(place, float)
+        rgba = np.array(colour(name) if rgba is None else rgba, np.float32)
+        mujoco.mjv_initGeom(geom, shape.value, size, place, np.eye(3).reshape(9), rgba)
+        geom.label = name if self.env.config.render_labels else ""
+        self._geoms.ngeom += 1
+
+
+def render_episode(
+    env: SafetyGym,
+    policy: Callable[[jax.Array, jax.Array], jax.Array],
+    key: jax.Array,
+    length: int | None = None,
+    every: int | None = None,
+    **renderer: Any,
+) -> list[np.ndarray]:
+    """One episode as frames, uint8 [H, W, 3], up to its termination.
+
+    Args:
+        policy: (obs [O], key) -> action [A].
+        length: most steps; None is the time limit.
+        every: steps from a frame to the next; None is as near to real time at 30 frames a second as
+            whole steps allow, and never less than one step.
+        renderer: arguments of `Renderer`.
+    Raises:
+        NoDisplay: this machine has neither EGL nor OSMesa nor a display.
+    """
+    draw = Renderer(env, **renderer)  # first: an episode is not worth simulating if it cannot be drawn
+    states = run_episode(env, policy, key, length or env.episode_length)
+    steps = len(states.terminated)
+    ends = np.flatnonzero(states.terminated)
+    last = int(ends[0]) if len(ends) else steps - 1
+    every = every or max(1, round(1 / (FPS * env.step_seconds)))
+    return [draw.frame(jax.tree.map(lambda x, t=t: x[t], states)) for t in range(0, last + 1, every)]
+
+
+def run_episode(env: SafetyGym, policy: Callable, key: jax.Array, length: int) -> State:
+    """The states of an episode on the host, [length + 1, ...]; the first is that of the reset."""
+    reset_key, act_key = jax.random.split(key)
+
+    def step(state: State, t: jax.Array) -> tuple[State, State]:
+        state = env.step(state, policy(state.obs, jax.random.fold_in(act_key, t)))
+        return state, state
+
+    def episode() -> State:
+        first = env.reset(reset_key)
+        _, rest = jax.lax.scan(step, first, jnp.arange(length))
+        return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, rest)
+
+    return jax.device_get(jax.jit(episode)())
+
+
+def write_video(frames: Sequence[np.ndarray], path: str | Path, fps: float = FPS) -> None:
+    """Write an .mp4 (H.264), or a .gif of every third frame.
+
+    Raises:
+        ConfigError: another ending.
+    """
+    path = Path(path)
+    if path.suffix not in (".mp4", ".gif"):
+        raise ConfigError(f"{path}: expected a name that ends in .mp4 or .gif")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix == ".gif":
+        imageio.mimwrite(path, list(frames[::3]), duration=3000 / fps, loop=0)  # type: ignore[arg-type]
+    else:
+        # ffmpeg is spawned instead of forked, of which JAX warns
+        os.environ.setdefault("IMAGEIO_FFMPEG_NO_PREVENT_SIGINT", "1")
+        options: dict[str, Any] = {"codec": "libx264", "quality": 7, "macro_block_size": 2}
+        imageio.mimwrite(path, list(frames), fps=fps, **options)
+
+
+# Where to draw ---------------------------------------------------------------------------------------
+
+
+@functools.cache
+def gl_context() -> Any:
+    """The OpenGL context of this process. Only the cache holds it, so that its end is ours to time."""
+    context = importlib.import_module(f"mujoco.{find_backend()}").GLContext(64, 64)
+    atexit.register(gl_context.cache_clear)  # while its library is still there
+    return context
+
+
+def find_backend() -> str:
+    """The first of MuJoCo's OpenGL backends that works here, or the one that MUJOCO_GL names.
+
+    Raises:
+        NoDisplay: none does.
+    """
+    wanted = os.environ.get("MUJOCO_GL", "").strip().lower()
+    names = BACKENDS.get(platform.system(), ("glfw",))
+    if wanted not in ("", "1", "on", "true", "enable", "enabled"):
+        names = ({"glx": "glfw", "wgl": "glfw"}.get(wanted, wanted),)
+    for name in names:
+        if works(name):
+            return name
+    hint = f"unset MUJOCO_GL={wanted}" if names == (wanted,) else "install libegl1 or libosmesa6"
+    raise NoDisplay(f"nothing to render with here: {', '.join(names)} failed; {hint}")
+
+
+def works(backend: str) -> bool:
+    """Try a backend in a process of its own: a failure would bar the next one from this process."""
+    try:
+        probe = subprocess.run([sys.executable, "-c", PROBE, backend], capture_output=True, timeout=60)
+    except (OSError, subprocess.TimeoutExpired):
+        return False
+    return probe.returncode == 0
+
+
+# Small parts -----------------------------------------------------------------------------------------
+
+
+def named_camera(model: mujoco.MjModel, name: str) -> mujoco.MjvCamera:
+    names = [model.camera(i).name for i in range(model.ncam)]
+    if name not in names:
+        raise ConfigError(f"no camera {name!r}{nearest(name, names)}")
+    camera = mujoco.MjvCamera()
+    camera.type = mujoco.mjtCamera.mjCAMERA_FIXED.value
+    camera.fixedcamid = names.index(name)
+    return camera
+
+
+def split(obs: Any, spec: dict[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
+    """Components of an observation by name, each flat."""
+    if isinstance(obs, dict):
+        return {name: np.asarray(value).reshape(-1) for name, value in obs.items()}
+    ends = np.cumsum([int(np.prod(shape)) for shape in spec.values()])
+    return dict(zip(spec, np.split(np.asarray(obs), ends[:-1]), strict=True)) if spec else {}
+
+
+def colour(name: str) -> tuple[float, ...]:
+    """RGBA of a kind, in the singular or the plural."""
+    return scenes.RGBA[name if name in scenes.RGBA else name[:-1]]

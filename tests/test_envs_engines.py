@@ -1,0 +1,150 @@
+"""Engines agree or refuse with a reason, and environments run under the shared rollout."""
+
+import builtins
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tasks import FAST, task
+
+from jaxsafe import envs
+from jaxsafe.config import ConfigError
+from jaxsafe.envs import physics
+from jaxsafe.rollout import collect, init_rollout
+
+
+def test_an_unknown_engine_gets_the_nearest():
+    with pytest.raises(ConfigError, match=r"env.engine='wrap'; did you mean 'warp'"):
+        envs.make("point_goal0", engine="wrap")
+
+
+def test_auto_is_the_engine_of_the_device():
+    if jax.default_backend() != "cpu":
+        pytest.skip("needs a CPU")
+    assert envs.make("point_goal0").engine == "c"
+
+
+@pytest.mark.parametrize("name", ["car_push1", "point_push1", "car_goal1", "doggo_push2"])
+def test_the_jax_engine_refuses_boxes_against_cylinders(name):
+    with pytest.raises(
+        ConfigError, match=r"MJX has no box-cylinder collision .* use env\.engine=c, or warp"
+    ):
+        envs.make(name, engine="jax")
+
+
+def test_the_warp_engine_says_what_to_install(monkeypatch):
+    real = builtins.__import__
+
+    def without_warp(name, *args, **kwargs):
+        if name == "warp" or name.startswith("warp."):
+            raise ImportError("no warp here")
+        return real(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", without_warp)
+    with pytest.raises(ConfigError, match=r"warp-lang is not installed; pip install 'jaxsafe\[gpu\]'"):
+        envs.make("point_goal0", engine="warp")
+
+
+def test_an_engine_that_nobody_knows_is_refused_by_the_maker():
+    scene = envs.make("point_goal0", engine="c").scene
+    with pytest.raises(ConfigError, match=r"valid: auto, c, jax, warp|did you mean"):
+        physics.make_engine("gazebo", scene, 10)
+
+
+def agree(name: str, steps: int, tolerance: float) -> None:
+    """The `jax` engine goes where `c` goes, a step at a time from the states of `c`."""
+    c, mjx = task(name), task(name, engine="jax")
+    state = c.begin()
+    actions = jax.random.uniform(jax.random.key(7), (steps, 4, c.env.action_size), minval=-1)
+    for action in actions:
+        twin = mjx.step(state, action)
+        state = c.step(state, action)
+        np.testing.assert_allclose(
+            twin.physics.physics.qpos, state.physics.physics.qpos, atol=tolerance
+        )
+        np.testing.assert_allclose(twin.reward, state.reward, atol=tolerance)
+        np.testing.assert_allclose(
+            mjx.part(twin, "goal_lidar"), c.part(state, "goal_lidar"), atol=tolerance
+        )
+        np.testing.assert_array_equal(twin.cost, state.cost)
+
+
+def test_the_jax_engine_agrees_with_c_where_nothing_touches():
+    agree("point_goal0", 4, 1e-4)
+
+
+@pytest.mark.slow
+def test_the_jax_engine_agrees_with_c_among_vases():
+    agree("point_goal1", 10, 1e-4)
+
+
+def test_one_world_or_many_and_batches_of_batches_are_the_same():
+    t = task("point_goal1")
+    state = t.begin(6)
+    state = t.idle(state)
+    action = jax.random.uniform(jax.random.key(3), (6, t.env.action_size), minval=-1)
+    many = t.step(state, action)
+    split = partial(jax.tree.map, lambda x: x.reshape(2, 3, *x.shape[1:]))
+    nested = jax.jit(jax.vmap(jax.vmap(t.env.step)), compiler_options=FAST)(split(state), split(action))
+    np.testing.assert_allclose(nested.obs.reshape(many.obs.shape), many.obs, atol=1e-5)
+    one = jax.jit(t.env.step, compiler_options=FAST)(jax.tree.map(lambda x: x[4], state), action[4])
+    np.testing.assert_allclose(one.obs, many.obs[4], atol=1e-5)
+    np.testing.assert_allclose(one.physics.physics.qpos, many.physics.physics.qpos[4], atol=1e-6)
+
+
+def test_reset_and_step_have_the_same_structure():
+    for name in ("point_goal2", "car_push2", "doggo_button2", "point_circle"):
+        env = envs.make(name, engine="c")
+        state = jax.eval_shape(env.reset, jax.random.key(0))
+        after = jax.eval_shape(env.step, state, jnp.zeros(env.action_size))
+        assert jax.tree.structure(state) == jax.tree.structure(after)
+        shapes = [[(x.shape, x.dtype) for x in jax.tree.leaves(s)] for s in (state, after)]
+        assert shapes[0] == shapes[1]
+        assert (state.obs.shape, state.costs.shape) == ((env.obs_size,), (len(env.cost_names),))
+
+
+@pytest.fixture(scope="module")
+def rollout():
+    """17 steps of 3 environments with episodes of 5 steps, and the state they end in."""
+    env: Any = task("point_goal0", num_steps=5).env
+
+    def push(obs, key):
+        return jax.random.uniform(key, (obs.shape[0], 2), minval=-1), jnp.zeros(obs.shape[0])
+
+    begin = init_rollout(env, jax.random.key(0), 3, False)
+    end, traj = jax.jit(partial(collect, env, push, horizon=17), compiler_options=FAST)(
+        begin, key=jax.random.key(1)
+    )
+    return env, begin, end, jax.tree.map(np.asarray, traj)
+
+
+def test_the_time_limit_truncates_and_does_not_terminate(rollout):
+    _, _, _, traj = rollout
+    np.testing.assert_array_equal(np.flatnonzero(traj.truncated[:, 0]), [4, 9, 14])
+    assert not traj.terminated.any()
+    np.testing.assert_array_equal(traj.length[traj.ended], 5)
+
+
+def test_every_episode_has_a_layout_of_its_own(rollout):
+    _, _, _, traj = rollout
+    starts = traj.obs[::5].reshape(12, -1)
+    assert len(np.unique(starts.round(4), axis=0)) == 12
+
+
+def test_an_observation_after_a_reset_is_that_of_the_new_episode(rollout):
+    env, begin, _, traj = rollout
+    np.testing.assert_array_equal(traj.obs[0], begin.state.obs)
+    np.testing.assert_array_equal(traj.obs[5], begin.pool.obs)  # a fresh reset each, in order
+    assert (np.abs(traj.next_obs[4] - traj.obs[5]).max(1) > 1e-3).all()
+    np.testing.assert_array_equal(traj.next_obs[:4], traj.obs[1:5])
+    # at rest: no speed, and gravity alone
+    spec = list(env.observation_spec)
+    assert (spec[0], spec[-1]) == ("accelerometer", "velocimeter")
+    np.testing.assert_array_equal(traj.obs[::5, :, -3:], 0)
+    np.testing.assert_allclose(
+        traj.obs[::5, :, :3], np.broadcast_to([0, 0, 9.81], (4, 3, 3)), atol=1e-6
+    )
+    assert (np.abs(traj.obs[4, :, -3:]) > 0).any()
