@@ -134,11 +134,14 @@ def collect(
 def restart(env: Env, rollout: RolloutState, done: jax.Array, key: jax.Array) -> RolloutState:
     """Put fresh resets where `done` [N] holds."""
     num_envs, ends = done.shape[0], done.sum()
+
+    def refill(carry: tuple[State, jax.Array]) -> tuple[State, jax.Array]:
+        _, used = carry  # the draw must depend on it, or XLA hoists it out of the loop
+        return reset_all(env, jax.random.fold_in(key, used), num_envs), jnp.zeros_like(used)
+
     # runs at most once; a cond would turn into a select under vmap over seeds and pay at every step
     pool, used = jax.lax.while_loop(
-        lambda carry: carry[1] + ends > num_envs,
-        lambda carry: (reset_all(env, key, num_envs), jnp.zeros_like(carry[1])),
-        (rollout.pool, rollout.used),
+        lambda carry: carry[1] + ends > num_envs, refill, (rollout.pool, rollout.used)
     )
     entry = used + jnp.cumsum(done) - 1
     return RolloutState(
