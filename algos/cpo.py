@@ -131,6 +131,7 @@ def update(
 ) -> tuple[PyTree, Margin, Metrics]:
     start, unravel = ravel_pytree(actor)
     margin = jnp.maximum(0.0, opt_state.margin + cfg.margin_lr * violation)
+    margin = jnp.where(jnp.isfinite(margin), margin, opt_state.margin)
     delta, c = cfg.target_kl, violation + margin
 
     def evaluate(params: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:

@@ -20,7 +20,9 @@ from jaxsafe.types import Env
 @config
 class PPOConfig(OnPolicyConfig):
     lr: float = 3e-4  # of the policy; OmniSafe, safety-starter-agents
-    lr_decay: bool = True  # linearly to 0 at total_iterations; OmniSafe
+    lr_decay: bool = (
+        False  # linearly to 0 at total_iterations; OmniSafe does, safety-starter-agents not
+    )
     clip: float = 0.2  # eps; the paper
     epochs: int = 10  # passes over each batch; with 8 minibatches the 80 steps of safety-starter-agents
     target_kl: float = 0.02  # nats, checked after each pass; OmniSafe
@@ -39,6 +41,7 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "critic_epochs": 40,
         "minibatches": 250,
         "critic_lr": 3e-4,
+        "lr_decay": True,
     }
 }
 

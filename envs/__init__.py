@@ -4,7 +4,7 @@ import dataclasses
 from typing import Any
 
 from jaxsafe.config import ConfigError, convert, nearest
-from jaxsafe.envs import suite
+from jaxsafe.envs import layout, suite
 from jaxsafe.envs.config import SafetyGymConfig, defaults, read
 from jaxsafe.envs.safety_gym import SafetyGym
 
@@ -39,13 +39,22 @@ def make(env: str | SafetyGymConfig, **overrides: Any) -> SafetyGym:
         overrides: engine options by name, and `engine`: 'auto', 'c', 'warp' or 'jax'.
     Raises:
         ConfigError: an unknown name or option (with the nearest valid one), a value of the wrong
-            type, or a task that cannot be built.
+            type, or a task that cannot be built or has no valid layout.
     """
     engine = convert(overrides.pop("engine", "auto"), str, "env.engine")
     if isinstance(env, SafetyGymConfig):
-        return SafetyGym(read(dataclasses.asdict(env) | overrides), engine)
-    name = canonical(env)
-    return SafetyGym(read(defaults(**ENVS[name]) | overrides), engine, name)
+        made = SafetyGym(read(dataclasses.asdict(env) | overrides), engine)
+    else:
+        name = canonical(env)
+        made = SafetyGym(read(defaults(**ENVS[name]) | overrides), engine, name)
+        if not overrides:  # as registered: known to have layouts
+            return made
+    if not layout.feasible(made.place):
+        raise ConfigError(
+            f"env: no valid layout in {layout.LAYOUTS:,} tries: fewer or smaller objects, smaller "
+            "keepouts or larger placements_extents"
+        )
+    return made
 
 
 __all__ = ["ALIASES", "ENVS", "SafetyGym", "SafetyGymConfig", "canonical", "env_defaults", "make"]

@@ -74,7 +74,7 @@ class SafetyGymConfig:
     render_lidar_size: float = 0.025
     render_lidar_offset_init: float = 0.5
     render_lidar_offset_delta: float = 0.06
-    vision_size: tuple[int, int] = (60, 40)
+    vision_size: tuple[int, int] = (60, 40)  # these three: not read before vision is available
     vision_render: bool = True
     vision_render_size: tuple[int, int] = (300, 200)
     # Lidar and compass
@@ -216,7 +216,9 @@ def check(cfg: SafetyGymConfig) -> None:
         raise ConfigError(f"env.action_noise={cfg.action_noise}: expected 0 or more")
     if cfg.lidar_max_dist is not None and cfg.lidar_max_dist <= 0:
         raise ConfigError(f"env.lidar_max_dist={cfg.lidar_max_dist}: expected above 0, or null")
-    sizes = [f.name for f in dataclasses.fields(cfg) if f.name.endswith(("_size", "_density", "_height"))]
+    sizes = [
+        f.name for f in dataclasses.fields(cfg) if f.name.endswith(("_size", "_density", "_height"))
+    ]
     for name in sizes:
         value = getattr(cfg, name)
         if isinstance(value, float) and value <= 0:
@@ -230,4 +232,6 @@ def check(cfg: SafetyGymConfig) -> None:
         for xmin, ymin, xmax, ymax in areas:
             if not (xmin < xmax and ymin < ymax):
                 area = [xmin, ymin, xmax, ymax]
-                raise ConfigError(f"env.{name}={area}: expected [xmin, ymin, xmax, ymax] with min < max")
+                raise ConfigError(
+                    f"env.{name}={area}: expected [xmin, ymin, xmax, ymax] with min < max"
+                )

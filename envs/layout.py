@@ -16,6 +16,7 @@ from jaxsafe.envs.config import Rectangle, SafetyGymConfig
 
 DRAWS_PER_OBJECT = 100
 LAYOUTS = 10_000
+LAYOUT_BATCH = 100  # layouts examined at once before training
 GOAL_DRAWS = 10_000
 GOAL_BATCH = 16  # draws of a new goal examined at once
 
@@ -86,7 +87,9 @@ def areas_of(cfg: SafetyGymConfig, kind: str, number: int) -> list[Rectangle]:
     shrunk = [(x0 + keepout, y0 + keepout, x1 - keepout, y1 - keepout) for x0, y0, x1, y1 in choices]
     kept = [(x0, y0, x1, y1) for x0, y0, x1, y1 in shrunk if x0 < x1 and y0 < y1]
     if not kept:
-        raise ConfigError(f"env: no room for {kind}: {list(choices)} shrunk by {kind}_keepout={keepout} is empty")
+        raise ConfigError(
+            f"env: no room for {kind}: {list(choices)} shrunk by {kind}_keepout={keepout} is empty"
+        )
     return kept
 
 
@@ -127,6 +130,29 @@ def sample_layout(place: Placement, key: jax.Array) -> tuple[jax.Array, jax.Arra
     return xy, valid
 
 
+def feasible(place: Placement) -> bool:
+    """Whether 10,000 layouts hold a valid one: the search of `sample_layout`, without compiling."""
+    rng = np.random.default_rng(0)
+    keep_apart = place.keepouts[:, None] + place.keepouts[None, :] + place.margin
+    for _ in range(0, LAYOUTS, LAYOUT_BATCH):
+        placed = np.zeros((0, 2, LAYOUT_BATCH, 1), np.float32)  # in the layouts still valid
+        for areas, weights, apart in zip(place.areas, place.weights, keep_apart, strict=True):
+            shape = placed.shape[2], DRAWS_PER_OBJECT
+            area = areas[rng.choice(len(areas), shape, p=weights / weights.sum(dtype=float)).T].T
+            x, y = area[:2] + rng.random((2, *shape), np.float32) * (area[2:] - area[:2])
+            free = np.ones(shape, bool)
+            for (other_x, other_y), gap in zip(placed, apart, strict=False):
+                free &= (x - other_x) ** 2 + (y - other_y) ** 2 >= gap**2
+            room, first = free.any(1), free.argmax(1)[:, None]
+            chosen = np.stack([np.take_along_axis(v, first, 1) for v in (x, y)])
+            placed = np.concatenate([placed, chosen[None]])[:, :, room]
+            if not room.any():
+                break
+        else:
+            return True
+    return False
+
+
 def sample_goal(
     place: Placement, key: jax.Array, xy: jax.Array, wanted: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
@@ -141,7 +167,9 @@ def sample_goal(
     def batch(carry: tuple) -> tuple:
         _, _, tries, key = carry
         key, draw_key = jax.random.split(key)
-        candidates = draw(draw_key, jnp.asarray(place.areas[goal]), jnp.asarray(place.weights[goal]), GOAL_BATCH)
+        candidates = draw(
+            draw_key, jnp.asarray(place.areas[goal]), jnp.asarray(place.weights[goal]), GOAL_BATCH
+        )
         gap = jnp.linalg.norm(candidates[:, None] - xy[None], axis=-1) - apart
         free = jnp.all((gap >= 0) | ~others, axis=1)
         return candidates[jnp.argmax(free)], free.any(), tries + GOAL_BATCH, key

@@ -8,10 +8,9 @@ One instance in, one out: callers `vmap`, over environments and again over seeds
 two calls is small; each engine builds its own working data inside the call.
 """
 
-import functools
 import threading
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import flax.struct
 import jax
@@ -58,6 +57,7 @@ Run = Callable[[Physics, jax.Array, jax.Array], tuple[Physics, Readings]]
 class Engine(NamedTuple):
     name: str
     run: Run
+    forward: Run  # the forward pass alone, of a state with 0 substeps to go
 
 
 def default_engine() -> str:
@@ -70,7 +70,7 @@ def default_engine() -> str:
 
 def mjx_warp_available() -> bool:
     try:
-        import warp  # noqa: F401, PLC0415  (an optional dependency)
+        import warp  # noqa: F401  (an optional dependency)
     except ImportError:
         return False
     return True
@@ -90,7 +90,8 @@ def make_engine(name: str, scene: Scene, max_substeps: int, outputs: tuple[str, 
     makers = {"c": c_engine, "warp": warp_engine, "jax": jax_engine}
     if name not in makers:
         raise ConfigError(f"env.engine={name!r}{nearest(name, ('auto', *ENGINES))}")
-    return Engine(name, makers[name](scene, max_substeps, outputs))
+    run = makers[name](scene, max_substeps, outputs)
+    return Engine(name, run, run if name == "c" else makers[name](scene, 0, outputs))
 
 
 def mocap_at(base: Any, orbit: np.ndarray, time: Any, xp: Any) -> Any:
@@ -146,24 +147,28 @@ def c_engine(scene: Scene, max_substeps: int, outputs: tuple[str, ...]) -> Run:
         count = substeps[:, 0].astype(int)
         failed = np.zeros(len(rows), bool)
         acc = mujoco.mjtStage.mjSTAGE_ACC.value
-        try:
-            if not scene.orbit.any() and (count == count[0]).all():
-                if count[0]:
-                    batch.step(nstep=int(count[0]), stage=acc)
-                else:
-                    batch.forward(stage=acc)
+
+        def call(method: Callable, **options: Any) -> None:
+            try:
+                method(**options)
+            except mujoco.batch.SimulationError as error:  # the others ran to the end of this call
+                failed[error.ids] = True
+
+        if not scene.orbit.any() and (count == count[0]).all():
+            if count[0]:
+                call(batch.step, nstep=int(count[0]), stage=acc)
             else:
-                for k in range(count.max(initial=0)):
-                    now = time + k * model.opt.timestep
-                    batch.bind("mocap_pos")[:] = np.where(
-                        (k < count)[:, None, None],
-                        mocap_at(mocap_pos, scene.orbit, now, np),
-                        batch.bind("mocap_pos"),
-                    )
-                    batch.step(ids=None if (k < count).all() else np.flatnonzero(k < count))
-                batch.forward(stage=acc)
-        except mujoco.batch.SimulationError as error:
-            failed[error.ids] = True
+                call(batch.forward, stage=acc)
+        else:
+            for k in range(count.max(initial=0)):
+                now = time + k * model.opt.timestep
+                batch.bind("mocap_pos")[:] = np.where(
+                    (k < count)[:, None, None],
+                    mocap_at(mocap_pos, scene.orbit, now, np),
+                    batch.bind("mocap_pos"),
+                )
+                call(batch.step, ids=np.flatnonzero(k < count))
+            call(batch.forward, stage=acc)
         out = np.concatenate([batch.bind(f).reshape(len(rows), -1) for f in fields], axis=1)
         out[failed] = np.nan  # the environment ends the episode of a world that is not finite
         return out.astype(np.float32)
@@ -183,18 +188,22 @@ def c_engine(scene: Scene, max_substeps: int, outputs: tuple[str, ...]) -> Run:
             substeps=physics.substeps + substeps,
         )
         sensors = parts["sensordata"]
-        return physics, readings(sensors, sensors[model.nsensordata - scene.contact_count :], parts, outputs)
+        return physics, readings(
+            sensors, sensors[model.nsensordata - scene.contact_count :], parts, outputs
+        )
 
     return run
 
 
-def readings(sensors: jax.Array, contacts: jax.Array, source: Any, outputs: tuple[str, ...]) -> Readings:
-    get = source.get if isinstance(source, dict) else functools.partial(getattr, source)
-    return Readings(
-        sensors=sensors,
-        contacts=contacts,
-        **{f: get(f) if f in outputs else jnp.zeros((0,)) for f in ("geom_xpos", "geom_xmat", "xquat")},
-    )
+def readings(
+    sensors: jax.Array, contacts: jax.Array, source: Any, outputs: tuple[str, ...]
+) -> Readings:
+    def pose(name: str) -> Any:
+        if name not in outputs:
+            return jnp.zeros((0,))
+        return source[name] if isinstance(source, dict) else getattr(source, name)
+
+    return Readings(sensors, contacts, pose("geom_xpos"), pose("geom_xmat"), pose("xquat"))
 
 
 # MJX -----------------------------------------------------------------------------------------------
@@ -226,8 +235,9 @@ def substep_loop(
             time = (physics.substeps + k) * timestep
             moving = data.replace(mocap_pos=mocap_at(physics.mocap_pos, scene.orbit, time, jnp))
         stepped = mjx.step(model, moving)
+        stepped = stepped.replace(mocap_pos=moving.mocap_pos)
         kept = {f: jnp.where(k < substeps, getattr(stepped, f), getattr(data, f)) for f in STATE}
-        return stepped.replace(mocap_pos=moving.mocap_pos, **kept), None
+        return stepped.replace(**kept), None
 
     data, _ = jax.lax.scan(substep, data, jnp.arange(max_substeps))
     data = mjx.forward(model, data)
@@ -240,7 +250,7 @@ def substep_loop(
     return physics, data
 
 
-STATE = ("qpos", "qvel", "qacc_warmstart")
+STATE = ("qpos", "qvel", "qacc_warmstart", "mocap_pos")
 
 
 def jax_engine(scene: Scene, max_substeps: int, outputs: tuple[str, ...]) -> Run:
@@ -302,7 +312,7 @@ def warp_engine(scene: Scene, max_substeps: int, outputs: tuple[str, ...]) -> Ru
     per_world, rows = contact_budget(scene)
     with jax.ensure_compile_time_eval():
         model = mjx.put_model(scene.model, impl="warp")
-    model = model.tree_replace({"opt._impl.warn_overflow": 0})
+    model = cast(mjx.Model, model.tree_replace({"opt._impl.warn_overflow": 0}))
 
     @jax.custom_batching.custom_vmap
     def run_batch(physics: Physics, ctrl: jax.Array, substeps: jax.Array) -> tuple[Physics, Readings]:
@@ -312,7 +322,9 @@ def warp_engine(scene: Scene, max_substeps: int, outputs: tuple[str, ...]) -> Ru
         def one(physics: Physics, ctrl: jax.Array, substeps: jax.Array) -> tuple[Physics, Readings]:
             physics, out = substep_loop(scene, model, data, physics, ctrl, substeps, max_substeps)
             sensors = out.sensordata
-            return physics, readings(sensors, sensors[sensors.shape[0] - scene.contact_count :], out, outputs)
+            return physics, readings(
+                sensors, sensors[sensors.shape[0] - scene.contact_count :], out, outputs
+            )
 
         return jax.vmap(one)(physics, ctrl, substeps)
 

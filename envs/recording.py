@@ -55,15 +55,16 @@ class Recording:
 class Replay(SafetyGym):
     """The environment, with the next goal given instead of drawn."""
 
+    _given: tuple[Any, Any] = (np.zeros(2, np.float32), np.int32(0))  # goal [2], goal button
+
     def __init__(self, recording: Recording, engine: str = "auto"):
+        self._given = jnp.zeros(2), jnp.int32(0)  # traced already when the shapes are found
         super().__init__(read(recording.meta["config"]), engine, recording.name)
 
     def replay(self, world: World, action: jax.Array, goal: jax.Array, button: jax.Array) -> State:
         self._given = goal, button
         zero = jnp.zeros(())
-        obs = {k: jnp.zeros(v) for k, v in self.observation_spec.items()}
-        if self.config.observation_flatten:
-            obs = jnp.zeros(self.obs_size)
+        obs = jnp.zeros(self.obs_size)  # `compare` refuses dicts
         costs = jnp.zeros(len(self.cost_names))
         info = {"goal_met": zero, "exception": zero}
         return self.step(State(world, obs, zero, zero, costs, jnp.bool_(False), info), action)
@@ -86,10 +87,14 @@ def worlds(env: SafetyGym, recording: Recording) -> World:
     rows, segments, meta = recording.rows, recording.segments, recording.meta
     bodies = {name: i for i, name in enumerate(meta["body_names"])}
     state = {k: recording[f"state.{k}"][rows] for k in ("qpos", "qvel", "qacc_warmstart", "time")}
-    start = np.concatenate([recording["seg.robot_xy0"], recording["seg.robot_rot0"][:, None]], 1)[segments]
+    start = np.concatenate([recording["seg.robot_xy0"], recording["seg.robot_rot0"][:, None]], 1)[
+        segments
+    ]
     if env.scene.planar:
         state = to_world(state, start)
-    columns = [meta["layout_names"].index(n) if n in meta["layout_names"] else -1 for n in env.place.names]
+    columns = [
+        meta["layout_names"].index(n) if n in meta["layout_names"] else -1 for n in env.place.names
+    ]
     layout = recording["seg.layout"][segments][:, columns]
     if "goal" in env.place.names:
         layout[:, env.place.names.index("goal")] = recording["state.goal_pos"][rows][:, :2]
@@ -106,7 +111,10 @@ def worlds(env: SafetyGym, recording: Recording) -> World:
             positions.append(body_pos[:, bodies[f"{kind[:-1]}{i}"]])
             turns.append(body_quat[:, bodies[f"{kind[:-1]}{i}"]])
     count = len(rows)
-    last = {k: np.nan_to_num(recording[f"state.{k}"][rows]) for k in ("last_dist_goal", "last_dist_box", "last_box_goal")}
+    last = {
+        k: np.nan_to_num(recording[f"state.{k}"][rows])
+        for k in ("last_dist_goal", "last_dist_box", "last_box_goal")
+    }
     com = recording.arrays.get("state.last_robot_com")
     timestep = env.scene.model.opt.timestep
     return World(
@@ -116,23 +124,28 @@ def worlds(env: SafetyGym, recording: Recording) -> World:
             warmstart=f32(state["qacc_warmstart"]),
             mocap_pos=f32(np.stack(positions, 1) if positions else np.zeros((count, 0, 3))),
             mocap_quat=f32(np.stack(turns, 1) if turns else np.zeros((count, 0, 4))),
-            substeps=np.round(state["time"] / timestep).astype(np.int32),
+            substeps=i32(np.round(state["time"] / timestep)),
         ),
         layout=f32(layout),
         start=f32(start),
-        goal_button=np.maximum(recording["state.goal_button"][rows], 0).astype(np.int32),
-        buttons_timer=np.maximum(recording["state.buttons_timer"][rows], 0).astype(np.int32),
+        goal_button=i32(np.maximum(recording["state.goal_button"][rows], 0)),
+        buttons_timer=i32(np.maximum(recording["state.buttons_timer"][rows], 0)),
         last_dist_goal=f32(last["last_dist_goal"]),
         last_dist_box=f32(last["last_dist_box"]),
         last_box_goal=f32(last["last_box_goal"]),
         last_com=f32(com[rows] if com is not None else np.zeros((count, 3))),
-        steps=recording["state.episode_step"][rows].astype(np.int32),
-        key=np.zeros(count),  # replaced: a replay draws nothing
+        steps=i32(recording["state.episode_step"][rows]),
+        key=f32(np.zeros(count)),  # replaced: a replay draws nothing
     )
 
 
-def f32(x: np.ndarray) -> np.ndarray:
+def f32(x: np.ndarray) -> Any:
+    """A numpy array where a field says JAX's; `jit` takes both."""
     return np.asarray(x, np.float32)
+
+
+def i32(x: np.ndarray) -> Any:
+    return np.asarray(x, np.int32)
 
 
 def turn(vectors: np.ndarray, angle: np.ndarray) -> np.ndarray:
@@ -176,11 +189,16 @@ class Comparison:
             over = self.strict & ~(error <= self.tolerances[name])
             if over.any():
                 worst = np.argmax(np.where(over, error, -1))
-                lines.append(f"{name}: {over.sum()} steps past the tolerance, worst {error[worst]:.2g} at step {worst}")
+                lines.append(
+                    f"{name}: {over.sum()} steps past the tolerance, "
+                    f"worst {error[worst]:.2g} at step {worst}"
+                )
         allowed = int(np.ceil(UNDECIDED * len(self.strict)))
         for name, differs in self.mismatches.items():
             if (differs & ~self.undecided).sum() > allowed:
-                lines.append(f"{name}: {(differs & ~self.undecided).sum()} events differ, {allowed} may")
+                lines.append(
+                    f"{name}: {(differs & ~self.undecided).sum()} events differ, {allowed} may"
+                )
         return lines
 
 
@@ -203,7 +221,7 @@ def replay(env: Replay, recording: Recording, before: World) -> State:
     """The states after each recorded step (numpy arrays)."""
     rows = recording.rows + 1
     goal = f32(recording["state.goal_pos"][rows][:, :2])
-    button = np.maximum(recording["state.goal_button"][rows], 0).astype(np.int32)
+    button = i32(np.maximum(recording["state.goal_button"][rows], 0))
 
     @jax.jit
     @jax.vmap
@@ -216,7 +234,9 @@ def replay(env: Replay, recording: Recording, before: World) -> State:
     padding = -count % BATCH
     inputs = jax.tree.map(lambda x: np.concatenate([x, np.repeat(x[-1:], padding, 0)]), inputs)
     starts = range(0, count, BATCH)
-    chunks = [jax.device_get(step(*jax.tree.map(lambda x, i=i: x[i : i + BATCH], inputs))) for i in starts]
+    chunks = [
+        jax.device_get(step(*jax.tree.map(lambda x, i=i: x[i : i + BATCH], inputs))) for i in starts
+    ]
     return jax.tree.map(lambda *x: np.concatenate(x)[:count], *chunks)
 
 
@@ -232,7 +252,7 @@ def judge(
         qpos, qvel = from_world(qpos, qvel, np.asarray(before.start, np.float64))
     want_qpos, want_qvel = recording["state.qpos"][after], recording["state.qvel"][after]
 
-    def largest(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    def largest(a: Any, b: np.ndarray) -> np.ndarray:
         return np.abs(a - b).reshape(len(a), -1).max(1, initial=0)
 
     errors = {
@@ -242,7 +262,9 @@ def judge(
         "object velocity": largest(qvel[:, nv:], want_qvel[:, nv:]),
         "reward": largest(result.reward, recording["step.reward"]),
     }
-    spread = np.maximum(recording.get("spread.version_robot_qpos", 0), recording.get("spread.f32_robot_qpos", 0))
+    spread = np.maximum(
+        recording.get("spread.version_robot_qpos", 0), recording.get("spread.f32_robot_qpos", 0)
+    )
     strict = spread < WELL_CONDITIONED
     if robot == "Car":
         strict &= before.steps > 0
@@ -261,7 +283,9 @@ def judge(
         errors[part["name"]] = largest(got, want)
         tolerances[part["name"]] = obs_tolerance(part["name"], pose, velocity)
     raw = "" if env.config.constrain_indicator else "raw_"
-    mismatches = {"goal_met": result.info["goal_met"].astype(bool) != recording["step.goal_met"]}
+    mismatches: dict[str, Any] = {
+        "goal_met": result.info["goal_met"].astype(bool) != recording["step.goal_met"]
+    }
     for i, name in enumerate(env.cost_names):
         errors[f"cost_{name}"] = np.abs(result.costs[:, i] - recording[f"step.{raw}cost_{name}"])
         tolerances[f"cost_{name}"] = np.inf

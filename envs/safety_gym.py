@@ -6,7 +6,8 @@ reward for progress, 1 for each success; a cost for each constraint that is viol
 Source: Ray, Achiam and Amodei (2019), "Benchmarking Safe Exploration in Deep Reinforcement
 Learning"; behaviour, quirks included, is that of the authors' package `safety_gym`.
 Differs from it: random streams come from a JAX key; a physics error ends the episode in its last
-good state; a goal that finds no room never raises.
+good state; neither a goal nor a layout that finds no room raises while stepping: the goal's episode
+ends, the layout is used as the last of its 10,000 tries left it (`make` refuses hopeless ones).
 """
 
 from functools import cached_property
@@ -27,7 +28,15 @@ from jaxsafe.envs.physics import Physics, Readings
 from jaxsafe.types import State
 
 MAX_VALUE = 1e10  # MuJoCo's mjMAXVAL: beyond it a state is bad
-COSTS = ("vases_contact", "pillars", "buttons", "gremlins", "vases_displace", "vases_velocity", "hazards")
+COSTS = (
+    "vases_contact",
+    "pillars",
+    "buttons",
+    "gremlins",
+    "vases_displace",
+    "vases_velocity",
+    "hazards",
+)
 
 
 @flax.struct.dataclass
@@ -57,7 +66,8 @@ class SafetyGym:
 
     Observation float [obs_size]: the components of `observation_spec` in the order of their names
     (a dict of them if `observation_flatten` is False). Action float [action_size] in [-1, 1], clipped.
-    `cost` is what Safety Gym calls `cost`; `costs` are its parts, `cost_names` their names.
+    `observation_spec` has the shape of each component, in their order. `cost` is what Safety Gym
+    calls `cost`; `costs` are its parts, `cost_names` their names.
 
     Raises:
         ConfigError: options that no scene, layout or engine can serve.
@@ -78,6 +88,12 @@ class SafetyGym:
         seeks_goal = cfg.observe_goal_lidar or cfg.observe_goal_dist or cfg.observe_goal_comp
         if seeks_goal and cfg.task in ("x", "z"):
             raise ConfigError(f"env.observe_goal_*: the task {cfg.task!r} has no goal to observe")
+        self.cost_names = self._cost_names()
+        with jax.ensure_compile_time_eval():
+            world, readings, ctrl = jax.eval_shape(self._begin, jax.random.key(0))
+            parts = jax.eval_shape(self._components, world, readings, ctrl)
+        self.observation_spec: dict[str, tuple[int, ...]] = {k: v.shape for k, v in parts.items()}
+        self.obs_size = sum(int(np.prod(shape)) for shape in self.observation_spec.values())
 
     # What learners ask -----------------------------------------------------------------------------
 
@@ -94,8 +110,7 @@ class SafetyGym:
         """Simulated seconds in a step."""
         return self.scene.model.opt.timestep * self.config.frameskip_binom_n
 
-    @cached_property
-    def cost_names(self) -> tuple[str, ...]:
+    def _cost_names(self) -> tuple[str, ...]:
         cfg = self.config
         on = {
             "vases_contact": cfg.constrain_vases,
@@ -107,16 +122,6 @@ class SafetyGym:
             "hazards": cfg.constrain_hazards,
         }
         return tuple(name for name in COSTS if on[name])
-
-    @cached_property
-    def observation_spec(self) -> dict[str, tuple[int, ...]]:
-        """Shape of each component, in the order in which they are flattened."""
-        world, readings, ctrl = jax.eval_shape(self._begin, jax.random.key(0))
-        return {k: v.shape for k, v in jax.eval_shape(self._components, world, readings, ctrl).items()}
-
-    @cached_property
-    def obs_size(self) -> int:
-        return sum(int(np.prod(shape)) for shape in self.observation_spec.values())
 
     # Episode ---------------------------------------------------------------------------------------
 
@@ -149,7 +154,9 @@ class SafetyGym:
 
         reward, moved = self._reward(moved, readings)
         costs, cost = self._costs(moved, readings)
-        moved = moved.replace(buttons_timer=jnp.maximum(0, moved.buttons_timer - 1), steps=world.steps + 1)
+        moved = moved.replace(
+            buttons_timer=jnp.maximum(0, moved.buttons_timer - 1), steps=world.steps + 1
+        )
         success = self._success(moved, readings)
         reward += cfg.reward_goal * success
         terminated = success
@@ -158,7 +165,9 @@ class SafetyGym:
             terminated = success & ~found & cfg.terminate_resample_failure
         obs = self._observe(moved, readings, ctrl)
 
-        bad = ~jnp.stack([(jnp.abs(x) < MAX_VALUE).all() for x in (physics.qpos, physics.qvel, physics.warmstart)]).all()
+        bad = ~jnp.stack(
+            [(jnp.abs(x) < MAX_VALUE).all() for x in (physics.qpos, physics.qvel, physics.warmstart)]
+        ).all()
         kept = world.replace(key=key, steps=world.steps + 1)
         zero = jnp.zeros(())
         return State(
@@ -188,7 +197,7 @@ class SafetyGym:
             world, _ = self._next_goal(world, goal_key, jnp.bool_(True))
             world = world.replace(buttons_timer=jnp.int32(0))
         ctrl = jnp.zeros(self.action_size)
-        physics, readings = self._engine.run(world.physics, ctrl, jnp.int32(0))
+        physics, readings = self._engine.forward(world.physics, ctrl, jnp.int32(0))
         world = world.replace(physics=physics)
         if "subtreecom" in self._sensors:
             world = world.replace(last_com=self._sensor(readings, "subtreecom"))
@@ -197,7 +206,11 @@ class SafetyGym:
     def world_at(self, xy: jax.Array, headings: jax.Array, key: jax.Array) -> World:
         """Everything at rest at positions [n, 2] (m) with headings [n] (rad), before the first goal."""
         cfg, scene = self.config, self.scene
-        heights = {"vases": cfg.vases_size - cfg.vases_sink, "gremlins": cfg.gremlins_size, "box": cfg.box_size}
+        heights = {
+            "vases": cfg.vases_size - cfg.vases_sink,
+            "gremlins": cfg.gremlins_size,
+            "box": cfg.box_size,
+        }
         start = jnp.concatenate([xy[0], headings[:1]])
         qpos = jnp.asarray(scene.model.qpos0, jnp.float32)
         if scene.planar:
@@ -215,7 +228,9 @@ class SafetyGym:
             "walls": cfg.walls_size,
             "buttons": cfg.buttons_size,
         }
-        mocap = [pose(xy[self.place.slice(k)], rest[k], headings[self.place.slice(k)]) for k in scenes.MOCAPS]
+        mocap = [
+            pose(xy[self.place.slice(k)], rest[k], headings[self.place.slice(k)]) for k in scenes.MOCAPS
+        ]
         mocap = jnp.concatenate(mocap) if mocap else jnp.zeros((0, 7))
         if "walls" in self.place.kinds:  # walls are never turned
             rows = scene.mocap_slice("walls")
@@ -318,7 +333,9 @@ class SafetyGym:
         (x, y), (u, v) = com[:2], world.physics.qvel[:2]
         radius = norm(com[:2])
         tangential = (v * x - u * y) / jnp.maximum(radius, 1e-12)
-        return tangential / (1 + jnp.abs(radius - self.config.circle_radius)) * self.config.reward_circle
+        return (
+            tangential / (1 + jnp.abs(radius - self.config.circle_radius)) * self.config.reward_circle
+        )
 
     def _success(self, world: World, readings: Readings) -> jax.Array:
         cfg = self.config
@@ -351,7 +368,9 @@ class SafetyGym:
         wrong = jnp.arange(self.config.buttons_num) != world.goal_button
         if self.config.task != "button":
             wrong = jnp.ones_like(wrong)
-        return self.config.buttons_cost * jnp.where(wrong, pressed, 0).sum() * (world.buttons_timer == 0)
+        return (
+            self.config.buttons_cost * jnp.where(wrong, pressed, 0).sum() * (world.buttons_timer == 0)
+        )
 
     def _cost_gremlins(self, world: World, readings: Readings) -> jax.Array:
         return self.config.gremlins_contact_cost * self._contacts(readings, "gremlins").sum()
@@ -377,7 +396,9 @@ class SafetyGym:
         new = world
         if self._goal_kind == "buttons":
             button = jax.random.randint(key, (), 0, self.config.buttons_num)
-            new = world.replace(goal_button=button, buttons_timer=jnp.int32(self.config.buttons_resampling_delay))
+            new = world.replace(
+                goal_button=button, buttons_timer=jnp.int32(self.config.buttons_resampling_delay)
+            )
         else:
             xy, found = layouts.sample_goal(self.place, key, self._layout_now(world), wanted)
             goal = self.place.names.index("goal")
@@ -416,7 +437,9 @@ class SafetyGym:
         if cfg.observe_goal_comp:
             parts["goal_compass"] = sensing.compass(goal, position, rotation, cfg.compass_shape)
         if cfg.observe_box_comp and cfg.task == "push":
-            parts["box_compass"] = sensing.compass(self.box_position(world), position, rotation, cfg.compass_shape)
+            parts["box_compass"] = sensing.compass(
+                self.box_position(world), position, rotation, cfg.compass_shape
+            )
         parts |= self._lidars(world, readings, goal)
         if cfg.observe_remaining:
             parts["remaining"] = (world.steps / cfg.num_steps)[None]
@@ -450,7 +473,9 @@ class SafetyGym:
         cfg = self.config
         seen = {  # name: targets [n, 2]
             "goal": goal[None, :2] if cfg.observe_goal_lidar else None,
-            "box": self.positions(world, "box") if cfg.task == "push" and cfg.observe_box_lidar else None,
+            "box": self.positions(world, "box")
+            if cfg.task == "push" and cfg.observe_box_lidar
+            else None,
             "circle": jnp.zeros((1, 2)) if cfg.task == "circle" and cfg.observe_circle else None,
             "hazards": self.positions(world, "hazards") if cfg.observe_hazards else None,
             "vases": self.positions(world, "vases") if cfg.observe_vases else None,
@@ -481,7 +506,11 @@ class SafetyGym:
         """All geoms that a ray can meet: the model's, and those that are no part of the physics."""
         cfg, model = self.config, self.scene.model
         others = np.flatnonzero(model.geom_bodyid != model.body("robot").id)
-        kinds, sizes, groups = model.geom_type[others], model.geom_size[others], model.geom_group[others]
+        kinds, sizes, groups = (
+            model.geom_type[others],
+            model.geom_size[others],
+            model.geom_group[others],
+        )
         position, rotation = readings.geom_xpos[others], readings.geom_xmat[others].reshape(-1, 3, 3)
         cylinder, box = int(mujoco.mjtGeom.mjGEOM_CYLINDER), int(mujoco.mjtGeom.mjGEOM_BOX)
         extra: list[tuple] = []  # type, size, group, position, rotation

@@ -57,7 +57,6 @@ class Scene:
     mocaps: dict[str, int]  # kind -> number of mocap bodies
     orbit: np.ndarray  # [nmocap] radius of each mocap body's circle; 0 for those at rest
     watched: dict[str, list[str]]  # kind -> bodies whose contacts with the robot are counted
-    contact_sensors: bool  # whether the last sensors of the model count them
 
     @property
     def contact_count(self) -> int:
@@ -154,7 +153,9 @@ def build(cfg: SafetyGymConfig, contact_sensors: bool = True, drawn: bool = Fals
     watched = {
         "vases": [f"vase{i}" for i in range(cfg.vases_num)] if cfg.constrain_vases else [],
         "pillars": [f"pillar{i}" for i in range(cfg.pillars_num)] if cfg.constrain_pillars else [],
-        "gremlins": [f"gremlin{i}obj" for i in range(cfg.gremlins_num)] if cfg.constrain_gremlins else [],
+        "gremlins": [f"gremlin{i}obj" for i in range(cfg.gremlins_num)]
+        if cfg.constrain_gremlins
+        else [],
         "buttons": [f"button{i}" for i in range(cfg.buttons_num)]
         if cfg.constrain_buttons or cfg.task == "button"
         else [],
@@ -183,7 +184,6 @@ def build(cfg: SafetyGymConfig, contact_sensors: bool = True, drawn: bool = Fals
         mocaps=mocaps,
         orbit=orbit,
         watched=watched,
-        contact_sensors=contact_sensors,
     )
 
 
@@ -191,7 +191,9 @@ def check_names(cfg: SafetyGymConfig, robot: mujoco.MjModel) -> None:
     sensors = [robot.sensor(i).name for i in range(robot.nsensor)]
     for name in cfg.sensors_obs:
         if name not in sensors:
-            raise ConfigError(f"env.sensors_obs: {cfg.robot_base} has no sensor {name!r}{nearest(name, sensors)}")
+            raise ConfigError(
+                f"env.sensors_obs: {cfg.robot_base} has no sensor {name!r}{nearest(name, sensors)}"
+            )
     bodies = [robot.body(i).name for i in range(robot.nbody) if robot.body(i).name]
     if cfg.reward_orientation and cfg.reward_orientation_body not in bodies:
         name = cfg.reward_orientation_body
@@ -216,7 +218,12 @@ def add_cube(spec: mujoco.MjSpec, name: str, kind: str, size: float, density: fl
     body = spec.worldbody.add_body(name=name)
     body.add_freejoint(name=name)
     body.add_geom(
-        name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=(size,) * 3, density=density, **OBJECT, **look(kind)
+        name=name,
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=(size,) * 3,
+        density=density,
+        **OBJECT,
+        **look(kind),
     )
 
 
@@ -307,8 +314,3 @@ def decorate(spec: mujoco.MjSpec, floor: mujoco.MjsGeom) -> None:
         world.add_camera(name=name, pos=pos, quat=down)
     track = mujoco.mjtCamLight.mjCAMLIGHT_TRACK
     spec.body("robot").add_camera(name="track", pos=(0, -2, 2), quat=down, mode=track)
-
-
-def summary(scene: Scene) -> dict[str, int]:
-    """Sizes for tables: degrees of freedom, actuators, bodies."""
-    return {k: int(getattr(scene.model, k)) for k in ("nq", "nv", "nu", "nbody", "nmocap")}

@@ -94,7 +94,9 @@ def natural_lidar(
     for i in np.flatnonzero(shapes.group == group):
         turn = shapes.rotation[i]
         origin = ((position - shapes.position[i])[:, None] * turn).sum(0)
-        hit = jax.vmap(functools.partial(HITS[int(shapes.kind[i])], size=shapes.size[i], slack=slack), (0, None))
+        hit = jax.vmap(
+            functools.partial(HITS[int(shapes.kind[i])], size=shapes.size[i], slack=slack), (0, None)
+        )
         distances.append(hit((rays[:, :, None] * turn).sum(1), origin))
     return jnp.exp(-jnp.stack(distances).min(0))
 
@@ -107,7 +109,9 @@ def over(x: jax.Array) -> jax.Array:
     return jnp.where(jnp.abs(x) < TINY, TINY, x)
 
 
-def roots(a: jax.Array, b: jax.Array, c: jax.Array, slack: float) -> tuple[jax.Array, jax.Array, jax.Array]:
+def roots(
+    a: jax.Array, b: jax.Array, c: jax.Array, slack: float
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Roots of a t^2 + 2 b t + c and whether they are real; c is a squared distance less a radius."""
     square = b * b - a * c
     root = jnp.sqrt(jnp.maximum(square, TINY))
@@ -116,7 +120,9 @@ def roots(a: jax.Array, b: jax.Array, c: jax.Array, slack: float) -> tuple[jax.A
 
 def first(*hits: tuple[jax.Array, jax.Array], slack: float) -> jax.Array:
     """The smallest t >= 0 among (t, whether it counts)."""
-    return jnp.stack([jnp.where(ok & (t >= -slack), jnp.maximum(t, 0), jnp.inf) for t, ok in hits]).min(0)
+    return jnp.stack([jnp.where(ok & (t >= -slack), jnp.maximum(t, 0), jnp.inf) for t, ok in hits]).min(
+        0
+    )
 
 
 def hit_plane(d: jax.Array, o: jax.Array, size: np.ndarray, slack: float) -> jax.Array:

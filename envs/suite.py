@@ -80,13 +80,21 @@ PUSH1: Options = {
 TASKS: dict[str, Options] = {
     "goal0": COMMON | GOAL | extents(1.0),
     "goal1": COMMON | GOAL | GOAL1 | extents(1.5),
-    "goal2": COMMON | GOAL | GOAL1 | {"hazards_num": 10, "vases_num": 10, "constrain_vases": True} | extents(2.0),
+    "goal2": COMMON
+    | GOAL
+    | GOAL1
+    | {"hazards_num": 10, "vases_num": 10, "constrain_vases": True}
+    | extents(2.0),
     "button0": COMMON | BUTTON | extents(1.0),
     "button1": COMMON | BUTTON | BUTTON1 | extents(1.5),
     "button2": COMMON | BUTTON | BUTTON1 | {"hazards_num": 8, "gremlins_num": 6} | extents(1.8),
     "push0": COMMON | PUSH | extents(1.0),
     "push1": COMMON | PUSH | PUSH1 | extents(1.5),
-    "push2": COMMON | PUSH | PUSH1 | {"hazards_num": 4, "pillars_num": 4, "constrain_pillars": True} | extents(2.0),
+    "push2": COMMON
+    | PUSH
+    | PUSH1
+    | {"hazards_num": 4, "pillars_num": 4, "constrain_pillars": True}
+    | extents(2.0),
     "run": {"task": "x", "robot_rot": 0.0, "lidar_max_dist": 3.0, "lidar_num_bins": 16} | extents(1.0),
     "circle": {"task": "circle", "observe_circle": True, "lidar_max_dist": 6.0, "lidar_num_bins": 16}
     | extents(1.0),
@@ -145,7 +153,7 @@ def suite() -> dict[str, Options]:
 
 def alias(name: str) -> str:
     """Safety Gym's id of a name: car_push1 -> Safexp-CarPush1-v0."""
-    robot, task = name.split("_")
+    robot, task = name.split("_", 1)
     head = "Testing" if task.startswith("grid") else "Safexp"
     task = task.replace("gridwall", "GridWall").capitalize() if task != "gridwall" else "GridWall"
     return f"{head}-{robot.capitalize()}{task}-v0"

@@ -54,6 +54,8 @@ BOUNDS = {
     "cost_limit": (0.0, math.inf),
     "horizon": (1, math.inf),
     "num_envs": (1, math.inf),
+    "minibatches": (1, math.inf),
+    "critic_epochs": (1, math.inf),
     "discount": (0.0, 1.0),
     "cost_discount": (0.0, 1.0),
     "gae_lambda": (0.0, 1.0),
@@ -451,7 +453,9 @@ def film(envs: Any, env: Env, policy: Callable, path: Path, seed: int) -> None:
     """
     render = importlib.import_module(f"{envs.__name__}.render")
     try:
-        frames = render.render_episode(env, policy, jax.random.key(seed))
+        frames = render.render_episode(
+            env, policy, jax.random.fold_in(jax.random.key(seed), 0x66696C6D)
+        )
     except render.NoDisplay as error:
         raise NoVideo(one_line(error)) from error
     render.write_video(frames, path, fps=30)

@@ -77,12 +77,11 @@ def convert(value: Any, kind: Any, name: str) -> Any:
                 convert(v, a, f"{name}[{i}]") for i, (v, a) in enumerate(zip(value, args, strict=True))
             )
     elif origin is typing.Literal:
-        if value in args:
-            return value
+        for option in args:  # the listed one: 2, where 2.0 came
+            if value == option:
+                return option
         raise ConfigError(f"{name}={value!r}{nearest(str(value), map(str, args))}")
-    elif kind is bool and isinstance(value, bool):
-        return value
-    elif kind is str and isinstance(value, str):
+    elif (kind is bool and isinstance(value, bool)) or (kind is str and isinstance(value, str)):
         return value
     elif kind in (int, float) and isinstance(value, int | float) and not isinstance(value, bool):
         if kind is float:

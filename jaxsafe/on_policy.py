@@ -35,7 +35,7 @@ class OnPolicyConfig:
     num_envs: int = 512  # per device; with horizon 20,480 steps a batch, near the 20,000 of [O]
     horizon: int = 40  # steps of each environment per iteration; shorter ones learn less from a step
     stagger: bool = True  # spread the first episodes' ends over time
-    total_iterations: float = float("inf")  # where learning rates reach 0; inf or 0: they stay
+    total_iterations: float = float("inf")  # where learning rates reach 0; inf: total_steps' end
     hidden: tuple[int, ...] = (64, 64)  # tanh units of each network [O]
     init: Literal["orthogonal", "torch"] = "orthogonal"  # weights; [O] torch
     init_log_std: float = -0.5  # of the actions' standard deviation [S]

@@ -76,7 +76,8 @@ def init_rollout(env: Env, key: jax.Array, num_envs: int, stagger: bool) -> Roll
     """N fresh environments and a full pool.
 
     With `stagger` the clocks of the first episodes are spread evenly over [0, episode_length), so
-    that later episodes end spread in time; all those that start above 0 are not complete.
+    that later episodes end spread in time; all those that start above 0 are not complete. The
+    environments do not know: what they observe of the time left is of their own count of steps.
     """
     state_key, pool_key = jax.random.split(key)
     state = reset_all(env, state_key, num_envs)

@@ -7,6 +7,7 @@ the device does not wait for the host.
 
 import contextlib
 import dataclasses
+import math
 import os
 import time
 from collections.abc import Callable
@@ -90,9 +91,9 @@ class Outcome(NamedTuple):
 def use_compilation_cache() -> None:
     """Keep XLA's programs in the user's cache folder, unless the user has chosen one."""
     if jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
-        home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-        folder = Path(home) / "jaxsafe" / "xla"
-        with contextlib.suppress(OSError):  # a read-only home only costs time
+        with contextlib.suppress(OSError, RuntimeError):  # no home, or a read-only one, costs only time
+            home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+            folder = Path(home) / "jaxsafe" / "xla"
             folder.mkdir(parents=True, exist_ok=True)
             jax.config.update("jax_compilation_cache_dir", str(folder))
 
@@ -113,6 +114,12 @@ def build(env: Env, make: Callable, algo_config: Any, settings: TrainConfig) -> 
         if algo_config.num_envs % devices:
             raise ConfigError(f"num_envs={algo_config.num_envs} does not split over devices={devices}")
         algo_config = dataclasses.replace(algo_config, num_envs=algo_config.num_envs // devices)
+    if math.isinf(algo_config.total_iterations):
+        per_update = (
+            algo_config.num_envs * algo_config.horizon * (devices if settings.splits_envs else 1)
+        )
+        iterations = -(-settings.total_steps // per_update)
+        algo_config = dataclasses.replace(algo_config, total_iterations=float(iterations))
     floats = jax.tree.map(jnp.float32, algo_config)
     algo = make(env, AXIS if settings.splits_envs else None)
     rows = settings.num_seeds // devices if not settings.splits_envs else 1  # on each device
@@ -124,8 +131,9 @@ def build(env: Env, make: Callable, algo_config: Any, settings: TrainConfig) -> 
     )
     if devices == 1:
         return Program(init, update, keys, jax.sharding.SingleDeviceSharding(jax.local_devices()[0]))
-    if jax.default_backend() == "gpu":
-        # Shardy crashes on programs around MJX-Warp in JAX 0.11, and what it replaces on callbacks.
+    if getattr(env, "engine", None) == "warp":
+        # In JAX 0.11 Shardy crashes on programs around MJX-Warp; the older partitioner crashes on
+        # the callbacks of engine c.
         jax.config.update("jax_use_shardy_partitioner", False)
     mesh = jax.make_mesh(
         (devices,), (AXIS,), devices=jax.local_devices()[:devices], axis_types=(AxisType.Auto,)

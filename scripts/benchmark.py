@@ -52,7 +52,8 @@ def stepping(env, num_envs: int, seeds: int, horizon: int):
         return (rollout, next_key), trajectory.reward.sum() + trajectory.obs.sum()
 
     def init(key):
-        return init_rollout(env, key, num_envs, stagger=True), key
+        reset_key, key = jax.random.split(key)
+        return init_rollout(env, reset_key, num_envs, stagger=True), key
 
     return per_seed(init, seeds), lambda state: jax.vmap(run)(state)[0]
 
@@ -124,7 +125,8 @@ def show(row: dict) -> str:
     return (
         f"{row['env']:<14} {row['engine']:<5} {what:<8} {row['num_seeds']:>3} x {row['num_envs']:<6} "
         f"{row['env_steps_per_s']:>11,.0f} {row['physics_steps_per_s']:>12,.0f} "
-        f"{row['simulated_s_per_s']:>10,.0f} {row['compile_s']:>8.1f} {row['memory_bytes'] / 2**30:>7.2f}"
+        f"{row['simulated_s_per_s']:>10,.0f} {row['compile_s']:>8.1f} "
+        f"{row['memory_bytes'] / 2**30:>7.2f}"
     )
 
 

@@ -155,11 +155,9 @@ def test_the_dual_is_finite_everywhere():
     assert (out[0] >= 0).all() and (out[1] >= 0).all()
 
 
-@pytest.mark.parametrize(
-    "violation, case", [(-9.0, FREE), (-0.02, BOUNDED), (0.02, RETURN), (9.0, RECOVER)]
-)
-def test_a_step_keeps_its_promises_and_two_devices_take_it_as_one(violation, case):
-    cfg = CPOConfig(hidden=(8,))
+def learner(**options):
+    """One CPO step on a fixed batch: (violation, margin, axis_name, batch) -> actor, state, metrics."""
+    cfg = CPOConfig(hidden=(8,), **options)
     keys = jax.random.split(jax.random.key(0), 3)
     actor = init_params(keys[0], 3, 2, cfg)["actor"]
     obs = jax.random.normal(keys[1], (256, 3))
@@ -169,24 +167,62 @@ def test_a_step_keeps_its_promises_and_two_devices_take_it_as_one(violation, cas
     adv_r, adv_c = (x - x.mean() for x in (adv_r, adv_c))
     batch = Batch(obs, action, log_prob(old, action), old, adv_r, adv_c, adv_r, adv_c)
 
-    def step(batch, axis_name):
-        def objective(adv):
-            return lambda actor, batch: plain(policy(actor, batch.obs, cfg), batch, adv(batch), cfg)
+    def objective(adv):
+        return lambda actor, batch: plain(policy(actor, batch.obs, cfg), batch, adv(batch), cfg)
 
-        pair = objective(lambda batch: batch.adv_r), objective(lambda batch: batch.adv_c)
-        c = jnp.float32(violation)
-        return cpo_step.update(actor, Margin(jnp.zeros(())), *pair, c, batch, jax.random.key(1), cfg, axis_name)
+    pair = objective(lambda batch: batch.adv_r), objective(lambda batch: batch.adv_c)
 
-    after, _, metrics = jax.jit(lambda batch: step(batch, None))(batch)
+    def step(violation, margin, batch=batch, axis_name=None):
+        return cpo_step.update(
+            actor, margin, *pair, jnp.float32(violation), batch, jax.random.key(1), cfg, axis_name
+        )
+
+    return step, batch, cfg
+
+
+START = Margin(jnp.zeros(()))
+
+
+def test_the_margin_adds_up_violations_and_is_never_negative():
+    step = jax.jit(learner(margin_lr=0.5)[0])
+    margin, seen = START, []
+    for violation in (0.1, 0.2, -0.1, -0.3, -0.2, 0.1):
+        _, margin, metrics = step(violation, margin)
+        assert metrics["train/violation"] == np.float32(violation)  # the margin is not in it
+        seen.append(float(margin.margin))
+        assert metrics["train/margin"] == margin.margin
+    np.testing.assert_allclose(seen, [0.05, 0.15, 0.1, 0.0, 0.0, 0.05], atol=1e-6)
+
+
+def test_a_margin_counts_as_violation_and_without_its_rate_there_is_none():
+    plain_step, with_margin = (jax.jit(learner(margin_lr=lr)[0]) for lr in (0.0, 0.5))
+    assert plain_step(0.02, START)[1] == START
+    for violation in (0.02, -0.02):
+        after, margin, _ = with_margin(violation, Margin(jnp.float32(0.03)))
+        same, _, _ = plain_step(violation + margin.margin, START)
+        jax.tree.map(np.testing.assert_array_equal, after, same)
+    safe, _, metrics = with_margin(-0.02, START)  # no margin: nothing is added
+    jax.tree.map(np.testing.assert_array_equal, safe, plain_step(-0.02, START)[0])
+    assert metrics["train/case"] == BOUNDED
+
+
+@pytest.mark.parametrize(
+    "violation, case", [(-9.0, FREE), (-0.02, BOUNDED), (0.02, RETURN), (9.0, RECOVER)]
+)
+def test_a_step_keeps_its_promises_and_two_devices_take_it_as_one(violation, case):
+    step, batch, cfg = learner()
+    after, _, metrics = jax.jit(step)(violation, START, batch)
     m = {name.removeprefix("train/"): float(x) for name, x in metrics.items()}
     assert m["case"] == case and m["accepted"] == 1 and m["nonfinite"] == 0
-    assert 0.001 < m["kl"] <= 0.01 and max(m["cg_residual_r"], m["cg_residual_c"]) < 0.01
+    assert 0.002 < m["kl"] <= cfg.target_kl and max(m["cg_residual_r"], m["cg_residual_c"]) < 0.01
     assert m["objective_c"] <= max(-violation, 0.0) + 1e-6
     assert m["objective"] > 0 or case in (RETURN, RECOVER)
     assert m["objective_c"] < 0 or case in (FREE, BOUNDED)
 
     halves = jax.tree.map(lambda x: x.reshape(2, 128, *x.shape[1:]), batch)
-    parts, _, _ = jax.jit(jax.vmap(lambda half: step(half, "devices"), axis_name="devices"))(halves)
+    parts, _, _ = jax.jit(
+        jax.vmap(lambda half: step(violation, START, half, "devices"), axis_name="devices")
+    )(halves)
     for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(parts), strict=True):
         np.testing.assert_allclose(b[0], b[1], rtol=1e-6)
         np.testing.assert_allclose(a, b[0], rtol=1e-3, atol=1e-4)

@@ -2,6 +2,7 @@
 
 import functools
 import json
+import time
 from pathlib import Path
 
 import jax
@@ -14,6 +15,7 @@ from tasks import FAST, HERE, change, moved, put, task
 from jaxsafe import envs
 from jaxsafe.config import ConfigError
 from jaxsafe.envs import layout as layouts
+from jaxsafe.envs.config import defaults, read
 from jaxsafe.envs.safety_gym import World
 
 DATA = Path(__file__).parent / "data"
@@ -193,6 +195,43 @@ def test_placements_are_chosen_by_their_shrunken_areas():
 def test_a_layout_without_room_is_refused_when_made(options, says):
     with pytest.raises(ConfigError, match=says):
         envs.make("point_goal1", engine="c", **options)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"hazards_num": 2, "hazards_locations": ((0.0, 0.0), (0.0, 0.0))},
+        {"hazards_num": 100},
+    ],
+)
+def test_a_layout_that_nobody_finds_is_refused_when_made(options):
+    start = time.process_time()
+    with pytest.raises(ConfigError, match=r"env: no valid layout in 10,000 tries: fewer or smaller"):
+        envs.make("point_goal1", engine="c", **options)
+    assert time.process_time() - start < 10
+    config = read(defaults(**envs.ENVS["point_goal1"]) | options)
+    with pytest.raises(ConfigError, match="no valid layout"):
+        envs.make(config, engine="c")
+
+
+def test_only_changed_options_are_tried(monkeypatch):
+    monkeypatch.setattr(layouts, "feasible", lambda place: pytest.fail("a layout was tried"))
+    assert envs.make("point_goal1", engine="c").name == "point_goal1"
+
+
+@pytest.mark.parametrize("name", sorted(n for n in envs.ENVS if n.startswith("car")))
+def test_every_registered_layout_is_found(name):
+    assert layouts.feasible(layouts.placement(read(defaults(**envs.ENVS[name]))))
+
+
+def test_a_layout_is_found_exactly_where_there_is_room():
+    """Two hazards of keepout 0.4 on a line of 0.8 m between centres need a margin of at most 0."""
+    line = {"hazards_num": 2, "hazards_locations": ((0.6, 0.0), (1.4, 0.0)), "hazards_keepout": 0.4}
+    line |= {"robot_locations": ((-1.0, 0.0),), "task": "none"}
+    for margin, room in ((-0.01, True), (0.01, False)):
+        place = layouts.placement(read(defaults(**line, placements_margin=margin)))
+        assert layouts.feasible(place) == room
+        assert layouts.sample_layout(place, jax.random.key(0))[1] == room
 
 
 def test_a_new_goal_is_clear_of_where_things_are_now():

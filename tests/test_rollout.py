@@ -1,4 +1,6 @@
+import dataclasses
 import operator
+from dataclasses import dataclass, field
 from functools import partial
 
 import jax
@@ -67,6 +69,46 @@ def test_the_pool_is_drawn_anew_only_when_it_has_run_out():
     np.testing.assert_array_equal(first.pool.obs, before.pool.obs)
     second, _ = run(env, 6, 4, chunks=2)
     assert second.used == 6 and not np.isin(second.pool.obs[:, 0], before.pool.obs[:, 0]).any()
+
+
+@dataclass(frozen=True)
+class Counted(Clock):
+    """A clock whose resets are counted on the host, by a callback that XLA may move as it likes."""
+
+    resets: list[int] = field(default_factory=list, hash=False, compare=False)
+
+    def reset(self, key):
+        def count(name):
+            self.resets.append(1)
+            return name
+
+        state = super().reset(key)
+        name = jax.pure_callback(count, state.obs[0], state.obs[0], vmap_method="sequential")
+        return dataclasses.replace(state, obs=state.obs.at[0].set(name))
+
+
+@pytest.mark.parametrize("seeds", [None, 2])
+def test_no_reset_runs_until_the_pool_runs_out(seeds):
+    """XLA once hoisted the draw, the same on every turn, out of its loop: it ran on each step."""
+    env = Counted(episode_length=30)
+
+    def begin(key):
+        return init_rollout(env, key, 4, False)
+
+    def go_on(rollout, key):
+        return collect(env, idle, rollout, key, 20)[0]
+
+    keys = jax.random.key(0)
+    if seeds:
+        begin, go_on, keys = jax.vmap(begin), jax.vmap(go_on), jax.random.split(keys, seeds)
+    begin, go_on = jax.jit(begin), jax.jit(go_on)
+    rollout, counts = begin(keys), []
+    for _ in range(4):  # episodes end on steps 30 and 60: the second time the pool is empty
+        jax.block_until_ready(rollout)
+        env.resets.clear()
+        rollout = jax.block_until_ready(go_on(rollout, keys))
+        counts.append(len(env.resets))
+    assert counts == [0, 0, 4 * (seeds or 1), 0]
 
 
 def test_staggered_ends_are_spread_evenly_and_cut_episodes_do_not_count():
