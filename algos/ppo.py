@@ -20,9 +20,7 @@ from jaxsafe.types import Env
 @config
 class PPOConfig(OnPolicyConfig):
     lr: float = 3e-4  # of the policy; OmniSafe, safety-starter-agents
-    lr_decay: bool = (
-        False  # linearly to 0 at total_iterations; OmniSafe does, safety-starter-agents not
-    )
+    lr_decay: bool = False  # of lr, linearly to 0 at total_iterations; OmniSafe: True
     clip: float = 0.2  # eps; the paper
     epochs: int = 10  # passes over each batch; with 8 minibatches the 80 steps of safety-starter-agents
     target_kl: float = 0.02  # nats, checked after each pass; OmniSafe
