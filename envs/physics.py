@@ -8,9 +8,10 @@ One instance in, one out: callers `vmap`, over environments and again over seeds
 two calls is small; each engine builds its own working data inside the call.
 """
 
+import importlib.util
 import threading
 from collections.abc import Callable
-from typing import Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import flax.struct
 import jax
@@ -18,10 +19,14 @@ import jax.numpy as jnp
 import mujoco
 import mujoco.batch
 import numpy as np
-from mujoco import mjx
 
 from jaxsafe.config import ConfigError, nearest
 from jaxsafe.envs.scene import Scene
+
+if (
+    TYPE_CHECKING
+):  # imported by the engines that need it: it is slow, and complains where Warp is missing
+    from mujoco import mjx
 
 ENGINES = ("c", "warp", "jax")
 
@@ -69,11 +74,7 @@ def default_engine() -> str:
 
 
 def mjx_warp_available() -> bool:
-    try:
-        import warp  # noqa: F401  (an optional dependency)
-    except ImportError:
-        return False
-    return True
+    return importlib.util.find_spec("warp") is not None
 
 
 def make_engine(name: str, scene: Scene, max_substeps: int, outputs: tuple[str, ...] = ()) -> Engine:
@@ -211,14 +212,16 @@ def readings(
 
 def substep_loop(
     scene: Scene,
-    model: mjx.Model,
-    data: mjx.Data,
+    model: "mjx.Model",
+    data: "mjx.Data",
     physics: Physics,
     ctrl: jax.Array,
     substeps: jax.Array,
     max_substeps: int,
-) -> tuple[Physics, mjx.Data]:
+) -> "tuple[Physics, mjx.Data]":
     """`substeps` calls of `mjx.step` and one of `mjx.forward`, for one world."""
+    from mujoco import mjx
+
     timestep = scene.model.opt.timestep
     data = data.replace(
         qpos=physics.qpos,
@@ -229,7 +232,7 @@ def substep_loop(
         mocap_quat=physics.mocap_quat,
     )
 
-    def substep(data: mjx.Data, k: jax.Array) -> tuple[mjx.Data, None]:
+    def substep(data: "mjx.Data", k: jax.Array) -> "tuple[mjx.Data, None]":
         moving = data
         if scene.orbit.any():
             time = (physics.substeps + k) * timestep
@@ -255,6 +258,8 @@ STATE = ("qpos", "qvel", "qacc_warmstart", "mocap_pos")
 
 def jax_engine(scene: Scene, max_substeps: int, outputs: tuple[str, ...]) -> Run:
     refuse_box_cylinder(scene.model)
+    from mujoco import mjx
+
     with jax.ensure_compile_time_eval():
         model = mjx.put_model(scene.model, impl="jax")
         template = mjx.make_data(scene.model, impl="jax")
@@ -309,10 +314,12 @@ def warp_engine(scene: Scene, max_substeps: int, outputs: tuple[str, ...]) -> Ru
     """MJX with Warp kernels. Buffers are sized for the whole batch, so the batch is made explicit."""
     if not mjx_warp_available():
         raise ConfigError("env.engine='warp': warp-lang is not installed; pip install 'jaxsafe[gpu]'")
+    from mujoco import mjx
+
     per_world, rows = contact_budget(scene)
     with jax.ensure_compile_time_eval():
         model = mjx.put_model(scene.model, impl="warp")
-    model = cast(mjx.Model, model.tree_replace({"opt._impl.warn_overflow": 0}))
+    model = cast("mjx.Model", model.tree_replace({"opt._impl.warn_overflow": 0}))
 
     @jax.custom_batching.custom_vmap
     def run_batch(physics: Physics, ctrl: jax.Array, substeps: jax.Array) -> tuple[Physics, Readings]:
@@ -372,8 +379,10 @@ def contact_budget(scene: Scene) -> tuple[int, int]:
     return contacts, 10 * (contacts + 16) + limits + 6 * scene.frees["gremlins"]
 
 
-def zeros_data(model: mujoco.MjModel, contacts: int, rows: int) -> mjx.Data:
+def zeros_data(model: mujoco.MjModel, contacts: int, rows: int) -> "mjx.Data":
     """`mjx.make_data`, with its large all-zero arrays made on the device instead of shipped."""
+    from mujoco import mjx
+
     with jax.ensure_compile_time_eval():
         data = mjx.make_data(model, impl="warp", naconmax=contacts, njmax=rows)
 

@@ -1,6 +1,6 @@
 """Engines agree or refuse with a reason, and environments run under the shared rollout."""
 
-import builtins
+import sys
 from functools import partial
 from typing import Any
 
@@ -38,12 +38,7 @@ def test_the_jax_engine_refuses_boxes_against_cylinders(name):
 def test_the_warp_engine_says_what_to_install(monkeypatch):
     real = builtins.__import__
 
-    def without_warp(name, *args, **kwargs):
-        if name == "warp" or name.startswith("warp."):
-            raise ImportError("no warp here")
-        return real(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", without_warp)
+    monkeypatch.setitem(sys.modules, "warp", None)
     with pytest.raises(ConfigError, match=r"warp-lang is not installed; pip install 'jaxsafe\[gpu\]'"):
         envs.make("point_goal0", engine="warp")
 
