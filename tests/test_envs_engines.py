@@ -36,8 +36,6 @@ def test_the_jax_engine_refuses_boxes_against_cylinders(name):
 
 
 def test_the_warp_engine_says_what_to_install(monkeypatch):
-    real = builtins.__import__
-
     monkeypatch.setitem(sys.modules, "warp", None)
     with pytest.raises(ConfigError, match=r"warp-lang is not installed; pip install 'jaxsafe\[gpu\]'"):
         envs.make("point_goal0", engine="warp")
