@@ -65,7 +65,7 @@ def test_the_first_pass_beyond_the_kl_limit_is_the_last():
 
 def test_the_learning_rate_falls_to_zero_at_the_last_iteration():
     def move(iteration, total):
-        cfg = PPOConfig(**SMALL, total_iterations=total, epochs=1, max_grad_norm=1e9)
+        cfg = PPOConfig(**SMALL, total_iterations=total, lr_decay=True, epochs=1, max_grad_norm=1e9)
         before, after, _ = improve(cfg, iteration=iteration)
         return float(jnp.abs(after["log_std"] - before["log_std"]).max())
 
