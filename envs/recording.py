@@ -70,16 +70,8 @@ class Replay(SafetyGym):
         return self.step(State(world, obs, zero, zero, costs, jnp.bool_(False), info), action)
 
     def _next_goal(self, world: World, key: jax.Array, wanted: jax.Array) -> tuple[World, jax.Array]:
-        given, button = self._given
-        new = world
-        if self._goal_kind == "buttons":
-            delay = jnp.int32(self.config.buttons_resampling_delay)
-            new = world.replace(goal_button=button, buttons_timer=delay)
-        else:
-            new = world.replace(layout=world.layout.at[self.place.names.index("goal")].set(given))
-        dist_goal, dist_box, box_goal = self.distances(new)
-        new = new.replace(last_dist_goal=dist_goal, last_dist_box=dist_box, last_box_goal=box_goal)
-        return jax.tree.map(lambda a, b: jnp.where(wanted, a, b), new, world), jnp.bool_(True)
+        place, button = self._given
+        return self._with_goal(world, place, button, wanted), jnp.bool_(True)
 
 
 def worlds(env: SafetyGym, recording: Recording) -> World:

@@ -392,20 +392,22 @@ class SafetyGym:
 
     def _next_goal(self, world: World, key: jax.Array, wanted: jax.Array) -> tuple[World, jax.Array]:
         """A new goal or goal button where `wanted`, and the distances to it; whether one was found."""
-        found = jnp.bool_(True)
-        new = world
+        button = jax.random.randint(key, (), 0, max(self.config.buttons_num, 1))
+        place, found = jnp.zeros(2), jnp.bool_(True)
+        if self._goal_kind == "goal":
+            place, found = layouts.sample_goal(self.place, key, self._layout_now(world), wanted)
+        return self._with_goal(world, place, button, wanted & found), found
+
+    def _with_goal(self, world: World, place: jax.Array, button: jax.Array, wanted: jax.Array) -> World:
+        """The goal at `place` [2], or goal button `button`, where `wanted`; and the distances to it."""
         if self._goal_kind == "buttons":
-            button = jax.random.randint(key, (), 0, self.config.buttons_num)
-            new = world.replace(
-                goal_button=button, buttons_timer=jnp.int32(self.config.buttons_resampling_delay)
-            )
+            delay = jnp.int32(self.config.buttons_resampling_delay)
+            new = world.replace(goal_button=button, buttons_timer=delay)
         else:
-            xy, found = layouts.sample_goal(self.place, key, self._layout_now(world), wanted)
-            goal = self.place.names.index("goal")
-            new = world.replace(layout=world.layout.at[goal].set(xy))
+            new = world.replace(layout=world.layout.at[self.place.names.index("goal")].set(place))
         dist_goal, dist_box, box_goal = self.distances(new)
         new = new.replace(last_dist_goal=dist_goal, last_dist_box=dist_box, last_box_goal=box_goal)
-        return jax.tree.map(lambda a, b: jnp.where(wanted & found, a, b), new, world), found
+        return jax.tree.map(lambda a, b: jnp.where(wanted, a, b), new, world)
 
     def _layout_now(self, world: World) -> jax.Array:
         """The layout with what has moved where it is now; gremlins count at their circles' centres."""
