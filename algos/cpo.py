@@ -18,6 +18,9 @@ A batch's own b promises more than it keeps: with thousands of parameters, part 
 batch's noise and lowers the surrogate, but not the cost. Without a margin the cost stays well above
 the limit, as in Ray, Achiam and Amodei (2019); the margin, from their code (where it is off), asks
 for more until the limit holds.
+
+OmniSafe leaves c per episode (`per_step=False`), about a thousand times as large as b'x can be: then
+a step maximises reward while the cost is under the limit and lowers cost while it is over.
 """
 
 from typing import Any, NamedTuple
@@ -43,6 +46,7 @@ class CPOConfig(OnPolicyConfig):
     cg_iterations: int = 15  # OmniSafe
     line_search_tries: int = 20  # OmniSafe
     line_search_shrink: float = 0.8  # OmniSafe, safety-starter-agents
+    per_step: bool = True  # the violation c in cost per step, as b is; OmniSafe: per episode
     margin_lr: float = 0.05  # safety-starter-agents, who leave it off; 0: no margin
 
 
@@ -58,6 +62,7 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "critic_epochs": 10,
         "minibatches": 160,
         "critic_lr": 1e-3,
+        "per_step": False,
         "margin_lr": 0.0,
     }
 }
@@ -115,7 +120,7 @@ def dual(
 
 
 class Margin(NamedTuple):
-    margin: jax.Array  # float [], cost per step, >= 0
+    margin: jax.Array  # float [], in the violation's unit, >= 0
 
 
 def update(
@@ -123,13 +128,15 @@ def update(
     opt_state: Margin,
     objective_r: Objective,
     objective_c: Objective,
-    violation: jax.Array,
+    excess: jax.Array,
+    length: jax.Array,
     batch: Any,
     key: jax.Array,
     cfg: Any,
     axis_name: str | None,
 ) -> tuple[PyTree, Margin, Metrics]:
     start, unravel = ravel_pytree(actor)
+    violation = excess / length if cfg.per_step else excess
     margin = jnp.maximum(0.0, opt_state.margin + cfg.margin_lr * violation)
     margin = jnp.where(jnp.isfinite(margin), margin, opt_state.margin)
     delta, c = cfg.target_kl, violation + margin
@@ -168,8 +175,8 @@ def update(
             "train/kl": divergence,
             "train/objective": new_reward - reward,
             "train/objective_c": new_cost - cost,  # cost per step
-            "train/violation": violation,  # cost per step
-            "train/margin": margin,  # cost per step
+            "train/violation": violation,  # cost per step, as the margin, or per episode
+            "train/margin": margin,
             "train/lam": lam,
             "train/nu": nu,
             "train/case": case,

@@ -129,8 +129,9 @@ def on_policy_pair(
 ) -> Algorithm:
     """Algorithms whose step weighs reward against cost itself, so that it takes two objectives.
 
-    update(actor, opt_state, objective_r, objective_c, violation, batch, key, cfg, axis_name), where
-    violation = (J_c - cost_limit) / mean episode length: cost per step, the unit of objective_c.
+    update(actor, opt_state, objective_r, objective_c, excess, length, batch, key, cfg, axis_name),
+    where excess = J_c - cost_limit, in cost per episode, and length is the mean episode's in steps:
+    objective_c is in cost per step, the unit of excess / length.
     """
 
     def improve(ts: TrainState, batch: Batch, cost: jax.Array, length: jax.Array, key: jax.Array):
@@ -142,13 +143,13 @@ def on_policy_pair(
         def objective_c(actor: PyTree, batch: Batch) -> tuple[jax.Array, Metrics]:
             return surrogate(policy(actor, batch.obs, cfg), batch, batch.adv_c, cfg)
 
-        violation = (cost - cfg.cost_limit) / length
         actor, opt_state, metrics = step.update(
             ts.params["actor"],
             ts.opt_state["actor"],
             objective_r,
             objective_c,
-            violation,
+            cost - cfg.cost_limit,
+            length,
             batch,
             key,
             cfg,

@@ -173,14 +173,15 @@ def learner(**options):
     pair = objective(lambda batch: batch.adv_r), objective(lambda batch: batch.adv_c)
 
     def step(violation, margin, batch=batch, axis_name=None):
-        return cpo_step.update(
-            actor, margin, *pair, jnp.float32(violation), batch, jax.random.key(1), cfg, axis_name
-        )
+        excess, length = LENGTH * jnp.float32(violation), jnp.float32(LENGTH)
+        key = jax.random.key(1)
+        return cpo_step.update(actor, margin, *pair, excess, length, batch, key, cfg, axis_name)
 
     return step, batch, cfg
 
 
 START = Margin(jnp.zeros(()))
+LENGTH = 1024  # steps of an episode; a power of 2 loses no digits
 
 
 def test_the_margin_adds_up_violations_and_is_never_negative():
@@ -204,6 +205,14 @@ def test_a_margin_counts_as_violation_and_without_its_rate_there_is_none():
     safe, _, metrics = with_margin(-0.02, START)  # no margin: nothing is added
     jax.tree.map(np.testing.assert_array_equal, safe, plain_step(-0.02, START)[0])
     assert metrics["train/case"] == BOUNDED
+
+
+def test_a_violation_per_episode_leaves_nothing_between_all_reward_and_all_cost():
+    step = jax.jit(learner(per_step=False, margin_lr=0.0)[0])
+    for violation, case in ((-0.02, FREE), (0.02, RECOVER)):
+        _, _, metrics = step(violation, START)
+        assert metrics["train/case"] == case
+        assert metrics["train/violation"] == np.float32(violation) * LENGTH
 
 
 @pytest.mark.parametrize(
