@@ -9,9 +9,10 @@ two calls is small; each engine builds its own working data inside the call.
 """
 
 import importlib.util
+import math
 import threading
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import flax.struct
 import jax
@@ -54,6 +55,7 @@ class Readings:
     geom_xpos: jax.Array  # [ngeom, 3]
     geom_xmat: jax.Array  # [ngeom, 3, 3]
     xquat: jax.Array  # [nbody, 4]
+    overflow: jax.Array  # float [], 1 where contacts or constraint rows found no room
 
 
 Run = Callable[[Physics, jax.Array, jax.Array], tuple[Physics, Readings]]
@@ -77,22 +79,34 @@ def mjx_warp_available() -> bool:
     return importlib.util.find_spec("warp") is not None
 
 
-def make_engine(name: str, scene: Scene, max_substeps: int, outputs: tuple[str, ...] = ()) -> Engine:
+def make_engine(
+    name: str,
+    scene: Scene,
+    max_substeps: int,
+    outputs: tuple[str, ...] = (),
+    alike: bool = False,
+    room: float = 1.0,
+) -> Engine:
     """The engine `name` for `scene`.
 
     Args:
         name: 'c', 'warp', 'jax' or 'auto'.
         max_substeps: most substeps of a call.
         outputs: which of 'geom_xpos', 'geom_xmat', 'xquat' to return.
+        alike: whether every call of `run` takes all `max_substeps`.
+        room: factor on the room that engine warp reserves for contacts.
     Raises:
         ConfigError: an unknown engine, or a scene that this one cannot run.
     """
     name = default_engine() if name == "auto" else name
-    makers = {"c": c_engine, "warp": warp_engine, "jax": jax_engine}
-    if name not in makers:
-        raise ConfigError(f"env.engine={name!r}{nearest(name, ('auto', *ENGINES))}")
-    run = makers[name](scene, max_substeps, outputs)
-    return Engine(name, run, run if name == "c" else makers[name](scene, 0, outputs))
+    if name == "c":
+        run = c_engine(scene, outputs)
+        return Engine(name, run, run)
+    if name == "warp":
+        return Engine(name, *warp_engine(scene, max_substeps, outputs, alike, room))
+    if name == "jax":
+        return Engine(name, jax_engine(scene, max_substeps, outputs), jax_engine(scene, 0, outputs))
+    raise ConfigError(f"env.engine={name!r}{nearest(name, ('auto', *ENGINES))}")
 
 
 def mocap_at(base: Any, orbit: np.ndarray, time: Any, xp: Any) -> Any:
@@ -104,7 +118,7 @@ def mocap_at(base: Any, orbit: np.ndarray, time: Any, xp: Any) -> Any:
 # MuJoCo in C ---------------------------------------------------------------------------------------
 
 
-def c_engine(scene: Scene, max_substeps: int, outputs: tuple[str, ...]) -> Run:
+def c_engine(scene: Scene, outputs: tuple[str, ...]) -> Run:
     """MuJoCo's thread pool. State crosses as float32; inside, all is float64 as in the original."""
     model = scene.model
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET.value  # bad states are ours to end
@@ -199,14 +213,19 @@ def c_engine(scene: Scene, max_substeps: int, outputs: tuple[str, ...]) -> Run:
 
 
 def readings(
-    sensors: jax.Array, contacts: jax.Array, source: Any, outputs: tuple[str, ...]
+    sensors: jax.Array,
+    contacts: jax.Array,
+    source: Any,
+    outputs: tuple[str, ...],
+    overflow: jax.Array | None = None,
 ) -> Readings:
     def pose(name: str) -> Any:
         if name not in outputs:
             return jnp.zeros((0,))
         return source[name] if isinstance(source, dict) else getattr(source, name)
 
-    return Readings(sensors, contacts, pose("geom_xpos"), pose("geom_xmat"), pose("xquat"))
+    poses = (pose(name) for name in ("geom_xpos", "geom_xmat", "xquat"))
+    return Readings(sensors, contacts, *poses, jnp.zeros(()) if overflow is None else overflow)
 
 
 # MJX -----------------------------------------------------------------------------------------------
@@ -312,48 +331,75 @@ def contact_geoms(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     return robot, np.stack([bodies == i for i in ids], 1) if ids else np.zeros((model.ngeom, 0), bool)
 
 
-def warp_engine(scene: Scene, max_substeps: int, outputs: tuple[str, ...]) -> Run:
-    """MJX with Warp kernels. Buffers are sized for the whole batch, so the batch is made explicit."""
+def warp_engine(
+    scene: Scene, max_substeps: int, outputs: tuple[str, ...], alike: bool, room: float
+) -> tuple[Run, Run]:
+    """MuJoCo Warp. Its buffers are sized for the whole batch, so the batch is made explicit."""
     if not mjx_warp_available():
         raise ConfigError("env.engine='warp': warp-lang is not installed; pip install 'jaxsafe[gpu]'")
-    from mujoco import mjx
+    from jaxsafe.envs import physics_warp
 
-    per_world, rows = contact_budget(scene)
-    with jax.ensure_compile_time_eval():
-        model = mjx.put_model(scene.model, impl="warp")
-    model = cast("mjx.Model", model.tree_replace({"opt._impl.warn_overflow": 0}))
+    model = scene.model
+    maker = physics_warp.warp_engine(scene, outputs, *contact_budget(scene, room))
+    _, results = physics_warp.widths(model, outputs)
+    ends = np.cumsum(list(results.values()))
+
+    def engine(substeps_of_all: int) -> Run:
+        advance = maker(substeps_of_all, alike)
+
+        def pack(physics: Physics, ctrl: jax.Array, substeps: jax.Array) -> jax.Array:
+            arrays = (physics.qpos, physics.qvel, physics.warmstart, physics.mocap_pos)
+            arrays += (physics.mocap_quat, ctrl, physics.substeps, substeps)
+            return jnp.concatenate([jnp.ravel(x).astype(jnp.float32) for x in arrays])
+
+        def unpack(row: jax.Array, physics: Physics, substeps: jax.Array):
+            parts = dict(zip(results, jnp.split(row, ends[:-1]), strict=True))
+            for name, shape in (("geom_xpos", (3,)), ("geom_xmat", (3, 3)), ("xquat", (4,))):
+                if name in parts:
+                    parts[name] = parts[name].reshape(-1, *shape)
+            physics = physics.replace(
+                qpos=parts["qpos"],
+                qvel=parts["qvel"],
+                warmstart=parts["qacc_warmstart"],
+                substeps=physics.substeps + substeps,
+            )
+            sensors = parts["sensordata"]
+            contacts = sensors[model.nsensordata - scene.contact_count :]
+            return physics, readings(sensors, contacts, parts, outputs, parts["overflow"][0])
+
+        def run_batch(physics: Physics, ctrl: jax.Array, substeps: jax.Array):
+            out = advance(jax.vmap(pack)(physics, ctrl, substeps))
+            return jax.vmap(unpack)(out, physics, substeps)
+
+        return batched(run_batch)
+
+    return engine(max_substeps), engine(0)
+
+
+def batched(run_batch: Run) -> Run:
+    """A function of one world from one of a batch: every `vmap` adds to the batch."""
 
     @jax.custom_batching.custom_vmap
-    def run_batch(physics: Physics, ctrl: jax.Array, substeps: jax.Array) -> tuple[Physics, Readings]:
-        worlds = ctrl.shape[0]
-        data = zeros_data(scene.model, per_world * worlds, rows)
+    def flat(physics: Physics, ctrl: jax.Array, substeps: jax.Array):
+        return run_batch(physics, ctrl, substeps)
 
-        def one(physics: Physics, ctrl: jax.Array, substeps: jax.Array) -> tuple[Physics, Readings]:
-            physics, out = substep_loop(scene, model, data, physics, ctrl, substeps, max_substeps)
-            sensors = out.sensordata
-            return physics, readings(
-                sensors, sensors[sensors.shape[0] - scene.contact_count :], out, outputs
-            )
-
-        return jax.vmap(one)(physics, ctrl, substeps)
-
-    @run_batch.def_vmap
+    @flat.def_vmap
     def _(axis_size: int, in_batched: Any, *args: Any) -> Any:
         args = spread(axis_size, in_batched, args)
         worlds = axis_size * args[1].shape[1]
-        flat = jax.tree.map(lambda x: x.reshape(worlds, *x.shape[2:]), args)
-        out = run_batch(*flat)
+        joined = jax.tree.map(lambda x: x.reshape(worlds, *x.shape[2:]), args)
+        out = flat(*joined)
         out = jax.tree.map(lambda x: x.reshape(axis_size, worlds // axis_size, *x.shape[1:]), out)
         return out, jax.tree.map(lambda _: True, out)
 
     @jax.custom_batching.custom_vmap
-    def run(physics: Physics, ctrl: jax.Array, substeps: jax.Array) -> tuple[Physics, Readings]:
+    def run(physics: Physics, ctrl: jax.Array, substeps: jax.Array):
         lone = jax.tree.map(lambda x: x[None], (physics, ctrl, substeps))
-        return jax.tree.map(lambda x: x[0], run_batch(*lone))
+        return jax.tree.map(lambda x: x[0], flat(*lone))
 
     @run.def_vmap
     def _(axis_size: int, in_batched: Any, *args: Any) -> Any:
-        out = run_batch(*spread(axis_size, in_batched, args))
+        out = flat(*spread(axis_size, in_batched, args))
         return out, jax.tree.map(lambda _: True, out)
 
     return run
@@ -368,29 +414,17 @@ def spread(axis_size: int, in_batched: Any, args: Any) -> Any:
     )
 
 
-def contact_budget(scene: Scene) -> tuple[int, int]:
-    """Contacts per world on average, and constraint rows in the fullest world.
+def contact_budget(scene: Scene, room: float = 1.0) -> tuple[int, int]:
+    """Contacts per world on average, and constraint rows in the fullest world, times `room`.
 
-    A resting cube holds 4 contacts, a robot part up to 4; each contact takes 10 rows (condim 6).
+    A resting cube touches the floor in 4 points, as do a box's four columns; a robot on wheels or
+    legs touches it with some of its geoms; cubes that meet share up to 8 points. Each contact takes
+    10 rows (condim 6, pyramidal cone), a weld 6.
     """
     model = scene.model
-    free = sum(scene.frees.values()) + 4 * scene.frees["box"]
+    resting = 4 * sum(scene.frees.values()) + 16 * scene.frees["box"]
     robot = int((model.body_rootid[model.geom_bodyid] == model.body("robot").id).sum())
-    contacts = 8 + 4 * free + 2 * robot * (not scene.planar)
-    limits = int(model.jnt_limited.sum())
-    return contacts, 10 * (contacts + 16) + limits + 6 * scene.frees["gremlins"]
-
-
-def zeros_data(model: mujoco.MjModel, contacts: int, rows: int) -> "mjx.Data":
-    """`mjx.make_data`, with its large all-zero arrays made on the device instead of shipped."""
-    from mujoco import mjx
-
-    with jax.ensure_compile_time_eval():
-        data = mjx.make_data(model, impl="warp", naconmax=contacts, njmax=rows)
-
-    def device(x: Any) -> Any:
-        if not hasattr(x, "dtype") or np.size(x) < 1024 or np.any(np.asarray(x)):
-            return x
-        return jnp.zeros(x.shape, x.dtype)
-
-    return jax.tree.map(device, data)
+    standing = 0 if scene.planar else robot
+    average = resting + standing + (8 if scene.frees["box"] else 4)
+    fullest = 10 * (resting + 2 * standing + 16) + 6 * scene.frees["gremlins"]
+    return math.ceil(room * average), math.ceil(room * fullest) + int(model.jnt_limited.sum())

@@ -66,7 +66,7 @@ class Replay(SafetyGym):
         zero = jnp.zeros(())
         obs = jnp.zeros(self.obs_size)  # `compare` refuses dicts
         costs = jnp.zeros(len(self.cost_names))
-        info = {"goal_met": zero, "exception": zero}
+        info = {"goal_met": zero, "exception": zero, "overflow": zero}
         return self.step(State(world, obs, zero, zero, costs, jnp.bool_(False), info), action)
 
     def _next_goal(self, world: World, key: jax.Array, wanted: jax.Array) -> tuple[World, jax.Array]:

@@ -82,7 +82,10 @@ class SafetyGym:
         self.place = layouts.placement(cfg)
         natural = ("geom_xpos", "geom_xmat") if cfg.lidar_type == "natural" else ()
         turned = ("xquat",) if cfg.reward_orientation else ()
-        self._engine = engines.make_engine(engine, self.scene, cfg.frameskip_binom_n, natural + turned)
+        alike = cfg.frameskip_binom_p >= 1
+        self._engine = engines.make_engine(
+            engine, self.scene, cfg.frameskip_binom_n, natural + turned, alike, cfg.contact_room
+        )
         self.engine = self._engine.name
         self._goal_kind = {"goal": "goal", "push": "goal", "button": "buttons"}.get(cfg.task)
         seeks_goal = cfg.observe_goal_lidar or cfg.observe_goal_dist or cfg.observe_goal_comp
@@ -135,7 +138,7 @@ class SafetyGym:
             cost=zero,
             costs=jnp.zeros(len(self.cost_names)),
             terminated=jnp.bool_(False),
-            info={"goal_met": zero, "exception": zero},
+            info={"goal_met": zero, "exception": zero, "overflow": readings.overflow},
         )
 
     def step(self, state: State, action: jax.Array) -> State:
@@ -177,7 +180,11 @@ class SafetyGym:
             cost=jnp.where(bad, zero, cost),
             costs=jnp.where(bad, zero, costs),
             terminated=bad | terminated,
-            info={"goal_met": jnp.where(bad, zero, success), "exception": bad.astype(jnp.float32)},
+            info={
+                "goal_met": jnp.where(bad, zero, success),
+                "exception": bad.astype(jnp.float32),
+                "overflow": readings.overflow,
+            },
         )
 
     def _begin(self, key: jax.Array) -> tuple[World, Readings, jax.Array]:

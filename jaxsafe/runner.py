@@ -26,6 +26,7 @@ from jaxsafe.progress import Report
 from jaxsafe.types import Env, PyTree
 
 AXIS = "devices"
+OVERFLOW = "train/overflow"  # steps of an episode in which engine warp ran out of room
 POLICY = ("params", "normaliser")  # the fields of a train state that `act` reads
 
 
@@ -299,7 +300,7 @@ class Log:
     def __init__(
         self, folder: Path, names: list[str], settings: TrainConfig, iteration: int, per_update: int
     ):
-        self.settings, self.per_update = settings, per_update
+        self.settings, self.per_update, self.warned = settings, per_update, False
         self.csv = run_folder.Metrics(folder, names, iteration)
         self.begun = time.perf_counter() - self.csv.seconds
         self.boards = [
@@ -318,6 +319,12 @@ class Log:
     def append(self, iteration: int, metrics: dict[str, jax.Array], report: Report) -> None:
         values = {k: np.asarray(v, np.float32) for k, v in jax.device_get(metrics).items()}
         steps, seconds = iteration * self.per_update, time.perf_counter() - self.begun
+        if not self.warned and (values.get(OVERFLOW, np.zeros(())) > 0).any():  # NaN: nothing ended
+            self.warned = True
+            report.line(
+                f"warning: contacts found no room in some steps ({OVERFLOW} in metrics.csv); "
+                "raise env.contact_room"
+            )
         self.csv.append(iteration, steps, self.settings.seeds, seconds, values)
         for s, board in enumerate(self.boards):
             board.append(steps, {name: float(value[s]) for name, value in values.items()})

@@ -165,7 +165,8 @@ TESTED_ALONE = {
     "observe_vision",
     "terminate_resample_failure",
     "_seed",
-}  # the last two with layouts
+    "contact_room",
+}  # the third and fourth with layouts, the last with engine warp
 
 
 def facts(env: SafetyGym) -> tuple:
