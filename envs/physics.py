@@ -2,10 +2,10 @@
 
     run(physics, ctrl, substeps) -> (physics, readings)
 
-`c` is MuJoCo itself, a thread pool behind a callback: exact, and the default on a CPU. `warp` is MJX
-with Warp kernels, the default on an NVIDIA GPU. `jax` is MJX in plain JAX, for every other device.
-One instance in, one out: callers `vmap`, over environments and again over seeds. The state between
-two calls is small; each engine builds its own working data inside the call.
+`c` is MuJoCo itself, a thread pool behind a callback: exact, and the default on a CPU. `warp` is
+MuJoCo Warp (`physics_warp.py`), the default on an NVIDIA GPU. `jax` is MJX in plain JAX, for every
+other device. One instance in, one out: callers `vmap`, over environments and again over seeds. The
+state between two calls is small; each engine keeps or builds its own working data.
 """
 
 import importlib.util

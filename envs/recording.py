@@ -174,11 +174,15 @@ class Comparison:
     undecided: np.ndarray  # steps whose events MuJoCo's own versions dispute
     tolerances: dict[str, np.ndarray]  # per component, [steps]
 
+    def past(self, name: str) -> np.ndarray:
+        """Strict steps on which a component is past its tolerance, bool [steps]."""
+        return self.strict & ~(self.errors[name] <= self.tolerances[name])
+
     def failures(self) -> list[str]:
         """What is past its tolerance, a line each."""
         lines = []
         for name, error in self.errors.items():
-            over = self.strict & ~(error <= self.tolerances[name])
+            over = self.past(name)
             if over.any():
                 worst = np.argmax(np.where(over, error, -1))
                 lines.append(

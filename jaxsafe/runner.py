@@ -133,7 +133,7 @@ def build(env: Env, make: Callable, algo_config: Any, settings: TrainConfig) -> 
     if devices == 1:
         return Program(init, update, keys, jax.sharding.SingleDeviceSharding(jax.local_devices()[0]))
     if getattr(env, "engine", None) == "warp":
-        # In JAX 0.11 Shardy crashes on programs around MJX-Warp; the older partitioner crashes on
+        # In JAX 0.11 Shardy crashes on programs around Warp's calls; the older partitioner crashes on
         # the callbacks of engine c.
         jax.config.update("jax_use_shardy_partitioner", False)
     mesh = jax.make_mesh(

@@ -64,6 +64,14 @@ def report(comparison: Comparison) -> str:
     return "\n".join(lines)
 
 
+def verdict(comparison: Comparison) -> str:
+    """'pass', or on how many strict steps something is past its tolerance."""
+    if not comparison.failures():
+        return "pass"
+    steps = np.any([comparison.past(name) for name in comparison.errors], axis=0).sum()
+    return f"{steps} step{'s' * (steps > 1)} past" if steps else "events"
+
+
 def row(comparison: Comparison) -> str:
     seen = [n for n in comparison.errors if n not in BODIES and not n.startswith("cost")]
     forces = [n for n in seen if n.startswith(FORCES)]
@@ -77,7 +85,7 @@ def row(comparison: Comparison) -> str:
         f"{comparison.strict.mean():.1%}",
         *errors,
         f"{count} ({undecided})" if count else "0",
-        "FAIL" if comparison.failures() else "pass",
+        verdict(comparison),
     )
     return f"| {' | '.join(cells)} |"
 
