@@ -1,4 +1,4 @@
-"""What the algorithms of one module each add: surrogates, projections and penalties, by hand or oracle."""
+"""What single algorithms add: surrogates, projections and penalties, by hand or by oracle."""
 
 import jax
 import jax.numpy as jnp
