@@ -3,7 +3,26 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from jaxsafe.algos import cpo, ppo, ppo_lag
+from jaxsafe.algos import (
+    cpo,
+    cppo_pid,
+    crpo,
+    cup,
+    focops,
+    ipo,
+    npg,
+    p3o,
+    pcpo,
+    pdo,
+    pg,
+    ppo,
+    ppo_lag,
+    ppo_penalty,
+    rcpo,
+    trpo,
+    trpo_lag,
+    trpo_pid,
+)
 from jaxsafe.on_policy import Algorithm
 
 
@@ -18,8 +37,64 @@ ALGOS: dict[str, Entry] = {
     "cpo": Entry(
         cpo.CPOConfig, cpo.make, "trust-region step within a linearised constraint", cpo.PUBLISHED
     ),
+    "cppo_pid": Entry(
+        cppo_pid.CPPOPIDConfig,
+        cppo_pid.make,
+        "PPO with a price on cost from a PID controller",
+        cppo_pid.PUBLISHED,
+    ),
+    "crpo": Entry(
+        crpo.CRPOConfig,
+        crpo.make,
+        "TRPO on reward or on cost, by whether the limit holds",
+        crpo.PUBLISHED,
+    ),
+    "cup": Entry(
+        cup.CUPConfig, cup.make, "PPO step, then a projection towards lower cost", cup.PUBLISHED
+    ),
+    "focops": Entry(
+        focops.FOCOPSConfig,
+        focops.make,
+        "first-order steps near the optimal policy of a constrained problem",
+        focops.PUBLISHED,
+    ),
+    "ipo": Entry(ipo.IPOConfig, ipo.make, "PPO with a logarithmic barrier at the limit", ipo.PUBLISHED),
+    "npg": Entry(npg.NPGConfig, npg.make, "natural policy gradient, no constraint", npg.PUBLISHED),
+    "p3o": Entry(p3o.P3OConfig, p3o.make, "PPO with an exact penalty beyond the limit", p3o.PUBLISHED),
+    "pcpo": Entry(
+        pcpo.PCPOConfig,
+        pcpo.make,
+        "trust-region step projected onto a linearised constraint",
+        pcpo.PUBLISHED,
+    ),
+    "pdo": Entry(
+        pdo.PDOConfig, pdo.make, "policy gradient with an adaptive price on cost", pdo.PUBLISHED
+    ),
+    "pg": Entry(pg.PGConfig, pg.make, "policy gradient, no constraint", pg.PUBLISHED),
     "ppo": Entry(ppo.PPOConfig, ppo.make, "clipped policy steps, no constraint", ppo.PUBLISHED),
     "ppo_lag": Entry(
         ppo_lag.PPOLagConfig, ppo_lag.make, "PPO with an adaptive price on cost", ppo_lag.PUBLISHED
+    ),
+    "ppo_penalty": Entry(
+        ppo_penalty.PPOPenaltyConfig,
+        ppo_penalty.make,
+        "PPO with a fixed price on cost",
+        ppo_penalty.PUBLISHED,
+    ),
+    "rcpo": Entry(
+        rcpo.RCPOConfig,
+        rcpo.make,
+        "natural policy gradient with an adaptive price on cost",
+        rcpo.PUBLISHED,
+    ),
+    "trpo": Entry(trpo.TRPOConfig, trpo.make, "trust-region steps, no constraint", trpo.PUBLISHED),
+    "trpo_lag": Entry(
+        trpo_lag.TRPOLagConfig, trpo_lag.make, "TRPO with an adaptive price on cost", trpo_lag.PUBLISHED
+    ),
+    "trpo_pid": Entry(
+        trpo_pid.TRPOPIDConfig,
+        trpo_pid.make,
+        "TRPO with a price on cost from a PID controller",
+        trpo_pid.PUBLISHED,
     ),
 }

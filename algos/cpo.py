@@ -23,16 +23,19 @@ OmniSafe leaves c per episode (`per_step=False`), about a thousand times as larg
 a step maximises reward while the cost is under the limit and lowers cost while it is over.
 """
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
+from jaxsafe.algos import trpo
 from jaxsafe.batch import all_finite, pmean
 from jaxsafe.config import config
 from jaxsafe.networks import policy
-from jaxsafe.on_policy import Algorithm, OnPolicyConfig, on_policy_pair
+from jaxsafe.on_policy import Algorithm, on_policy_pair
 from jaxsafe.steps import Objective, Step, mean_kl
 from jaxsafe.surrogates import plain
 from jaxsafe.trust_region import conjugate_gradient, fisher_product, line_search
@@ -40,31 +43,15 @@ from jaxsafe.types import Env, Metrics, PyTree
 
 
 @config
-class CPOConfig(OnPolicyConfig):
-    target_kl: float = 0.02  # delta, nats; OmniSafe's 0.01 is of a mean over (2) action dimensions
-    damping: float = 0.1  # added to the Fisher matrix; OmniSafe, safety-starter-agents
-    cg_iterations: int = 15  # OmniSafe
+class CPOConfig(trpo.TRPOConfig):
     line_search_tries: int = 20  # OmniSafe
-    line_search_shrink: float = 0.8  # OmniSafe, safety-starter-agents
     per_step: bool = True  # the violation c in cost per step, as b is; OmniSafe: per episode
     margin_lr: float = 0.05  # safety-starter-agents, who leave it off; 0: no margin
 
 
-# OmniSafe @15603dd, configs/on-policy/CPO.yaml. Its minibatches of 128 do not divide 20 * 1000
-# steps: these are of 125.
+# CPO.yaml differs from TRPO.yaml by the constraint alone.
 PUBLISHED: dict[str, dict[str, Any]] = {
-    "omnisafe": {
-        "num_envs": 20,
-        "horizon": 1000,
-        "stagger": False,
-        "init": "torch",
-        "init_log_std": 0.0,
-        "critic_epochs": 10,
-        "minibatches": 160,
-        "critic_lr": 1e-3,
-        "per_step": False,
-        "margin_lr": 0.0,
-    }
+    name: options | {"per_step": False, "margin_lr": 0.0} for name, options in trpo.PUBLISHED.items()
 }
 
 RECOVER, RETURN, BOUNDED, FREE = range(4)  # cases of the dual
@@ -119,11 +106,48 @@ def dual(
     return jnp.where(recover, 0.0, lam), jnp.where(recover, per_b, nu), case
 
 
+class Direction(NamedTuple):
+    """Where a rule would go.
+
+    step: float [P], change of the parameters.
+    earns: bool [], whether the reward's surrogate must not fall.
+    metrics: of the rule.
+    """
+
+    step: jax.Array
+    earns: jax.Array
+    metrics: Metrics
+
+
+def solution(
+    h_g: jax.Array,
+    h_b: jax.Array,
+    q: jax.Array,
+    r: jax.Array,
+    s: jax.Array,
+    c: jax.Array,
+    delta: jax.Array,
+) -> Direction:
+    """The solution of the linearised problem."""
+    lam, nu, case = dual(q, r, s, c, delta)
+    recover = case == RECOVER
+    step = jnp.where(recover, -nu * h_b, (h_g - nu * h_b) / jnp.where(recover, 1.0, lam))
+    metrics = {"train/lam": lam, "train/nu": nu, "train/case": case}
+    return Direction(step, case > RETURN, metrics)
+
+
 class Margin(NamedTuple):
     margin: jax.Array  # float [], in the violation's unit, >= 0
 
 
+def step_by(rule: Callable[..., Direction]) -> Step:
+    """A trust-region step where `rule(h_g, h_b, q, r, s, c, delta)` says, with H^-1 g, H^-1 b and
+    their products, shortened until it keeps what it promised."""
+    return Step(lambda actor, cfg: Margin(jnp.zeros(())), partial(update, rule))
+
+
 def update(
+    rule: Callable[..., Direction],
     actor: PyTree,
     opt_state: Margin,
     objective_r: Objective,
@@ -153,16 +177,13 @@ def update(
     )
     solve = jax.vmap(lambda v: conjugate_gradient(product, v, cfg.cg_iterations))
     (h_g, h_b), residual = solve(jnp.stack([g, b]))
-    lam, nu, case = dual(g @ h_g, g @ h_b, b @ h_b, c, delta)
-    recover = case == RECOVER
-    step = jnp.where(recover, -nu * h_b, (h_g - nu * h_b) / jnp.where(recover, 1.0, lam))
-
+    step, earns, metrics = rule(h_g, h_b, g @ h_g, g @ h_b, b @ h_b, c, delta)
     reward, cost, _ = evaluate(start)
 
     def accept(params: jax.Array) -> jax.Array:
         new_reward, new_cost, divergence = evaluate(params)
-        earns = (new_reward >= reward) | ((case <= RETURN) & jnp.isfinite(new_reward))
-        return earns & (new_cost - cost <= jnp.maximum(-c, 0.0)) & (divergence <= delta)
+        good = (new_reward >= reward) | (~earns & jnp.isfinite(new_reward))
+        return good & (new_cost - cost <= jnp.maximum(-c, 0.0)) & (divergence <= delta)
 
     params, accepted, tries = line_search(
         accept, start, step, cfg.line_search_tries, cfg.line_search_shrink
@@ -177,19 +198,17 @@ def update(
             "train/objective_c": new_cost - cost,  # cost per step
             "train/violation": violation,  # cost per step, as the margin, or per episode
             "train/margin": margin,
-            "train/lam": lam,
-            "train/nu": nu,
-            "train/case": case,
             "train/accepted": accepted,
             "train/line_search": tries,
             "train/cg_residual_r": residual[0],
             "train/cg_residual_c": residual[1],
             "train/nonfinite": ~all_finite((g, b, step)),
+            **metrics,
         },
     )
 
 
-cpo_step = Step(init=lambda actor, cfg: Margin(jnp.zeros(())), update=update)
+cpo_step = step_by(solution)
 
 
 def make(env: Env, axis_name: str | None = None) -> Algorithm:

@@ -9,8 +9,9 @@ OmniSafe; the value function is a network of its own. A cost critic is trained f
 
 from typing import Any
 
+from jaxsafe.algos import pg
 from jaxsafe.config import config
-from jaxsafe.on_policy import Algorithm, OnPolicyConfig, on_policy
+from jaxsafe.on_policy import Algorithm, on_policy
 from jaxsafe.steps import adam_epochs
 from jaxsafe.surrogates import clipped
 from jaxsafe.treatments import none
@@ -18,29 +19,13 @@ from jaxsafe.types import Env
 
 
 @config
-class PPOConfig(OnPolicyConfig):
-    lr: float = 3e-4  # of the policy; OmniSafe, safety-starter-agents
-    lr_decay: bool = False  # of lr, linearly to 0 at total_iterations; OmniSafe: True
+class PPOConfig(pg.PGConfig):
     clip: float = 0.2  # eps; the paper
-    epochs: int = 10  # passes over each batch; with 8 minibatches the 80 steps of safety-starter-agents
-    target_kl: float = 0.02  # nats, checked after each pass; OmniSafe
 
 
-# OmniSafe @15603dd, configs/on-policy/PPO.yaml. Its minibatches of 64 do not divide 20 * 1000 steps:
-# these are of 80. Its 20 episodes run one after the other, these side by side.
+# PPO.yaml differs from PolicyGradient.yaml by its passes.
 PUBLISHED: dict[str, dict[str, Any]] = {
-    "omnisafe": {
-        "num_envs": 20,
-        "horizon": 1000,
-        "stagger": False,
-        "init": "torch",
-        "init_log_std": 0.0,
-        "epochs": 40,
-        "critic_epochs": 40,
-        "minibatches": 250,
-        "critic_lr": 3e-4,
-        "lr_decay": True,
-    }
+    name: options | {"epochs": 40, "critic_epochs": 40} for name, options in pg.PUBLISHED.items()
 }
 
 

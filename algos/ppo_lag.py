@@ -16,15 +16,13 @@ from jaxsafe.config import config
 from jaxsafe.on_policy import Algorithm, on_policy
 from jaxsafe.steps import adam_epochs
 from jaxsafe.surrogates import clipped
-from jaxsafe.treatments import lagrangian
+from jaxsafe.treatments import LagrangianConfig, lagrangian
 from jaxsafe.types import Env
 
 
 @config
-class PPOLagConfig(ppo.PPOConfig):
-    lam_init: float = 0.001  # OmniSafe
-    lam_max: float = float("inf")  # OmniSafe
-    dual_lr: float = 0.1  # Adam's step, whatever the size of the violation; OmniSafe 0.035
+class PPOLagConfig(LagrangianConfig, ppo.PPOConfig):
+    pass
 
 
 # PPOLag.yaml differs from PPO.yaml by the multiplier alone.

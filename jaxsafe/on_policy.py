@@ -125,9 +125,14 @@ def on_policy(
 
 
 def on_policy_pair(
-    env: Env, surrogate: Callable, step: Step, axis_name: str | None = None
+    env: Env,
+    surrogate: Callable,
+    step: Step,
+    axis_name: str | None = None,
+    surrogate_c: Callable | None = None,
 ) -> Algorithm:
-    """Algorithms whose step weighs reward against cost itself, so that it takes two objectives.
+    """Algorithms whose step weighs reward against cost itself, so that it takes two objectives, both
+    by `surrogate` if the cost's has no own.
 
     update(actor, opt_state, objective_r, objective_c, excess, length, batch, key, cfg, axis_name),
     where excess = J_c - cost_limit, in cost per episode, and length is the mean episode's in steps:
@@ -141,7 +146,8 @@ def on_policy_pair(
             return surrogate(policy(actor, batch.obs, cfg), batch, batch.adv_r, cfg)
 
         def objective_c(actor: PyTree, batch: Batch) -> tuple[jax.Array, Metrics]:
-            return surrogate(policy(actor, batch.obs, cfg), batch, batch.adv_c, cfg)
+            dist = policy(actor, batch.obs, cfg)
+            return (surrogate_c or surrogate)(dist, batch, batch.adv_c, cfg)
 
         actor, opt_state, metrics = step.update(
             ts.params["actor"],

@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxsafe.gaussian import Gaussian, log_prob
+from jaxsafe.gaussian import Gaussian, kl, log_prob
 from jaxsafe.types import Metrics
 
 
@@ -27,3 +27,27 @@ def clipped(dist: Gaussian, batch: Any, advantage: jax.Array, cfg: Any) -> tuple
     near = jnp.clip(w, 1 - cfg.clip, 1 + cfg.clip)
     fraction = jnp.mean(jnp.abs(w - 1) > cfg.clip)
     return jnp.mean(jnp.minimum(w * advantage, near * advantage)), {"train/clip_fraction": fraction}
+
+
+def pessimistic(
+    dist: Gaussian, batch: Any, advantage: jax.Array, cfg: Any
+) -> tuple[jax.Array, Metrics]:
+    """E[max(w A, clip(w, 1 - eps, 1 + eps) A)]: `clipped` for what is to be kept low.
+
+    Source: Zhang et al. (2022), arXiv:2205.11814, equation 12.
+    """
+    low, metrics = clipped(dist, batch, -advantage, cfg)
+    return -low, metrics
+
+
+def near(dist: Gaussian, batch: Any, advantage: jax.Array, cfg: Any) -> tuple[jax.Array, Metrics]:
+    """E[1{KL <= eta} (w A / temperature - KL)], with the KL of each state.
+
+    Source: Zhang, Vuong and Ross (2020), "First Order Constrained Optimization in Policy Space",
+    arXiv:2002.06506, equation 11; the KL is KL(new || old).
+    """
+    w = jnp.exp(log_prob(dist, batch.action) - batch.log_prob)
+    divergence = kl(dist, batch.old)
+    inside = jax.lax.stop_gradient(divergence <= cfg.near_kl)
+    gain = w * advantage / cfg.temperature - divergence
+    return jnp.mean(inside * gain), {"train/inside": jnp.mean(inside)}

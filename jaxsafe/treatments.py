@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from jaxsafe.config import config
 from jaxsafe.types import Metrics, PyTree
 
 
@@ -28,6 +29,13 @@ none = Treatment(
     advantage=lambda dual, adv_r, adv_c: adv_r,
     metrics=lambda dual: {},
 )
+
+
+@config
+class LagrangianConfig:
+    lam_init: float = 0.001  # OmniSafe
+    lam_max: float = float("inf")  # OmniSafe
+    dual_lr: float = 0.1  # Adam's step, whatever the size of the violation; OmniSafe 0.035
 
 
 class Multiplier(NamedTuple):
@@ -54,4 +62,83 @@ lagrangian = Treatment(
     update=adam_ascent,
     advantage=lambda dual, adv_r, adv_c: (adv_r - dual.lam * adv_c) / (1.0 + dual.lam),
     metrics=lambda dual: {"train/lam": dual.lam},
+)
+
+
+@config
+class PIDConfig:
+    lam_init: float = 0.001  # OmniSafe
+    pid_kp: float = 0.1  # of the smoothed error; OmniSafe
+    pid_ki: float = 0.01  # of the error, each iteration; OmniSafe
+    pid_kd: float = 0.01  # of the smoothed cost's rise; OmniSafe
+    pid_smoothing: float = 0.95  # share of the past in what is smoothed; OmniSafe
+    pid_delay: int = 10  # iterations over which a rise is taken; OmniSafe
+
+
+class PID(NamedTuple):
+    """What the controller remembers: costs per episode, but lam."""
+
+    lam: jax.Array  # float [], reward per unit of cost, >= 0
+    integral: jax.Array  # float [], K_i times the sum of errors, >= 0
+    error: jax.Array  # float [], smoothed J_c - cost_limit
+    cost: jax.Array  # float [], smoothed J_c
+    past: jax.Array  # float [pid_delay], earlier smoothed costs, oldest first
+
+
+def init_pid(cfg: Any) -> PID:
+    zero, lam = jnp.zeros(()), jnp.asarray(cfg.lam_init, jnp.float32)
+    return PID(lam, lam, zero, zero, jnp.zeros(cfg.pid_delay))
+
+
+def control(dual: PID, episode_cost: jax.Array, cfg: Any) -> PID:
+    """lam = (K_p P + I + K_d D)+, from the error's smoothed value, its sum, and the cost's rise."""
+    error = episode_cost - cfg.cost_limit
+    integral = jnp.maximum(0.0, dual.integral + cfg.pid_ki * error)
+    smooth = cfg.pid_smoothing * dual.error + (1 - cfg.pid_smoothing) * error
+    cost = cfg.pid_smoothing * dual.cost + (1 - cfg.pid_smoothing) * episode_cost
+    rise = jnp.maximum(0.0, cost - dual.past[0])
+    lam = jnp.maximum(0.0, cfg.pid_kp * smooth + integral + cfg.pid_kd * rise)
+    return PID(lam, integral, smooth, cost, jnp.append(dual.past[1:], cost))
+
+
+# Stooke, Achiam and Abbeel (2020), "Responsive Safety in Reinforcement Learning by PID Lagrangian
+# Methods", arXiv:2007.03964, algorithm 2; the smoothing and the scale are from their code
+pid = Treatment(
+    init=init_pid,
+    update=control,
+    advantage=lagrangian.advantage,
+    metrics=lambda dual: {"train/lam": dual.lam, "train/integral": dual.integral},
+)
+
+
+def barrier_price(dual: jax.Array, episode_cost: jax.Array, cfg: Any) -> jax.Array:
+    """The slope of the barrier -barrier log(cost_limit - J_c), or price_max where there is none."""
+    slack = cfg.cost_limit - episode_cost
+    price = cfg.barrier / jnp.where(slack > 0, slack, 1.0)
+    return jnp.where((slack > 0) & (price < cfg.price_max), price, cfg.price_max)
+
+
+# Liu, Ding and Liu (2020), "IPO: Interior-point Policy Optimization under Constraints",
+# arXiv:1910.09615, equation 6, whose barrier enters here by its gradient
+barrier = Treatment(
+    init=lambda cfg: jnp.zeros(()),
+    update=barrier_price,
+    advantage=lambda price, adv_r, adv_c: (adv_r - price * adv_c) / (1.0 + price),
+    metrics=lambda price: {"train/lam": price},
+)
+
+penalty = Treatment(
+    init=lambda cfg: jnp.asarray(cfg.price, jnp.float32),
+    update=lambda price, episode_cost, cfg: price,
+    advantage=lambda price, adv_r, adv_c: adv_r - price * adv_c,
+    metrics=lambda price: {"train/lam": price},
+)
+
+# Xu, Liang and Lan (2021), "CRPO: A New Approach for Safe Reinforcement Learning with Convergence
+# Guarantee", arXiv:2011.05869, algorithm 1
+switch = Treatment(
+    init=lambda cfg: jnp.bool_(False),
+    update=lambda over, episode_cost, cfg: episode_cost > cfg.cost_limit + cfg.tolerance,
+    advantage=lambda over, adv_r, adv_c: jnp.where(over, -adv_c, adv_r),
+    metrics=lambda over: {"train/over": over},
 )

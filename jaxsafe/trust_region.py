@@ -1,16 +1,21 @@
-"""What trust-region steps share: Fisher products, conjugate gradients, a line search.
+"""Trust-region steps, and what they share: Fisher products, conjugate gradients, a line search.
 
 Vectors are flat, float [P]: the policy's parameters through `ravel_pytree`.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 
-from jaxsafe.batch import pmean
+from jaxsafe.batch import all_finite, pmean
 from jaxsafe.gaussian import Gaussian, kl
+from jaxsafe.networks import policy
+from jaxsafe.steps import Objective, Step, mean_kl
+from jaxsafe.types import Metrics, PyTree
 
 Matvec = Callable[[jax.Array], jax.Array]
 
@@ -86,3 +91,60 @@ def line_search(
         (jnp.bool_(False), jnp.int32(0)),
     )
     return jnp.where(accepted, candidate(i), start), accepted, i
+
+
+def update_natural(
+    actor: PyTree,
+    opt_state: PyTree,
+    objective: Objective,
+    batch: Any,
+    key: jax.Array,
+    cfg: Any,
+    axis_name: str | None,
+    search: bool,
+) -> tuple[PyTree, PyTree, Metrics]:
+    """theta + sqrt(2 delta / g'H^-1 g) H^-1 g, to where the quadratic model's KL is target_kl.
+
+    With `search` the step is shortened until the objective does not fall and the KL itself is at
+    most target_kl; else it is taken as it is.
+    """
+    start, unravel = ravel_pytree(actor)
+
+    def evaluate(params: jax.Array) -> tuple[jax.Array, jax.Array]:
+        actor = unravel(params)
+        gain = pmean(objective(actor, batch)[0], axis_name)
+        return gain, mean_kl(batch.old, policy(actor, batch.obs, cfg), axis_name)
+
+    g = pmean(jax.grad(lambda params: objective(unravel(params), batch)[0])(start), axis_name)
+    product = fisher_product(
+        lambda params: policy(unravel(params), batch.obs, cfg), start, batch.old, cfg.damping, axis_name
+    )
+    h_g, residual = conjugate_gradient(product, g, cfg.cg_iterations)
+    step = jnp.sqrt(2 * cfg.target_kl / jnp.maximum(g @ h_g, 1e-20)) * h_g
+    before, _ = evaluate(start)
+
+    def accept(params: jax.Array) -> jax.Array:
+        gain, divergence = evaluate(params)
+        return (gain >= before) & (divergence <= cfg.target_kl) if search else jnp.isfinite(gain)
+
+    tries, shrink = (cfg.line_search_tries, cfg.line_search_shrink) if search else (1, 1.0)
+    params, accepted, tried = line_search(accept, start, step, tries, shrink)
+    after, divergence = evaluate(params)
+    return (
+        unravel(params),
+        opt_state,
+        {
+            "train/kl": divergence,
+            "train/objective": after - before,
+            "train/accepted": accepted,
+            "train/line_search": tried,
+            "train/cg_residual_r": residual,
+            "train/nonfinite": ~all_finite((g, step)),
+        },
+    )
+
+
+# Kakade (2001), "A Natural Policy Gradient", with the step's length from the trust region
+natural_gradient = Step(lambda actor, cfg: (), partial(update_natural, search=False))
+# Schulman et al. (2015), "Trust Region Policy Optimization", arXiv:1502.05477, appendix C
+trust_region = Step(lambda actor, cfg: (), partial(update_natural, search=True))

@@ -5,9 +5,18 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from jaxsafe.algos.cpo import CPOConfig
-from jaxsafe.gaussian import kl
+from jaxsafe.algos.trpo import TRPOConfig
+from jaxsafe.gaussian import kl, log_prob, sample
 from jaxsafe.networks import init_params, policy
-from jaxsafe.trust_region import conjugate_gradient, fisher_product, line_search
+from jaxsafe.on_policy import Batch
+from jaxsafe.surrogates import plain
+from jaxsafe.trust_region import (
+    conjugate_gradient,
+    fisher_product,
+    line_search,
+    natural_gradient,
+    trust_region,
+)
 
 
 def spd(rng, n):
@@ -70,3 +79,45 @@ def test_the_line_search_takes_the_first_step_that_is_accepted(bound, index):
 def test_the_line_search_stays_where_it_is_when_nothing_is_finite():
     x, accepted, _ = line_search(lambda x: x[0] < jnp.inf, jnp.ones(1), jnp.full(1, jnp.nan), 5, 0.5)
     assert not accepted and x[0] == 1.0
+
+
+def natural(step, **options):
+    """A policy, the flat step taken, its gradient and Fisher matrix (dense), and the metrics."""
+    cfg = TRPOConfig(hidden=(4,), cg_iterations=60, **options)
+    keys = jax.random.split(jax.random.key(0), 3)
+    actor = init_params(keys[0], 3, 2, cfg)["actor"]
+    obs = jax.random.normal(keys[1], (256, 3))
+    old = policy(actor, obs, cfg)
+    action = sample(old, keys[2])
+    adv = action.sum(-1) - action.sum(-1).mean()
+    batch = Batch(obs, action, log_prob(old, action), old, adv, adv, adv, adv)
+
+    def objective(actor, batch):
+        return plain(policy(actor, batch.obs, cfg), batch, batch.adv_r, cfg)
+
+    after, _, metrics = step.update(actor, (), objective, batch, jax.random.key(0), cfg, None)
+    start, unravel = ravel_pytree(actor)
+    g = jax.grad(lambda x: objective(unravel(x), batch)[0])(start)
+    hessian = jax.hessian(lambda x: kl(old, policy(unravel(x), obs, cfg)).mean())(start)
+    return ravel_pytree(after)[0] - start, g, hessian + cfg.damping * jnp.eye(len(g)), metrics, cfg
+
+
+def test_the_natural_gradient_is_numpys_and_as_long_as_the_trust_region():
+    step, g, h, metrics, cfg = natural(natural_gradient, target_kl=1e-3)
+    exact = np.linalg.solve(np.asarray(h, np.float64), np.asarray(g, np.float64))
+    exact *= np.sqrt(2 * cfg.target_kl / (g @ exact))
+    np.testing.assert_allclose(step, exact, rtol=2e-2, atol=2e-4)
+    np.testing.assert_allclose(step @ h @ step / 2, cfg.target_kl, rtol=1e-2)
+    # less than the model's: it has the damping besides
+    assert 0.1 * cfg.target_kl < metrics["train/kl"] < 1.1 * cfg.target_kl
+
+
+def test_a_trust_region_step_is_the_natural_one_shortened_until_it_holds():
+    long, *_ = natural(natural_gradient, target_kl=0.5, damping=1e-3)
+    step, _, _, metrics, cfg = natural(trust_region, target_kl=0.5, damping=1e-3)
+    assert metrics["train/accepted"] == 1 and metrics["train/objective"] > 0
+    assert metrics["train/kl"] <= cfg.target_kl
+    shrunk = cfg.line_search_shrink ** float(metrics["train/line_search"])
+    np.testing.assert_allclose(step, shrunk * long, rtol=1e-3, atol=1e-5)
+    _, _, _, unsearched, _ = natural(natural_gradient, target_kl=0.5, damping=1e-3)
+    assert (unsearched["train/kl"] > cfg.target_kl) == (metrics["train/line_search"] > 0)

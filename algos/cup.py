@@ -1,0 +1,77 @@
+"""CUP: a PPO step on the reward, then a projection towards lower cost.
+
+    1. theta_1: maximise  E[min(w A_r, clip(w) A_r)]
+    2. theta:   minimise  E[lam (1 - gamma gae) / (1 - gamma) w A_c + KL(pi || pi_1)]
+    minimise_lam  -lam (J_c - cost_limit),  0 <= lam <= lam_max, once an iteration, before both
+
+w = pi(a | s) / pi_old(a | s) with the policy that collected the batch, in both steps.
+
+Source: Yang et al. (2022), "Constrained Update Projection Approach to Safe Policy Optimization",
+arXiv:2209.07089, algorithm 1 and equation 22.
+Differs from it, as OmniSafe does: Adam on lam.
+"""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxsafe.algos import ppo
+from jaxsafe.config import config
+from jaxsafe.gaussian import kl
+from jaxsafe.networks import policy
+from jaxsafe.on_policy import Algorithm, Batch, TrainState, loop
+from jaxsafe.steps import AdamState, adam_epochs
+from jaxsafe.surrogates import clipped, plain
+from jaxsafe.treatments import LagrangianConfig, lagrangian
+from jaxsafe.types import Env, Metrics, PyTree
+
+
+@config
+class CUPConfig(LagrangianConfig, ppo.PPOConfig):
+    target_kl: float = 0.01  # nats, of each step; OmniSafe
+    lam_max: float = 2.0  # OmniSafe
+
+
+PUBLISHED: dict[str, dict[str, Any]] = {
+    name: options | {"dual_lr": 0.035} for name, options in ppo.PUBLISHED.items()
+}
+
+
+def projection(
+    actor: PyTree, batch: Batch, lam: jax.Array | float, cfg: Any
+) -> tuple[jax.Array, Metrics]:
+    """What the second step maximises, with `batch.old` the policy of the first."""
+    dist = policy(actor, batch.obs, cfg)
+    scale = (1 - cfg.cost_discount * cfg.cost_gae_lambda) / (1 - cfg.cost_discount)
+    cost, _ = plain(dist, batch, batch.adv_c, cfg)
+    return -(lam * scale * cost + jnp.mean(kl(dist, batch.old))), {}
+
+
+def make(env: Env, axis_name: str | None = None) -> Algorithm:
+    def improve(ts: TrainState, batch: Batch, cost: jax.Array, length: jax.Array, key: jax.Array):
+        cfg = ts.config
+        dual = lagrangian.update(ts.dual, cost, cfg)
+        keys = jax.random.split(key)
+
+        def earn(actor: PyTree, batch: Batch) -> tuple[jax.Array, Metrics]:
+            return clipped(policy(actor, batch.obs, cfg), batch, batch.adv_r, cfg)
+
+        actor, opt_state, metrics = adam_epochs.update(
+            ts.params["actor"], ts.opt_state["actor"], earn, batch, keys[0], cfg, axis_name
+        )
+        better = dataclasses.replace(batch, old=policy(actor, batch.obs, cfg))
+
+        def project(actor: PyTree, batch: Batch) -> tuple[jax.Array, Metrics]:
+            return projection(actor, batch, dual.lam, cfg)
+
+        again = AdamState(opt_state.adam, ts.opt_state["actor"].iteration)  # the same learning rate
+        actor, opt_state, second = adam_epochs.update(
+            actor, again, project, better, keys[1], cfg, axis_name
+        )
+        metrics |= {f"{name}_projection": x for name, x in second.items()}
+        metrics["train/nonfinite"] += metrics.pop("train/nonfinite_projection")
+        return actor, opt_state, dual, metrics | lagrangian.metrics(dual)
+
+    return loop(env, adam_epochs.init, lagrangian.init, improve, axis_name)

@@ -1,0 +1,62 @@
+"""P3O: PPO with an exact penalty on what the clipped cost surrogate exceeds the limit by.
+
+    maximise_theta  E[min(w A_r, clip(w) A_r)] - kappa max(0, E[max(w A_c, clip(w) A_c)] + c)
+
+c: (J_c - cost_limit) / mean episode length, the violation in cost per step.
+
+Source: Zhang et al. (2022), "Penalized Proximal Policy Optimization for Safe Reinforcement Learning",
+arXiv:2205.11814, equation 13.
+Differs from it: c, which there is (1 - gamma) times the discounted violation, another mean per step.
+OmniSafe takes c per episode and does not clip the cost's surrogate.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxsafe.algos import ppo
+from jaxsafe.batch import pmean
+from jaxsafe.config import config
+from jaxsafe.on_policy import Algorithm, on_policy_pair
+from jaxsafe.steps import Objective, Step, adam_epochs
+from jaxsafe.surrogates import clipped, pessimistic
+from jaxsafe.types import Env, Metrics, PyTree
+
+
+@config
+class P3OConfig(ppo.PPOConfig):
+    kappa: float = 20.0  # reward advantages, of standard deviation 1, per unit of cost; OmniSafe
+
+
+PUBLISHED: dict[str, dict[str, Any]] = {
+    name: options | {"epochs": 10, "critic_epochs": 10} for name, options in ppo.PUBLISHED.items()
+}
+
+
+def update(
+    actor: PyTree,
+    opt_state: PyTree,
+    objective_r: Objective,
+    objective_c: Objective,
+    excess: jax.Array,
+    length: jax.Array,
+    batch: Any,
+    key: jax.Array,
+    cfg: Any,
+    axis_name: str | None,
+) -> tuple[PyTree, PyTree, Metrics]:
+    def objective(actor: PyTree, batch: Any) -> tuple[jax.Array, Metrics]:
+        reward, metrics = objective_r(actor, batch)
+        cost, _ = objective_c(actor, batch)
+        # max(0, x) of the mean over all devices, as a factor: its gradient is this device's share
+        beyond = jax.lax.stop_gradient(pmean(cost, axis_name) + excess / length)
+        penalty = cfg.kappa * jnp.where(beyond > 0, cost + excess / length, 0.0)
+        return reward - penalty, metrics | {"train/penalty": penalty}
+
+    return adam_epochs.update(actor, opt_state, objective, batch, key, cfg, axis_name)
+
+
+def make(env: Env, axis_name: str | None = None) -> Algorithm:
+    step = Step(adam_epochs.init, update)
+    return on_policy_pair(env, clipped, step, axis_name, surrogate_c=pessimistic)

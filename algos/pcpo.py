@@ -1,0 +1,49 @@
+"""PCPO: a trust-region step on the reward, then a projection onto the linearised constraint.
+
+    x = sqrt(2 delta / q) H^-1 g - max(0, (sqrt(2 delta / q) r + c) / s) H^-1 b
+
+g, b, H, q, r, s, c as in CPO; the projection is in the metric of H, the KL's.
+
+Source: Yang et al. (2020), "Projection-based Constrained Policy Optimization", arXiv:2010.03152,
+equation 9.
+Differs from it, as CPO does: c, and the line search, which keeps the step within delta (the paper
+has none; OmniSafe has CPO's, and x without H^-1 in the first term).
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxsafe.algos import cpo
+from jaxsafe.config import config
+from jaxsafe.on_policy import Algorithm, on_policy_pair
+from jaxsafe.surrogates import plain
+from jaxsafe.types import Env
+
+
+@config
+class PCPOConfig(cpo.CPOConfig):
+    line_search_tries: int = 200  # OmniSafe
+
+
+PUBLISHED: dict[str, dict[str, Any]] = cpo.PUBLISHED
+
+
+def projection(
+    h_g: jax.Array,
+    h_b: jax.Array,
+    q: jax.Array,
+    r: jax.Array,
+    s: jax.Array,
+    c: jax.Array,
+    delta: jax.Array,
+) -> cpo.Direction:
+    """The reward's step, moved back along H^-1 b to where b'x + c = 0, if it lies beyond."""
+    scale = jnp.sqrt(2 * delta / jnp.maximum(q, 1e-20))
+    back = jnp.maximum(0.0, (scale * r + c) / jnp.maximum(s, 1e-20))
+    return cpo.Direction(scale * h_g - back * h_b, jnp.bool_(False), {"train/nu": back})
+
+
+def make(env: Env, axis_name: str | None = None) -> Algorithm:
+    return on_policy_pair(env, plain, cpo.step_by(projection), axis_name)

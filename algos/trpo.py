@@ -1,0 +1,44 @@
+"""TRPO: trust-region policy optimisation, blind to cost.
+
+    maximise_theta  E[w A]   subject to   KL(old || new) <= delta
+
+Source: Schulman et al. (2015), "Trust Region Policy Optimization", arXiv:1502.05477.
+"""
+
+from typing import Any
+
+from jaxsafe.config import config
+from jaxsafe.on_policy import Algorithm, OnPolicyConfig, on_policy
+from jaxsafe.surrogates import plain
+from jaxsafe.treatments import none
+from jaxsafe.trust_region import trust_region
+from jaxsafe.types import Env
+
+
+@config
+class TRPOConfig(OnPolicyConfig):
+    target_kl: float = 0.02  # delta, nats; OmniSafe's 0.01 is of a mean over (2) action dimensions
+    damping: float = 0.1  # added to the Fisher matrix; OmniSafe, safety-starter-agents
+    cg_iterations: int = 15  # OmniSafe
+    line_search_tries: int = 15  # OmniSafe
+    line_search_shrink: float = 0.8  # OmniSafe, safety-starter-agents
+
+
+# OmniSafe @15603dd, configs/on-policy/TRPO.yaml. Its minibatches of 128 do not divide 20 * 1000
+# steps: these are of 125.
+PUBLISHED: dict[str, dict[str, Any]] = {
+    "omnisafe": {
+        "num_envs": 20,
+        "horizon": 1000,
+        "stagger": False,
+        "init": "torch",
+        "init_log_std": 0.0,
+        "critic_epochs": 10,
+        "minibatches": 160,
+        "critic_lr": 1e-3,
+    }
+}
+
+
+def make(env: Env, axis_name: str | None = None) -> Algorithm:
+    return on_policy(env, none, plain, trust_region, axis_name)
