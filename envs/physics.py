@@ -224,8 +224,14 @@ def readings(
             return jnp.zeros((0,))
         return source[name] if isinstance(source, dict) else getattr(source, name)
 
-    poses = (pose(name) for name in ("geom_xpos", "geom_xmat", "xquat"))
-    return Readings(sensors, contacts, *poses, jnp.zeros(()) if overflow is None else overflow)
+    return Readings(
+        sensors,
+        contacts,
+        pose("geom_xpos"),
+        pose("geom_xmat"),
+        pose("xquat"),
+        jnp.zeros(()) if overflow is None else overflow,
+    )
 
 
 # MJX -----------------------------------------------------------------------------------------------

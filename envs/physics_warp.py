@@ -6,6 +6,9 @@ one row out. Sensors are read in the last forward pass alone.
 
 Imported by the engine itself only: it needs Warp.
 """
+# Kernels are Warp's language in Python's syntax, which no type checker of Python knows:
+# pyright: reportIndexIssue=false, reportAssignmentType=false, reportGeneralTypeIssues=false
+# pyright: reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false
 
 import dataclasses
 from collections.abc import Callable
