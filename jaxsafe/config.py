@@ -5,6 +5,7 @@ import difflib
 import math
 import types
 import typing
+from collections import Counter
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
@@ -34,8 +35,16 @@ def config(cls: type[T]) -> type[T]:
 def nearest(name: str, names: typing.Iterable[str]) -> str:
     """'; did you mean X?' for the closest of `names`, or the list of them if none is close."""
     names = sorted(names)
-    close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
-    return f"; did you mean {close[0]!r}?" if close else f"; valid: {', '.join(names)}"
+    close = difflib.get_close_matches(name, names, n=3, cutoff=0.5)
+    if not close:
+        return f"; valid: {', '.join(names)}"
+
+    def likeness(candidate: str) -> tuple[float, int, int]:
+        ratio = difflib.SequenceMatcher(None, candidate, name).ratio()
+        shared = Counter(candidate) & Counter(name)  # of equal ratios, letters swapped come first
+        return ratio, shared.total(), -len(candidate)
+
+    return f"; did you mean {max(close, key=likeness)!r}?"
 
 
 def from_dict(cls: type[T], values: dict[str, Any], where: str = "") -> T:
