@@ -1,14 +1,15 @@
 """CUP: a PPO step on the reward, then a projection towards lower cost.
 
     1. theta_1: maximise  E[min(w A_r, clip(w) A_r)]
-    2. theta:   minimise  E[lam (1 - gamma gae) / (1 - gamma) w A_c + KL(pi || pi_1)]
+    2. theta:   minimise  E[lam (1 - gamma gae_lambda) / (1 - gamma) w A_c + KL(pi || pi_1)]
     minimise_lam  -lam (J_c - cost_limit),  0 <= lam <= lam_max, once an iteration, before both
 
-w = pi(a | s) / pi_old(a | s) with the policy that collected the batch, in both steps.
+w = pi(a | s) / pi_old(a | s) with the policy that collected the batch, in both steps; gamma and
+gae_lambda are `cost_discount` and `cost_gae_lambda`.
 
 Source: Yang et al. (2022), "Constrained Update Projection Approach to Safe Policy Optimization",
 arXiv:2209.07089, algorithm 1 and equation 22.
-Differs from it, as OmniSafe does: Adam on lam.
+Differs from it, as OmniSafe does: Adam on lam; A_c is centred; each step stops at target_kl.
 """
 
 import dataclasses

@@ -17,7 +17,7 @@ from jaxsafe.algos import pg
 from jaxsafe.config import config
 from jaxsafe.on_policy import Algorithm, on_policy
 from jaxsafe.steps import adam_epochs
-from jaxsafe.surrogates import near
+from jaxsafe.surrogates import near_old
 from jaxsafe.treatments import LagrangianConfig, lagrangian
 from jaxsafe.types import Env
 
@@ -36,4 +36,4 @@ PUBLISHED: dict[str, dict[str, Any]] = {
 
 
 def make(env: Env, axis_name: str | None = None) -> Algorithm:
-    return on_policy(env, lagrangian, near, adam_epochs, axis_name)
+    return on_policy(env, lagrangian, near_old, adam_epochs, axis_name)

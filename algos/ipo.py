@@ -5,7 +5,8 @@
 
 Source: Liu, Ding and Liu (2020), "IPO: Interior-point Policy Optimization under Constraints",
 arXiv:1910.09615.
-Differs from it, as OmniSafe does: the barrier enters by its gradient at the present policy.
+Differs from it, as OmniSafe does: the barrier enters by its gradient at the present policy. OmniSafe
+also normalises rewards and costs, which is not done here.
 """
 
 from typing import Any
@@ -21,8 +22,8 @@ from jaxsafe.types import Env
 
 @config
 class IPOConfig(ppo.PPOConfig):
-    barrier: float = 0.01  # 1 / t of the paper, reward per log of cost; OmniSafe
-    price_max: float = 1.0  # reward per unit of cost; OmniSafe
+    barrier: float = 0.01  # 1 / t of the paper; OmniSafe
+    price_max: float = 1.0  # standard deviations of A_r per unit of cost; OmniSafe
 
 
 PUBLISHED: dict[str, dict[str, Any]] = {

@@ -6,8 +6,8 @@ g, b, H, q, r, s, c as in CPO; the projection is in the metric of H, the KL's.
 
 Source: Yang et al. (2020), "Projection-based Constrained Policy Optimization", arXiv:2010.03152,
 equation 9.
-Differs from it, as CPO does: c, and the line search, which keeps the step within delta (the paper
-has none; OmniSafe has CPO's, and x without H^-1 in the first term).
+Differs from it, as CPO does: c with its margin, and the line search, which keeps the step within
+delta (the paper has none; OmniSafe has CPO's, and x without H^-1 in the first term).
 """
 
 from typing import Any

@@ -4,9 +4,9 @@
     minimise_lam    -lam (J_c - cost_limit),  lam >= 0, by Adam, once an iteration, before the policy
 
 Source: Chow et al. (2018), "Risk-Constrained Reinforcement Learning with Percentile Risk Criteria",
-arXiv:1512.01629, whose constraint on the mean this is.
-Differs from it: the constraint is on the expected cost, not on a percentile of it, as in OmniSafe;
-which normalises rewards and costs, too, where advantages alone are scaled here.
+arXiv:1512.01629.
+Differs from it, as OmniSafe does: the constraint is on the expected cost, where the paper's is on its
+CVaR or on a chance. OmniSafe also normalises rewards and costs, which is not done here.
 """
 
 from typing import Any

@@ -5,8 +5,9 @@
 
 Source: Ray, Achiam and Amodei (2019), "Benchmarking Safe Exploration in Deep Reinforcement
 Learning"; the 1 / (1 + lam) scale is from the authors' code.
-Differs from it, as OmniSafe does: there only the reward term is clipped, and Adam moves a softplus
-of lam. J_c is of this batch (`returns.mean_length`), where OmniSafe has the last 100 episodes.
+In the authors' code only the reward term is clipped, and Adam moves a softplus of lam; here, as in
+OmniSafe, both terms are clipped, and Adam moves lam. J_c is of this batch (`returns.mean_length`),
+where OmniSafe has the last 100 episodes.
 """
 
 from typing import Any

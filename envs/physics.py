@@ -55,7 +55,7 @@ class Readings:
     geom_xpos: jax.Array  # [ngeom, 3]
     geom_xmat: jax.Array  # [ngeom, 3, 3]
     xquat: jax.Array  # [nbody, 4]
-    overflow: jax.Array  # float [], 1 where contacts or constraint rows found no room
+    overflow: jax.Array  # float [], 1 where this world's rows or the batch's contacts found no room
 
 
 Run = Callable[[Physics, jax.Array, jax.Array], tuple[Physics, Readings]]

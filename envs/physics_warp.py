@@ -59,7 +59,8 @@ def plane_capsule(
     return wp.vec2(dist1, dist2), at, frame
 
 
-collision_primitive.plane_capsule = plane_capsule  # before Warp compiles the kernels that name it
+# Before Warp compiles the kernels that name it; for all users of these kernels in the process.
+collision_primitive.plane_capsule = plane_capsule
 
 
 @wp.kernel
@@ -89,10 +90,23 @@ def hold(substeps: wp.array2d[float], k: int, before: wp.array2d[float], after: 
 
 
 @wp.kernel
-def flag(overflow: wp.array[int], mask: int, out: wp.array2d[float]):
-    """1 where a bit of `mask` is set."""
+def flag(
+    overflow: wp.array[int],
+    mask: int,
+    nacon: wp.array[int],
+    ncollision: wp.array[int],
+    contacts: int,
+    nefc: wp.array[int],
+    rows: int,
+    out: wp.array2d[float],
+):
+    """1 where a substep set a bit of `mask`, or the last forward pass, which sets none, had no room."""
     world = wp.tid()
-    out[world, 0] = wp.where((overflow[world] & mask) != 0, 1.0, 0.0)
+    full = (overflow[world] & mask) != 0 or nefc[world] > rows
+    if full or nacon[0] > contacts or ncollision[0] > contacts:
+        out[world, 0] = 1.0
+    else:
+        out[world, 0] = 0.0
 
 
 Kind = mujoco_warp.OverflowType
@@ -120,7 +134,7 @@ def columns(packed: Any, sizes: dict[str, int]) -> dict[str, Any]:
 
 
 def floats(x: wp.array) -> wp.array:
-    """`x` [worlds, n] of floats, vectors or matrices as floats [worlds, m]."""
+    """A view of `x` [worlds, n], of floats, vectors or matrices, as floats [worlds, m]."""
     width = x.size * wp.types.type_size(x.dtype) // x.shape[0]
     return wp.array(ptr=x.ptr, dtype=float, shape=(x.shape[0], width), device=x.device)
 
@@ -144,6 +158,7 @@ def warp_engine(
     """For a scene: maker(substeps, alike) -> a function of packed rows, [worlds, in] -> [worlds, out].
 
     Where not all worlds take all `substeps` (`alike` is false), the column 'substeps' says how many.
+    The working data of every batch size that was ever stepped is kept.
 
     Args:
         outputs: poses to return, of 'geom_xpos', 'geom_xmat', 'xquat'.
@@ -156,7 +171,7 @@ def warp_engine(
 
     def prepare(worlds: int) -> Worlds:
         m = mujoco_warp.put_model(model)
-        m.opt.warn_overflow = 0  # returned instead, world by world
+        m.opt.warn_overflow = 0  # returned instead
         sensors_off = m.opt.disableflags | mujoco.mjtDisableBit.mjDSBL_SENSOR.value
         return Worlds(
             model=m,
@@ -200,7 +215,20 @@ def warp_engine(
                     wp.launch(hold, new.shape, inputs=[given["substeps"], k, old], outputs=[new])
             mujoco_warp.forward(w.model, data)
             full = wanted.pop("overflow")
-            wp.launch(flag, data.nworld, inputs=[data.overflow, NO_ROOM], outputs=[full])
+            wp.launch(
+                flag,
+                data.nworld,
+                inputs=[
+                    data.overflow,
+                    NO_ROOM,
+                    data.nacon,
+                    data.ncollision,
+                    data.naconmax,
+                    data.nefc,
+                    data.njmax,
+                ],
+                outputs=[full],
+            )
             for name, column in wanted.items():
                 wp.copy(column, floats(getattr(data, name)))
 

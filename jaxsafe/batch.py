@@ -7,7 +7,8 @@ from jaxsafe.types import PyTree
 
 
 def pmean(tree: PyTree, axis_name: str | None) -> PyTree:
-    """The mean over devices of every leaf. Gradients pass through here, losses never do."""
+    """The mean over devices of every leaf. Differentiate this device's share first, then call this:
+    its own derivative is not that of a mean over devices under `shard_map(check_vma=False)`."""
     return tree if axis_name is None else jax.lax.pmean(tree, axis_name)
 
 

@@ -131,8 +131,8 @@ def on_policy_pair(
     axis_name: str | None = None,
     surrogate_c: Callable | None = None,
 ) -> Algorithm:
-    """Algorithms whose step weighs reward against cost itself, so that it takes two objectives, both
-    by `surrogate` if the cost's has no own.
+    """Algorithms whose step weighs reward against cost itself, so that it takes two objectives:
+    `surrogate` of the reward's advantage, and `surrogate_c` (or the same) of the cost's.
 
     update(actor, opt_state, objective_r, objective_c, excess, length, batch, key, cfg, axis_name),
     where excess = J_c - cost_limit, in cost per episode, and length is the mean episode's in steps:

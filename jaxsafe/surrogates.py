@@ -40,14 +40,15 @@ def pessimistic(
     return -low, metrics
 
 
-def near(dist: Gaussian, batch: Any, advantage: jax.Array, cfg: Any) -> tuple[jax.Array, Metrics]:
+def near_old(dist: Gaussian, batch: Any, advantage: jax.Array, cfg: Any) -> tuple[jax.Array, Metrics]:
     """E[1{KL <= eta} (w A / temperature - KL)], with the KL of each state.
 
     Source: Zhang, Vuong and Ross (2020), "First Order Constrained Optimization in Policy Space",
     arXiv:2002.06506, equation 11; the KL is KL(new || old).
     """
-    w = jnp.exp(log_prob(dist, batch.action) - batch.log_prob)
     divergence = kl(dist, batch.old)
-    inside = jax.lax.stop_gradient(divergence <= cfg.near_kl)
+    inside = divergence <= cfg.near_kl
+    # outside, w may overflow, and 0 times its gradient would be NaN
+    w = jnp.exp(jnp.where(inside, log_prob(dist, batch.action) - batch.log_prob, 0.0))
     gain = w * advantage / cfg.temperature - divergence
-    return jnp.mean(inside * gain), {"train/inside": jnp.mean(inside)}
+    return jnp.mean(jnp.where(inside, gain, 0.0)), {"train/inside": jnp.mean(inside)}

@@ -39,7 +39,7 @@ class LagrangianConfig:
 
 
 class Multiplier(NamedTuple):
-    lam: jax.Array  # float [], reward per unit of cost, >= 0
+    lam: jax.Array  # float [], standard deviations of A_r per unit of cost, >= 0
     opt_state: PyTree
 
 
@@ -76,9 +76,9 @@ class PIDConfig:
 
 
 class PID(NamedTuple):
-    """What the controller remembers: costs per episode, but lam."""
+    """What the controller remembers: lam and integral are prices, the others costs per episode."""
 
-    lam: jax.Array  # float [], reward per unit of cost, >= 0
+    lam: jax.Array  # float [], standard deviations of A_r per unit of cost, >= 0
     integral: jax.Array  # float [], K_i times the sum of errors, >= 0
     error: jax.Array  # float [], smoothed J_c - cost_limit
     cost: jax.Array  # float [], smoothed J_c
@@ -138,7 +138,7 @@ penalty = Treatment(
 # Guarantee", arXiv:2011.05869, algorithm 1
 switch = Treatment(
     init=lambda cfg: jnp.bool_(False),
-    update=lambda over, episode_cost, cfg: episode_cost > cfg.cost_limit + cfg.tolerance,
-    advantage=lambda over, adv_r, adv_c: jnp.where(over, -adv_c, adv_r),
-    metrics=lambda over: {"train/over": over},
+    update=lambda over_limit, episode_cost, cfg: episode_cost > cfg.cost_limit + cfg.tolerance,
+    advantage=lambda over_limit, adv_r, adv_c: jnp.where(over_limit, -adv_c, adv_r),
+    metrics=lambda over_limit: {"train/over_limit": over_limit},
 )

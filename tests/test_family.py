@@ -12,7 +12,7 @@ from jaxsafe.gaussian import Gaussian, kl, log_prob, sample
 from jaxsafe.networks import init_params, policy
 from jaxsafe.on_policy import Batch
 from jaxsafe.steps import adam_epochs
-from jaxsafe.surrogates import clipped, near, pessimistic
+from jaxsafe.surrogates import clipped, near_old, pessimistic
 
 
 def batch_of(old, action, adv):
@@ -28,17 +28,28 @@ def test_focops_weighs_states_by_their_own_kl():
     old, new = gaussian([0.0, 0.0, 0.0]), gaussian([0.0, 0.1, 1.0])  # KL 0, 0.005, 0.5
     action, adv = jnp.array([[0.3], [0.5], [0.7]]), jnp.array([1.0, 2.0, 4.0])
     cfg = focops.FOCOPSConfig(temperature=2.0, near_kl=0.02)
-    value, metrics = near(new, batch_of(old, action, adv), adv, cfg)
+    value, metrics = near_old(new, batch_of(old, action, adv), adv, cfg)
     w = np.exp(0.5 * 0.1 - 0.1**2 / 2)
     np.testing.assert_allclose(value, (1 / 2 + (2 * w / 2 - 0.005) + 0) / 3, rtol=1e-5)
     np.testing.assert_allclose(metrics["train/inside"], 2 / 3, rtol=1e-6)
+
+
+def test_focops_has_a_gradient_where_a_state_is_far_off():
+    old, action, adv = gaussian([0.0, 0.0]), jnp.array([[0.3], [60.0]]), jnp.array([1.0, 1.0])
+    cfg = focops.FOCOPSConfig()
+
+    def value(mean):
+        return near_old(gaussian(mean), batch_of(old, action, adv), adv, cfg)[0]
+
+    slope = jax.grad(value)(jnp.array([0.0, 50.0]))  # there w is e^1750
+    np.testing.assert_allclose(slope, [0.3 / cfg.temperature / 2, 0.0], rtol=1e-5)
 
 
 def test_focops_kl_is_from_the_new_policy_to_the_old():
     old = Gaussian(jnp.zeros((1, 1)), jnp.zeros((1, 1)))
     new = Gaussian(jnp.zeros((1, 1)), jnp.full((1, 1), 0.1))
     cfg = focops.FOCOPSConfig(temperature=1e9, near_kl=1.0)
-    value, _ = near(new, batch_of(old, jnp.zeros((1, 1)), jnp.zeros(1)), jnp.zeros(1), cfg)
+    value, _ = near_old(new, batch_of(old, jnp.zeros((1, 1)), jnp.zeros(1)), jnp.zeros(1), cfg)
     np.testing.assert_allclose(-value, np.exp(0.2) / 2 - 0.5 - 0.1, rtol=1e-3)
 
 

@@ -1,4 +1,4 @@
-"""Draw the curves and print the table of these runs: python docs/results/make.py
+"""Draw the curves and print the numbers of these runs: python docs/results/make.py
 
 Each folder holds the metrics of one command (versions.json has it), compressed.
 """
@@ -17,7 +17,7 @@ from jaxsafe.evaluation import estimate
 HERE = Path(__file__).parent
 LIMIT = 25.0
 # Return and cost, mean and spread. OmniSafe: benchmarks/on-policy, Table 2, 1e7 steps, evaluated
-# policies. Safety Gym: unconstrained PPO, 1e7 steps; nobody has published a constrained figure.
+# policies. Safety Gym: unconstrained PPO, 1e7 steps; we know of no constrained table.
 PUBLISHED = {
     "point_goal1-ppo_lag": "OmniSafe 12.96 ± 6.95, cost 25.80 ± 34.99",
     "point_goal1-cpo": "OmniSafe 20.46 ± 1.38, cost 28.84 ± 7.76",
