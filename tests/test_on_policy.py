@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from tasks import FAST
 from toys import Clock, Corridor, Lever
 
 from jaxsafe.algos import ALGOS
@@ -22,7 +23,7 @@ TINY: dict[str, Any] = {"num_envs": 8, "horizon": 25, "minibatches": 2, "hidden"
 @cache
 def build(name, env=Corridor()):  # noqa: B008
     algo = ALGOS[name].make(env)
-    return algo, jax.jit(algo.update)
+    return algo, jax.jit(algo.update, compiler_options=FAST)
 
 
 def start(name, seed=0, **settings):
@@ -70,34 +71,25 @@ def test_the_same_key_gives_the_same_run(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_seed_among_others_is_the_lone_seed(name):
-    init = build(name)[0].init
-    cfg = ALGOS[name].config(**TINY)
-    keys = jnp.stack([jax.random.key(i) for i in range(3)])
-    together = jax.vmap(lambda key: init(key, cfg))(keys)
-    update = jax.jit(jax.vmap(build(name)[0].update))
-    lone = [start(name, seed=i) for i in range(3)]
-    for _ in range(2):
-        together, metrics = update(together)
-        for i in range(3):
-            lone[i], alone = build(name)[1](lone[i])
-            # sums are ordered differently, and what decides by a threshold may amplify that
-            assert_close(row(metrics, i)["train/cost_rate"], alone["train/cost_rate"], rtol=1e-5)
-            assert_close(row(together.params, i), lone[i].params, rtol=1e-4, atol=1e-5)
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_cost_limits_side_by_side_are_the_lone_ones(name):
+def test_seeds_and_cost_limits_side_by_side_are_the_lone_ones(name):
     algo, update = build(name)
     cfg = ALGOS[name].config(**TINY)
 
-    def init(limit):
-        return algo.init(jax.random.key(0), dataclasses.replace(cfg, cost_limit=limit))
+    def init(key, limit):
+        return algo.init(key, dataclasses.replace(cfg, cost_limit=limit))
 
-    limits = jnp.array([0.0, 25.0])
-    after, _ = jax.jit(jax.vmap(algo.update))(jax.vmap(init)(limits))
-    for i, limit in enumerate(limits):
-        assert_close(row(after.params, i), update(init(limit))[0].params, rtol=1e-4, atol=1e-5)
+    keys, limits = jnp.stack([jax.random.key(i) for i in range(3)]), jnp.array([25.0, 1.0, 5.0])
+    together = jax.vmap(init)(keys, limits)
+    lone = [init(*pair) for pair in zip(keys, limits, strict=True)]
+    vmapped = jax.jit(jax.vmap(algo.update), compiler_options=FAST)
+    # sums are ordered differently, and unfinished conjugate gradients amplify that a hundredfold
+    for tolerance in (1e-6, 1e-4):
+        together, metrics = vmapped(together)
+        for i in range(3):
+            lone[i], alone = update(lone[i])
+            assert_close(row(metrics, i)["train/cost_rate"], alone["train/cost_rate"], rtol=1e-5)
+            assert_close(row(together.params, i), lone[i].params, rtol=tolerance, atol=tolerance)
+    assert together.config.cost_limit.tolist() == limits.tolist()
 
 
 @pytest.mark.parametrize("name", NAMES)
