@@ -12,6 +12,7 @@ import importlib.util
 import math
 import threading
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import flax.struct
@@ -72,10 +73,10 @@ def default_engine() -> str:
     platform = jax.default_backend()
     if platform == "cpu":
         return "c"
-    return "warp" if platform in ("gpu", "cuda") and mjx_warp_available() else "jax"
+    return "warp" if platform in ("gpu", "cuda") and warp_available() else "jax"
 
 
-def mjx_warp_available() -> bool:
+def warp_available() -> bool:
     return importlib.util.find_spec("warp") is not None
 
 
@@ -115,6 +116,59 @@ def mocap_at(base: Any, orbit: np.ndarray, time: Any, xp: Any) -> Any:
     return base + orbit[:, None] * circle[..., None, :]
 
 
+# A world as one row of floats, for the engines whose working data lies outside JAX -----------------
+
+STATE = ("qpos", "qvel", "qacc_warmstart")
+
+
+def widths(model: mujoco.MjModel, outputs: tuple[str, ...]) -> tuple[dict[str, int], dict[str, int]]:
+    """The columns of a row that goes in (`pack`) and of one that comes out (`unpack`)."""
+    state = dict(zip(STATE, (model.nq, model.nv, model.nv), strict=True))
+    mocap = {"mocap_pos": 3 * model.nmocap, "mocap_quat": 4 * model.nmocap}
+    poses = {"geom_xpos": 3 * model.ngeom, "geom_xmat": 9 * model.ngeom, "xquat": 4 * model.nbody}
+    into = state | mocap | {"ctrl": model.nu, "done": 1, "substeps": 1}
+    out = state | {"sensordata": model.nsensordata} | {name: poses[name] for name in outputs}
+    return into, out
+
+
+def columns(sizes: dict[str, int]) -> dict[str, slice]:
+    """Where in a row each part lies."""
+    ends = dict(zip(sizes, np.cumsum(list(sizes.values())).tolist(), strict=True))
+    return {name: slice(ends[name] - n, ends[name]) for name, n in sizes.items()}
+
+
+def pack(physics: Physics, ctrl: jax.Array, substeps: jax.Array) -> jax.Array:
+    arrays = (physics.qpos, physics.qvel, physics.warmstart, physics.mocap_pos)
+    arrays += (physics.mocap_quat, ctrl, physics.substeps, substeps)
+    return jnp.concatenate([jnp.ravel(x).astype(jnp.float32) for x in arrays])
+
+
+def unpack(
+    row: jax.Array, sizes: dict[str, int], scene: Scene, physics: Physics, substeps: jax.Array
+) -> tuple[Physics, Readings]:
+    """What `substeps` made of `physics`, from the row that came out."""
+    parts = {name: row[where] for name, where in columns(sizes).items()}
+    sensors = parts["sensordata"]
+
+    def pose(name: str, *shape: int) -> jax.Array:
+        return parts[name].reshape(-1, *shape) if name in parts else jnp.zeros((0,))
+
+    physics = physics.replace(
+        qpos=parts["qpos"],
+        qvel=parts["qvel"],
+        warmstart=parts["qacc_warmstart"],
+        substeps=physics.substeps + substeps,
+    )
+    return physics, Readings(
+        sensors=sensors,
+        contacts=sensors[scene.model.nsensordata - scene.contact_count :],
+        geom_xpos=pose("geom_xpos", 3),
+        geom_xmat=pose("geom_xmat", 3, 3),
+        xquat=pose("xquat", 4),
+        overflow=parts["overflow"][0] if "overflow" in parts else jnp.zeros(()),
+    )
+
+
 # MuJoCo in C ---------------------------------------------------------------------------------------
 
 
@@ -122,45 +176,31 @@ def c_engine(scene: Scene, outputs: tuple[str, ...]) -> Run:
     """MuJoCo's thread pool. State crosses as float32; inside, all is float64 as in the original."""
     model = scene.model
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET.value  # bad states are ours to end
-    shapes = {
-        "qpos": (model.nq,),
-        "qvel": (model.nv,),
-        "qacc_warmstart": (model.nv,),
-        "sensordata": (model.nsensordata,),
-        "geom_xpos": (model.ngeom, 3),
-        "geom_xmat": (model.ngeom, 3, 3),
-        "xquat": (model.nbody, 4),
-    }
-    inputs = [model.nq, model.nv, model.nv, 3 * model.nmocap, 4 * model.nmocap, model.nu, 1, 1]
-    fields = ("qpos", "qvel", "qacc_warmstart", "sensordata", *outputs)
-    sizes = [int(np.prod(shapes[f])) for f in fields]
+    inputs, results = widths(model, outputs)
     batches: dict[int, mujoco.batch.Batch] = {}
     lock = threading.Lock()
     sensors_off = mujoco.mjtDisableBit.mjDSBL_SENSOR.value  # nothing reads them between substeps
 
     def host(packed: np.ndarray) -> np.ndarray:
-        """One row a simulation, [..., sum(inputs)] -> [..., sum(sizes)], both float32."""
-        rows = np.asarray(packed, np.float64).reshape(-1, sum(inputs))
+        """One row a simulation, [..., in] -> [..., out], both float32."""
+        rows = np.asarray(packed, np.float64).reshape(-1, packed.shape[-1])
         with lock:
             if len(rows) not in batches:
                 batches[len(rows)] = mujoco.batch.Batch(model, len(rows))
-                for field in fields:  # outputs are filled only by calls made after they are bound
+                for field in results:  # they are filled only by calls made after they are bound
                     batches[len(rows)].bind(field)
             out = advance(batches[len(rows)], rows)
-        return out.reshape(*packed.shape[:-1], sum(sizes))
+        return out.reshape(*packed.shape[:-1], -1)
 
     def advance(batch: mujoco.batch.Batch, rows: np.ndarray) -> np.ndarray:
-        columns = np.split(rows, np.cumsum(inputs)[:-1], axis=1)
-        qpos, qvel, warmstart, mocap_pos, mocap_quat, ctrl, done, substeps = columns
-        mocap_pos = mocap_pos.reshape(len(rows), model.nmocap, 3)
-        batch.bind("qpos")[:], batch.bind("qvel")[:] = qpos, qvel
-        batch.bind("qacc_warmstart")[:], batch.bind("ctrl")[:] = warmstart, ctrl
-        time = done[:, 0] * model.opt.timestep
+        given = {name: rows[:, where] for name, where in columns(inputs).items()}
+        time = given.pop("done")[:, 0] * model.opt.timestep
+        count = given.pop("substeps")[:, 0].astype(int)
+        for field, column in given.items():
+            if column.size:
+                batch.bind(field)[:] = column.reshape(batch.bind(field).shape)
         batch.bind("time")[:] = time
-        if model.nmocap:
-            batch.bind("mocap_pos")[:] = mocap_pos
-            batch.bind("mocap_quat")[:] = mocap_quat.reshape(len(rows), model.nmocap, 4)
-        count = substeps[:, 0].astype(int)
+        mocap_pos = given["mocap_pos"].reshape(len(rows), model.nmocap, 3)
         failed = np.zeros(len(rows), bool)
         acc = mujoco.mjtStage.mjSTAGE_ACC.value
 
@@ -186,101 +226,19 @@ def c_engine(scene: Scene, outputs: tuple[str, ...]) -> Run:
                 call(batch.step, ids=np.flatnonzero(k < count))
         flags[:] = model.opt.disableflags
         call(batch.forward, stage=acc)
-        out = np.concatenate([batch.bind(f).reshape(len(rows), -1) for f in fields], axis=1)
+        out = np.concatenate([batch.bind(f).reshape(len(rows), -1) for f in results], axis=1)
         out[failed] = np.nan  # the environment ends the episode of a world that is not finite
         return out.astype(np.float32)
 
     def run(physics: Physics, ctrl: jax.Array, substeps: jax.Array) -> tuple[Physics, Readings]:
-        arrays = [physics.qpos, physics.qvel, physics.warmstart, physics.mocap_pos, physics.mocap_quat]
-        arrays += [ctrl, physics.substeps, substeps]
-        packed = jnp.concatenate([jnp.ravel(x).astype(jnp.float32) for x in arrays])
-        shape = jax.ShapeDtypeStruct((sum(sizes),), jnp.float32)
-        out = jax.pure_callback(host, shape, packed, vmap_method="broadcast_all")
-        parts = dict(zip(fields, jnp.split(out, np.cumsum(sizes)[:-1]), strict=True))
-        parts = {f: x.reshape(shapes[f]) for f, x in parts.items()}
-        physics = physics.replace(
-            qpos=parts["qpos"],
-            qvel=parts["qvel"],
-            warmstart=parts["qacc_warmstart"],
-            substeps=physics.substeps + substeps,
-        )
-        sensors = parts["sensordata"]
-        return physics, readings(
-            sensors, sensors[model.nsensordata - scene.contact_count :], parts, outputs
-        )
+        shape = jax.ShapeDtypeStruct((sum(results.values()),), jnp.float32)
+        row = jax.pure_callback(host, shape, pack(physics, ctrl, substeps), vmap_method="broadcast_all")
+        return unpack(row, results, scene, physics, substeps)
 
     return run
 
 
-def readings(
-    sensors: jax.Array,
-    contacts: jax.Array,
-    source: Any,
-    outputs: tuple[str, ...],
-    overflow: jax.Array | None = None,
-) -> Readings:
-    def pose(name: str) -> Any:
-        if name not in outputs:
-            return jnp.zeros((0,))
-        return source[name] if isinstance(source, dict) else getattr(source, name)
-
-    return Readings(
-        sensors,
-        contacts,
-        pose("geom_xpos"),
-        pose("geom_xmat"),
-        pose("xquat"),
-        jnp.zeros(()) if overflow is None else overflow,
-    )
-
-
-# MJX -----------------------------------------------------------------------------------------------
-
-
-def substep_loop(
-    scene: Scene,
-    model: "mjx.Model",
-    data: "mjx.Data",
-    physics: Physics,
-    ctrl: jax.Array,
-    substeps: jax.Array,
-    max_substeps: int,
-) -> "tuple[Physics, mjx.Data]":
-    """`substeps` calls of `mjx.step` and one of `mjx.forward`, for one world."""
-    from mujoco import mjx
-
-    timestep = scene.model.opt.timestep
-    data = data.replace(
-        qpos=physics.qpos,
-        qvel=physics.qvel,
-        qacc_warmstart=physics.warmstart,
-        ctrl=ctrl,
-        mocap_pos=physics.mocap_pos,
-        mocap_quat=physics.mocap_quat,
-    )
-
-    def substep(data: "mjx.Data", k: jax.Array) -> "tuple[mjx.Data, None]":
-        moving = data
-        if scene.orbit.any():
-            time = (physics.substeps + k) * timestep
-            moving = data.replace(mocap_pos=mocap_at(physics.mocap_pos, scene.orbit, time, jnp))
-        stepped = mjx.step(model, moving)
-        stepped = stepped.replace(mocap_pos=moving.mocap_pos)
-        kept = {f: jnp.where(k < substeps, getattr(stepped, f), getattr(data, f)) for f in STATE}
-        return stepped.replace(**kept), None
-
-    data, _ = jax.lax.scan(substep, data, jnp.arange(max_substeps))
-    data = mjx.forward(model, data)
-    physics = physics.replace(
-        qpos=data.qpos,
-        qvel=data.qvel,
-        warmstart=data.qacc_warmstart,
-        substeps=physics.substeps + substeps,
-    )
-    return physics, data
-
-
-STATE = ("qpos", "qvel", "qacc_warmstart", "mocap_pos")
+# MJX in JAX ----------------------------------------------------------------------------------------
 
 
 def jax_engine(scene: Scene, max_substeps: int, outputs: tuple[str, ...]) -> Run:
@@ -291,15 +249,51 @@ def jax_engine(scene: Scene, max_substeps: int, outputs: tuple[str, ...]) -> Run
         model = mjx.put_model(scene.model, impl="jax")
         template = mjx.make_data(scene.model, impl="jax")
     robot, watched = map(jnp.asarray, contact_geoms(scene))
+    timestep = scene.model.opt.timestep
+    carried = (*STATE, "mocap_pos")
 
     def run(physics: Physics, ctrl: jax.Array, substeps: jax.Array) -> tuple[Physics, Readings]:
-        physics, data = substep_loop(scene, model, template, physics, ctrl, substeps, max_substeps)
+        data = template.replace(
+            qpos=physics.qpos,
+            qvel=physics.qvel,
+            qacc_warmstart=physics.warmstart,
+            ctrl=ctrl,
+            mocap_pos=physics.mocap_pos,
+            mocap_quat=physics.mocap_quat,
+        )
+
+        def substep(data: "mjx.Data", k: jax.Array) -> "tuple[mjx.Data, None]":
+            moving = data
+            if scene.orbit.any():
+                time = (physics.substeps + k) * timestep
+                moving = data.replace(mocap_pos=mocap_at(physics.mocap_pos, scene.orbit, time, jnp))
+            stepped = mjx.step(model, moving)
+            stepped = stepped.replace(mocap_pos=moving.mocap_pos)
+            kept = {f: jnp.where(k < substeps, getattr(stepped, f), getattr(data, f)) for f in carried}
+            return stepped.replace(**kept), None
+
+        data, _ = jax.lax.scan(substep, data, jnp.arange(max_substeps))
+        data = mjx.forward(model, data)
         contact = data._impl.contact  # type: ignore[union-attr]
         first, second = contact.geom[:, 0], contact.geom[:, 1]
         touching = contact.dist <= 0
         met = robot[first][:, None] & watched[second] | robot[second][:, None] & watched[first]
-        counts = (met & touching[:, None]).sum(0).astype(jnp.float32)
-        return physics, readings(data.sensordata, counts, data, outputs)
+        physics = physics.replace(
+            qpos=data.qpos,
+            qvel=data.qvel,
+            warmstart=data.qacc_warmstart,
+            substeps=physics.substeps + substeps,
+        )
+        poses = {
+            name: getattr(data, name) if name in outputs else jnp.zeros((0,))
+            for name in ("geom_xpos", "geom_xmat", "xquat")
+        }
+        return physics, Readings(
+            sensors=data.sensordata,
+            contacts=(met & touching[:, None]).sum(0).astype(jnp.float32),
+            overflow=jnp.zeros(()),
+            **poses,
+        )
 
     return run
 
@@ -337,45 +331,26 @@ def contact_geoms(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     return robot, np.stack([bodies == i for i in ids], 1) if ids else np.zeros((model.ngeom, 0), bool)
 
 
+# MuJoCo Warp ---------------------------------------------------------------------------------------
+
+
 def warp_engine(
     scene: Scene, max_substeps: int, outputs: tuple[str, ...], alike: bool, room: float
 ) -> tuple[Run, Run]:
     """MuJoCo Warp. Its buffers are sized for the whole batch, so the batch is made explicit."""
-    if not mjx_warp_available():
+    if not warp_available():
         raise ConfigError("env.engine='warp': warp-lang is not installed; pip install 'jaxsafe[gpu]'")
     from jaxsafe.envs import physics_warp
 
-    model = scene.model
-    maker = physics_warp.warp_engine(scene, outputs, *contact_budget(scene, room))
-    _, results = physics_warp.widths(model, outputs)
-    ends = np.cumsum(list(results.values()))
+    maker, results = physics_warp.warp_engine(scene, outputs, *contact_budget(scene, room))
 
     def engine(substeps_of_all: int) -> Run:
         advance = maker(substeps_of_all, alike)
 
-        def pack(physics: Physics, ctrl: jax.Array, substeps: jax.Array) -> jax.Array:
-            arrays = (physics.qpos, physics.qvel, physics.warmstart, physics.mocap_pos)
-            arrays += (physics.mocap_quat, ctrl, physics.substeps, substeps)
-            return jnp.concatenate([jnp.ravel(x).astype(jnp.float32) for x in arrays])
-
-        def unpack(row: jax.Array, physics: Physics, substeps: jax.Array):
-            parts = dict(zip(results, jnp.split(row, ends[:-1]), strict=True))
-            for name, shape in (("geom_xpos", (3,)), ("geom_xmat", (3, 3)), ("xquat", (4,))):
-                if name in parts:
-                    parts[name] = parts[name].reshape(-1, *shape)
-            physics = physics.replace(
-                qpos=parts["qpos"],
-                qvel=parts["qvel"],
-                warmstart=parts["qacc_warmstart"],
-                substeps=physics.substeps + substeps,
-            )
-            sensors = parts["sensordata"]
-            contacts = sensors[model.nsensordata - scene.contact_count :]
-            return physics, readings(sensors, contacts, parts, outputs, parts["overflow"][0])
-
         def run_batch(physics: Physics, ctrl: jax.Array, substeps: jax.Array):
-            out = advance(jax.vmap(pack)(physics, ctrl, substeps))
-            return jax.vmap(unpack)(out, physics, substeps)
+            rows = advance(jax.vmap(pack)(physics, ctrl, substeps))
+            come_back = partial(unpack, sizes=results, scene=scene)
+            return jax.vmap(come_back)(rows, physics=physics, substeps=substeps)
 
         return batched(run_batch)
 

@@ -16,11 +16,11 @@ from typing import Any
 
 import jax
 import mujoco
-import numpy as np
 import warp as wp
 from mujoco.mjx.third_party import mujoco_warp
 from mujoco.mjx.third_party.mujoco_warp._src import collision_primitive, collision_primitive_core
 
+from jaxsafe.envs.physics import STATE, columns, widths
 from jaxsafe.envs.scene import Scene
 
 wp.config.log_level = wp.LOG_WARNING  # a line for every kernel otherwise
@@ -114,23 +114,6 @@ NO_ROOM = int(
     Kind.NEFC | Kind.NJMAX_NNZ | Kind.BROADPHASE | Kind.NARROWPHASE | Kind.CCD | Kind.CONTACT_MATCH
 )
 FEW_WORLDS = 128  # contacts more: the average of few worlds varies
-STATE = ("qpos", "qvel", "qacc_warmstart")
-
-
-def widths(model: mujoco.MjModel, outputs: tuple[str, ...]) -> tuple[dict[str, int], dict[str, int]]:
-    """The columns of a packed row, in and out."""
-    state = dict(zip(STATE, (model.nq, model.nv, model.nv), strict=True))
-    mocap = {"mocap_pos": 3 * model.nmocap, "mocap_quat": 4 * model.nmocap}
-    poses = {"geom_xpos": 3 * model.ngeom, "geom_xmat": 9 * model.ngeom, "xquat": 4 * model.nbody}
-    into = state | mocap | {"ctrl": model.nu, "done": 1, "substeps": 1}
-    out = state | {"sensordata": model.nsensordata} | {name: poses[name] for name in outputs}
-    return into, out | {"overflow": 1}
-
-
-def columns(packed: Any, sizes: dict[str, int]) -> dict[str, Any]:
-    """Views of the columns of `packed` [worlds, n]; those without width are left out."""
-    ends = dict(zip(sizes, np.cumsum(list(sizes.values())), strict=True))
-    return {name: packed[:, ends[name] - n : ends[name]] for name, n in sizes.items() if n}
 
 
 def floats(x: wp.array) -> wp.array:
@@ -154,8 +137,9 @@ class Worlds:
 
 def warp_engine(
     scene: Scene, outputs: tuple[str, ...], contacts: int, rows: int
-) -> Callable[[int, bool], Callable[[jax.Array], jax.Array]]:
-    """For a scene: maker(substeps, alike) -> a function of packed rows, [worlds, in] -> [worlds, out].
+) -> tuple[Callable[[int, bool], Callable[[jax.Array], jax.Array]], dict[str, int]]:
+    """For a scene: maker(substeps, alike) -> a function of rows, [worlds, in] -> [worlds, out], and
+    the columns of a row that comes out.
 
     Where not all worlds take all `substeps` (`alike` is false), the column 'substeps' says how many.
     The working data of every batch size that was ever stepped is kept.
@@ -167,6 +151,7 @@ def warp_engine(
     """
     model = scene.model
     inputs, results = widths(model, outputs)
+    results |= {"overflow": 1}
     batches: dict[tuple[str, int], Worlds] = {}
 
     def prepare(worlds: int) -> Worlds:
@@ -187,9 +172,11 @@ def warp_engine(
 
     def maker(substeps: int, alike: bool) -> Callable[[jax.Array], jax.Array]:
         def advance(w: Worlds) -> None:
-            data, given, wanted = w.data, columns(w.into, inputs), columns(w.out, results)
+            data = w.data
+            given = {name: w.into[:, where] for name, where in columns(inputs).items()}
+            wanted = {name: w.out[:, where] for name, where in columns(results).items()}
             for name, column in given.items():
-                if name not in ("done", "substeps"):
+                if column.size and name not in ("done", "substeps"):
                     wp.copy(floats(getattr(data, name)), column)
             data.overflow.zero_()
             base = wp.clone(data.mocap_pos) if scene.orbit.any() else None
@@ -230,7 +217,8 @@ def warp_engine(
                 outputs=[full],
             )
             for name, column in wanted.items():
-                wp.copy(column, floats(getattr(data, name)))
+                if column.size:
+                    wp.copy(column, floats(getattr(data, name)))
 
         def run(packed: wp.array2d[float], result: wp.array2d[float]):
             device = wp.get_device()
@@ -253,4 +241,4 @@ def warp_engine(
         out = sum(results.values())
         return lambda packed: call(packed, output_dims={"result": (packed.shape[0], out)})[0]
 
-    return maker
+    return maker, results

@@ -74,8 +74,9 @@ def test_the_jax_engine_agrees_with_c_among_vases():
     agree("point_goal1", 10, 1e-4)
 
 
-def test_one_world_or_many_and_batches_of_batches_are_the_same():
-    t = task("point_goal1")
+@pytest.mark.parametrize("engine", ["c", "warp"])
+def test_one_world_or_many_and_batches_of_batches_are_the_same(engine):
+    t = task("point_goal1", engine=engine)
     state = t.begin(6)
     state = t.idle(state)
     action = jax.random.uniform(jax.random.key(3), (6, t.env.action_size), minval=-1)

@@ -1,12 +1,10 @@
 """Engine `warp`, on Warp's CPU device: the same kernels and packing as on a GPU, without its graphs."""
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tasks import FAST, task
+from tasks import task
 
 from jaxsafe import envs
 
@@ -57,18 +55,6 @@ def test_guides_go_round_and_steps_of_different_length_live_side_by_side():
 def test_poses_that_a_task_asks_for_come_along():
     worst = errors("point_goal1", lidar_type="natural", reward_orientation=True)
     assert worst["obs"] < 5e-3 and worst["reward"] < 1e-5
-
-
-def test_a_batch_of_batches_and_a_lone_world_are_the_same():
-    t = task("point_goal1", engine="warp")
-    state = t.begin(6)
-    action = jax.random.uniform(jax.random.key(3), (6, t.env.action_size), minval=-1)
-    many = t.step(state, action)
-    split = partial(jax.tree.map, lambda x: x.reshape(2, 3, *x.shape[1:]))
-    nested = jax.jit(jax.vmap(jax.vmap(t.env.step)), compiler_options=FAST)(split(state), split(action))
-    np.testing.assert_allclose(nested.obs.reshape(many.obs.shape), many.obs, atol=1e-5)
-    lone = jax.jit(t.env.step, compiler_options=FAST)(jax.tree.map(lambda x: x[4], state), action[4])
-    np.testing.assert_allclose(lone.obs, many.obs[4], atol=1e-5)
 
 
 def test_contacts_without_room_are_counted():
