@@ -106,6 +106,21 @@ def dual(
     return jnp.where(recover, 0.0, lam), jnp.where(recover, per_b, nu), case
 
 
+class Problem(NamedTuple):
+    """The linearised problem, in the letters above; h_g = H^-1 g and h_b = H^-1 b are float [P]."""
+
+    h_g: jax.Array
+    h_b: jax.Array
+    q: jax.Array
+    r: jax.Array
+    s: jax.Array
+    c: jax.Array
+    delta: jax.Array
+
+
+Rule = Callable[[Problem], "Direction"]
+
+
 class Direction(NamedTuple):
     """Where a rule would go.
 
@@ -119,19 +134,11 @@ class Direction(NamedTuple):
     metrics: Metrics
 
 
-def solution(
-    h_g: jax.Array,
-    h_b: jax.Array,
-    q: jax.Array,
-    r: jax.Array,
-    s: jax.Array,
-    c: jax.Array,
-    delta: jax.Array,
-) -> Direction:
+def solution(p: Problem) -> Direction:
     """The solution of the linearised problem."""
-    lam, nu, case = dual(q, r, s, c, delta)
+    lam, nu, case = dual(p.q, p.r, p.s, p.c, p.delta)
     recover = case == RECOVER
-    step = jnp.where(recover, -nu * h_b, (h_g - nu * h_b) / jnp.where(recover, 1.0, lam))
+    step = jnp.where(recover, -nu * p.h_b, (p.h_g - nu * p.h_b) / jnp.where(recover, 1.0, lam))
     metrics = {"train/lam": lam, "train/nu": nu, "train/case": case}
     return Direction(step, case > RETURN, metrics)
 
@@ -140,14 +147,13 @@ class Margin(NamedTuple):
     margin: jax.Array  # float [], in the violation's unit, >= 0
 
 
-def step_by(rule: Callable[..., Direction]) -> Step:
-    """A trust-region step where `rule(h_g, h_b, q, r, s, c, delta)` says, with H^-1 g, H^-1 b and
-    their products, shortened until it keeps what it promised."""
+def step_by(rule: Rule) -> Step:
+    """A trust-region step where `rule` says, shortened until it keeps what it promised."""
     return Step(lambda actor, cfg: Margin(jnp.zeros(())), partial(update, rule))
 
 
 def update(
-    rule: Callable[..., Direction],
+    rule: Rule,
     actor: PyTree,
     opt_state: Margin,
     objective_r: Objective,
@@ -177,7 +183,7 @@ def update(
     )
     solve = jax.vmap(lambda v: conjugate_gradient(product, v, cfg.cg_iterations))
     (h_g, h_b), residual = solve(jnp.stack([g, b]))
-    step, earns, metrics = rule(h_g, h_b, g @ h_g, g @ h_b, b @ h_b, c, delta)
+    step, earns, metrics = rule(Problem(h_g, h_b, g @ h_g, g @ h_b, b @ h_b, c, delta))
     reward, cost, _ = evaluate(start)
 
     def accept(params: jax.Array) -> jax.Array:

@@ -12,7 +12,6 @@ delta (the paper has none; OmniSafe has CPO's, and x without H^-1 in the first t
 
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 
 from jaxsafe.algos import cpo
@@ -30,19 +29,11 @@ class PCPOConfig(cpo.CPOConfig):
 PUBLISHED: dict[str, dict[str, Any]] = cpo.PUBLISHED
 
 
-def projection(
-    h_g: jax.Array,
-    h_b: jax.Array,
-    q: jax.Array,
-    r: jax.Array,
-    s: jax.Array,
-    c: jax.Array,
-    delta: jax.Array,
-) -> cpo.Direction:
+def projection(p: cpo.Problem) -> cpo.Direction:
     """The reward's step, moved back along H^-1 b to where b'x + c = 0, if it lies beyond."""
-    scale = jnp.sqrt(2 * delta / jnp.maximum(q, 1e-20))
-    back = jnp.maximum(0.0, (scale * r + c) / jnp.maximum(s, 1e-20))
-    return cpo.Direction(scale * h_g - back * h_b, jnp.bool_(False), {"train/nu": back})
+    scale = jnp.sqrt(2 * p.delta / jnp.maximum(p.q, 1e-20))
+    back = jnp.maximum(0.0, (scale * p.r + p.c) / jnp.maximum(p.s, 1e-20))
+    return cpo.Direction(scale * p.h_g - back * p.h_b, jnp.bool_(False), {"train/nu": back})
 
 
 def make(env: Env, axis_name: str | None = None) -> Algorithm:

@@ -11,7 +11,7 @@ KL(old || new) > target_kl.
 from typing import Any
 
 from jaxsafe.config import config
-from jaxsafe.on_policy import Algorithm, OnPolicyConfig, on_policy
+from jaxsafe.on_policy import OMNISAFE, Algorithm, OnPolicyConfig, on_policy
 from jaxsafe.steps import adam_epochs
 from jaxsafe.surrogates import plain
 from jaxsafe.treatments import none
@@ -27,14 +27,10 @@ class PGConfig(OnPolicyConfig):
 
 
 # OmniSafe @15603dd, configs/on-policy/PolicyGradient.yaml. Its minibatches of 64 do not divide
-# 20 * 1000 steps: these are of 80. Its 20 episodes run one after the other, these side by side.
+# 20 * 1000 steps: these are of 80.
 PUBLISHED: dict[str, dict[str, Any]] = {
     "omnisafe": {
-        "num_envs": 20,
-        "horizon": 1000,
-        "stagger": False,
-        "init": "torch",
-        "init_log_std": 0.0,
+        **OMNISAFE,
         "epochs": 10,
         "critic_epochs": 10,
         "minibatches": 250,

@@ -18,7 +18,7 @@ from jaxsafe.types import Env
 
 @config
 class PPOPenaltyConfig(ppo.PPOConfig):
-    price: float = 0.5  # standard deviations of A_r per unit of cost
+    price: float = 0.5  # standard deviations of A_r per unit of cost; ours, published by nobody
 
 
 PUBLISHED: dict[str, dict[str, Any]] = ppo.PUBLISHED

@@ -8,7 +8,7 @@ Source: Schulman et al. (2015), "Trust Region Policy Optimization", arXiv:1502.0
 from typing import Any
 
 from jaxsafe.config import config
-from jaxsafe.on_policy import Algorithm, OnPolicyConfig, on_policy
+from jaxsafe.on_policy import OMNISAFE, Algorithm, OnPolicyConfig, on_policy
 from jaxsafe.surrogates import plain
 from jaxsafe.treatments import none
 from jaxsafe.trust_region import trust_region
@@ -29,11 +29,7 @@ class TRPOConfig(OnPolicyConfig):
 # Doggo's 12 it is algo.target_kl=0.12.
 PUBLISHED: dict[str, dict[str, Any]] = {
     "omnisafe": {
-        "num_envs": 20,
-        "horizon": 1000,
-        "stagger": False,
-        "init": "torch",
-        "init_log_std": 0.0,
+        **OMNISAFE,
         "critic_epochs": 10,
         "minibatches": 160,
         "critic_lr": 1e-3,

@@ -52,6 +52,17 @@ class OnPolicyConfig:
     max_grad_norm: float = 40.0  # of each network's gradient [O]
 
 
+# The settings that all of [O]'s on-policy algorithms share (@15603dd, configs/on-policy) and that
+# differ from the defaults above. Its 20 episodes run one after the other, these side by side.
+OMNISAFE: dict[str, Any] = {
+    "num_envs": 20,
+    "horizon": 1000,
+    "stagger": False,
+    "init": "torch",
+    "init_log_std": 0.0,
+}
+
+
 @flax.struct.dataclass
 class TrainState:
     """All that an update needs. Environment steps so far: iteration * num_envs * horizon.

@@ -7,7 +7,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 from scipy.optimize import minimize
 
-from jaxsafe.algos import cup, focops, p3o, pcpo
+from jaxsafe.algos import cpo, cup, focops, p3o, pcpo
 from jaxsafe.gaussian import Gaussian, kl, log_prob, sample
 from jaxsafe.networks import init_params, policy
 from jaxsafe.on_policy import Batch
@@ -73,7 +73,7 @@ def test_the_projection_is_scipys(seed, c):
     h_g, h_b = np.linalg.solve(h, g), np.linalg.solve(h, b)
     delta = 0.02
     arrays = (h_g, h_b, g @ h_g, g @ h_b, b @ h_b, c, delta)
-    step = pcpo.projection(*(jnp.float32(x) for x in arrays)).step
+    step = pcpo.projection(cpo.Problem(*map(jnp.float32, arrays))).step
     reward = np.sqrt(2 * delta / (g @ h_g)) * h_g
     oracle = minimize(
         lambda x: (x - reward) @ h @ (x - reward),
