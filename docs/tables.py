@@ -3,7 +3,6 @@
 Each table stands between <!-- table: NAME --> and <!-- end -->; a test holds README.md to them.
 """
 
-import re
 from pathlib import Path
 
 from jaxsafe.algos import ALGOS
@@ -30,9 +29,10 @@ def algorithms() -> str:
 
 def filled(text: str) -> str:
     """`text` with its tables made anew."""
-    for name, table in (("environments", environments), ("algorithms", algorithms)):
-        pattern = rf"(<!-- table: {name} -->\n).*?(<!-- end -->)"
-        text = re.sub(pattern, lambda m: f"{m[1]}{table()}\n{m[2]}", text, flags=re.DOTALL)  # noqa: B023
+    for name, table in (("environments", environments()), ("algorithms", algorithms())):
+        begin, end = f"<!-- table: {name} -->\n", "\n<!-- end -->"
+        before, _, rest = text.partition(begin)
+        text = before + begin + table + end + rest.partition(end)[2]
     return text
 
 

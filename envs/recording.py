@@ -104,8 +104,8 @@ def worlds(env: SafetyGym, recording: Recording) -> World:
             turns.append(body_quat[:, bodies[f"{kind[:-1]}{i}"]])
     count = len(rows)
     last = {
-        k: np.nan_to_num(recording[f"state.{k}"][rows])
-        for k in ("last_dist_goal", "last_dist_box", "last_box_goal")
+        k: np.zeros(count) if np.isnan(recording[f"state.{k}"]).all() else recording[f"state.{k}"][rows]
+        for k in ("last_dist_goal", "last_dist_box", "last_box_goal")  # NaN: not of this task
     }
     com = recording.arrays.get("state.last_robot_com")
     timestep = env.scene.model.opt.timestep
