@@ -179,6 +179,7 @@ class SafetyGymConfig:
     # Physics
     frameskip_binom_n: int = 10  # physics steps in a step ~ Binomial(n, p)
     frameskip_binom_p: float = 1.0
+    awake: int | None = None  # ours: vases, and gremlins, simulated at once; null: the engine's
     contact_room: float = 1.0  # ours: of engine warp, times the room estimated for contacts
     # Random numbers
     _seed: int | None = None  # mixed into the key of every reset
@@ -213,6 +214,8 @@ def check(cfg: SafetyGymConfig) -> None:
         raise ConfigError("env.buttons_num=0: the button task needs at least 1")
     if not 0 <= cfg.frameskip_binom_p <= 1:
         raise ConfigError(f"env.frameskip_binom_p={cfg.frameskip_binom_p}: expected 0 to 1")
+    if cfg.awake is not None and cfg.awake < 1:
+        raise ConfigError(f"env.awake={cfg.awake}: expected at least 1, or null")
     if cfg.contact_room <= 0:
         raise ConfigError(f"env.contact_room={cfg.contact_room}: expected above 0")
     if cfg.action_noise < 0:

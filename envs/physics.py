@@ -13,7 +13,7 @@ import math
 import threading
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import flax.struct
 import jax
@@ -24,11 +24,6 @@ import numpy as np
 
 from jaxsafe.config import ConfigError, nearest
 from jaxsafe.envs.scene import Scene
-
-if (
-    TYPE_CHECKING
-):  # imported by the engines that need it: it is slow, and complains where Warp is missing
-    from mujoco import mjx
 
 ENGINES = ("c", "warp", "jax")
 
@@ -48,8 +43,8 @@ class Physics:
 
 @flax.struct.dataclass
 class Readings:
-    """What a forward pass shows: sensors [nsensordata], contact counts [watched objects] and the
-    poses that a task asked for (others have no elements)."""
+    """What a forward pass shows: sensors [nsensordata], whose last are the contact counts [watched
+    objects], and the poses that a task asked for (others have no elements)."""
 
     sensors: jax.Array
     contacts: jax.Array
@@ -106,6 +101,8 @@ def make_engine(
     if name == "warp":
         return Engine(name, *warp_engine(scene, max_substeps, outputs, alike, room))
     if name == "jax":
+        from jaxsafe.envs.physics_jax import jax_engine  # MJX is slow to import
+
         return Engine(name, jax_engine(scene, max_substeps, outputs), jax_engine(scene, 0, outputs))
     raise ConfigError(f"env.engine={name!r}{nearest(name, ('auto', *ENGINES))}")
 
@@ -236,99 +233,6 @@ def c_engine(scene: Scene, outputs: tuple[str, ...]) -> Run:
         return unpack(row, results, scene, physics, substeps)
 
     return run
-
-
-# MJX in JAX ----------------------------------------------------------------------------------------
-
-
-def jax_engine(scene: Scene, max_substeps: int, outputs: tuple[str, ...]) -> Run:
-    refuse_box_cylinder(scene.model)
-    from mujoco import mjx
-
-    with jax.ensure_compile_time_eval():
-        model = mjx.put_model(scene.model, impl="jax")
-        template = mjx.make_data(scene.model, impl="jax")
-    robot, watched = map(jnp.asarray, contact_geoms(scene))
-    timestep = scene.model.opt.timestep
-    carried = (*STATE, "mocap_pos")
-
-    def run(physics: Physics, ctrl: jax.Array, substeps: jax.Array) -> tuple[Physics, Readings]:
-        data = template.replace(
-            qpos=physics.qpos,
-            qvel=physics.qvel,
-            qacc_warmstart=physics.warmstart,
-            ctrl=ctrl,
-            mocap_pos=physics.mocap_pos,
-            mocap_quat=physics.mocap_quat,
-        )
-
-        def substep(data: "mjx.Data", k: jax.Array) -> "tuple[mjx.Data, None]":
-            moving = data
-            if scene.orbit.any():
-                time = (physics.substeps + k) * timestep
-                moving = data.replace(mocap_pos=mocap_at(physics.mocap_pos, scene.orbit, time, jnp))
-            stepped = mjx.step(model, moving)
-            stepped = stepped.replace(mocap_pos=moving.mocap_pos)
-            kept = {f: jnp.where(k < substeps, getattr(stepped, f), getattr(data, f)) for f in carried}
-            return stepped.replace(**kept), None
-
-        data, _ = jax.lax.scan(substep, data, jnp.arange(max_substeps))
-        data = mjx.forward(model, data)
-        contact = data._impl.contact  # type: ignore[union-attr]
-        first, second = contact.geom[:, 0], contact.geom[:, 1]
-        touching = contact.dist <= 0
-        met = robot[first][:, None] & watched[second] | robot[second][:, None] & watched[first]
-        physics = physics.replace(
-            qpos=data.qpos,
-            qvel=data.qvel,
-            warmstart=data.qacc_warmstart,
-            substeps=physics.substeps + substeps,
-        )
-        poses = {
-            name: getattr(data, name) if name in outputs else jnp.zeros((0,))
-            for name in ("geom_xpos", "geom_xmat", "xquat")
-        }
-        return physics, Readings(
-            sensors=data.sensordata,
-            contacts=(met & touching[:, None]).sum(0).astype(jnp.float32),
-            overflow=jnp.zeros(()),
-            **poses,
-        )
-
-    return run
-
-
-def refuse_box_cylinder(model: mujoco.MjModel) -> None:
-    """MJX's JAX implementation has every pair of these scenes but box and cylinder."""
-    solid = (model.geom_contype | model.geom_conaffinity) > 0
-    types = {int(t): model.geom(i).name for i, t in enumerate(model.geom_type) if solid[i]}
-    cylinder, box = (int(t) for t in (mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_BOX))
-    if cylinder in types and box in types and collide(model, cylinder, box):
-        raise ConfigError(
-            f"env.engine='jax': MJX has no box-cylinder collision and this scene needs it "
-            f"({types[box]} and {types[cylinder]}); use env.engine=c, or warp on an NVIDIA GPU"
-        )
-
-
-def collide(model: mujoco.MjModel, one: int, other: int) -> bool:
-    """Whether any two geoms of these types belong to bodies that can meet."""
-    for a in np.flatnonzero(model.geom_type == one):
-        for b in np.flatnonzero(model.geom_type == other):
-            i, j = (int(model.body_weldid[model.geom_bodyid[g]]) for g in (a, b))
-            parents = (int(model.body_weldid[model.body_parentid[k]]) for k in (i, j))
-            fixed = i == 0 and j == 0
-            if i != j and not fixed and not (0 not in (i, j) and (i in parents or j in parents)):
-                return True
-    return False
-
-
-def contact_geoms(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Masks of the robot's geoms [ngeom] and of each watched object's [ngeom, watched]."""
-    model = scene.model
-    bodies = model.geom_bodyid
-    robot = model.body_rootid[bodies] == model.body("robot").id
-    ids = [model.body(name).id for names in scene.watched.values() for name in names]
-    return robot, np.stack([bodies == i for i in ids], 1) if ids else np.zeros((model.ngeom, 0), bool)
 
 
 # MuJoCo Warp ---------------------------------------------------------------------------------------

@@ -57,9 +57,10 @@ class Replay(SafetyGym):
 
     _given: tuple[Any, Any] = (np.zeros(2, np.float32), np.int32(0))  # goal [2], goal button
 
-    def __init__(self, recording: Recording, engine: str = "auto"):
+    def __init__(self, recording: Recording, engine: str = "auto", awake: int | None = None):
         self._given = jnp.zeros(2), jnp.int32(0)  # traced already when the shapes are found
-        super().__init__(read(recording.meta["config"]), engine, recording.name)
+        config = read(recording.meta["config"] | {"awake": awake})
+        super().__init__(config, engine, recording.name)
 
     def replay(self, world: World, action: jax.Array, goal: jax.Array, button: jax.Array) -> State:
         self._given = goal, button
@@ -198,9 +199,9 @@ class Comparison:
         return lines
 
 
-def compare(recording: Recording, engine: str = "auto") -> Comparison:
+def compare(recording: Recording, engine: str = "auto", awake: int | None = None) -> Comparison:
     """Replay every step of a recording and compare it with what was recorded."""
-    env = Replay(recording, engine)
+    env = Replay(recording, engine, awake)
     if not env.config.observation_flatten:
         raise ConfigError(f"{recording.name}: observation_flatten=false cannot be replayed")
     before = worlds(env, recording)

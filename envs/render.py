@@ -65,7 +65,7 @@ class Renderer:
         camera: str | mujoco.MjvCamera = "fixedfar",
     ):
         self.env = env
-        self.scene = scenes.build(env.config, contact_sensors=False, drawn=True)
+        self.scene = scenes.build(env.config, drawn=True)
         self._model = model = self.scene.model
         self._camera = named_camera(model, camera) if isinstance(camera, str) else camera
         self._data = mujoco.MjData(model)

@@ -22,7 +22,7 @@ from jaxsafe.config import ConfigError
 from jaxsafe.envs import layout as layouts
 from jaxsafe.envs import physics as engines
 from jaxsafe.envs import scene as scenes
-from jaxsafe.envs import sensing
+from jaxsafe.envs import sensing, sleeping
 from jaxsafe.envs.config import SafetyGymConfig
 from jaxsafe.envs.physics import Physics, Readings
 from jaxsafe.types import State
@@ -78,14 +78,19 @@ class SafetyGym:
     def __init__(self, cfg: SafetyGymConfig, engine: str = "auto", name: str = "custom"):
         self.name, self.config = name, cfg
         engine = engines.default_engine() if engine == "auto" else engine
-        self.scene = scenes.build(cfg, contact_sensors=engine != "jax")
+        self.scene = scenes.build(cfg)
         self.place = layouts.placement(cfg)
         natural = ("geom_xpos", "geom_xmat") if cfg.lidar_type == "natural" else ()
         turned = ("xquat",) if cfg.reward_orientation else ()
         alike = cfg.frameskip_binom_p >= 1
+        small = sleeping.small_config(cfg, sleeping.awake(cfg, engine))
+        as_built = small == cfg and engine != "jax"
+        scene = self.scene if as_built else scenes.build(small, mjx=engine == "jax")
         self._engine = engines.make_engine(
-            engine, self.scene, cfg.frameskip_binom_n, natural + turned, alike, cfg.contact_room
+            engine, scene, cfg.frameskip_binom_n, natural + turned, alike, cfg.contact_room
         )
+        if small != cfg:
+            self._engine = sleeping.with_sleepers(self._engine, scene, self.scene, cfg)
         self.engine = self._engine.name
         self._goal_kind = {"goal": "goal", "push": "goal", "button": "buttons"}.get(cfg.task)
         seeks_goal = cfg.observe_goal_lidar or cfg.observe_goal_dist or cfg.observe_goal_comp

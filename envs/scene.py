@@ -41,6 +41,7 @@ GROUP = {
     "circle": 6,
 }
 MOCAPS = ("gremlins", "pillars", "walls", "buttons")  # in the order of their mocap ids
+MJX_LIMITS = {"max_geom_pairs": 16, "max_contact_points": 48}  # nearest pairs a type, deepest contacts
 FREES = ("vases", "gremlins", "box")  # in the order of their free joints
 
 
@@ -91,11 +92,12 @@ def robot_file(base: str) -> Path:
     raise ConfigError(f"env.robot_base={base!r}: no such robot{nearest(name, robots)}")
 
 
-def build(cfg: SafetyGymConfig, contact_sensors: bool = True, drawn: bool = False) -> Scene:
+def build(cfg: SafetyGymConfig, mjx: bool = False, drawn: bool = False) -> Scene:
     """Compile the scene of `cfg`.
 
     Args:
-        contact_sensors: count contacts between the robot and each constrained object by sensors.
+        mjx: for MJX in JAX, which has no contact sensors, collides a capsule better than a cylinder
+            (pillars become capsules, with caps out of reach), and has room for `MJX_LIMITS` only.
         drawn: add what only rendering needs (light, cameras, colours, the gremlins' guides).
     Raises:
         ConfigError: an unknown robot, sensor or body.
@@ -140,7 +142,8 @@ def build(cfg: SafetyGymConfig, contact_sensors: bool = True, drawn: bool = Fals
         add_gremlin_guide(spec, i, cfg.gremlins_size if drawn else None)
     for i in range(cfg.pillars_num):
         size = (cfg.pillars_size, cfg.pillars_height, 0)
-        add_fixed(spec, f"pillar{i}", "pillar", mujoco.mjtGeom.mjGEOM_CYLINDER, size)
+        shape = mujoco.mjtGeom.mjGEOM_CAPSULE if mjx else mujoco.mjtGeom.mjGEOM_CYLINDER
+        add_fixed(spec, f"pillar{i}", "pillar", shape, size)
     for i in range(cfg.walls_num):
         add_fixed(spec, f"wall{i}", "wall", mujoco.mjtGeom.mjGEOM_BOX, (cfg.walls_size,) * 3)
     for i in range(cfg.buttons_num):
@@ -160,7 +163,10 @@ def build(cfg: SafetyGymConfig, contact_sensors: bool = True, drawn: bool = Fals
         if cfg.constrain_buttons or cfg.task == "button"
         else [],
     }
-    if contact_sensors:
+    if mjx:
+        for name, value in MJX_LIMITS.items():
+            spec.add_numeric(name=name, data=[value], size=1)
+    elif not drawn:
         for name in (name for names in watched.values() for name in names):
             spec.add_sensor(
                 name=f"contact_{name}",

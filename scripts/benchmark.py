@@ -82,7 +82,8 @@ def memory() -> int:
 
 
 def measure(name: str, num_envs: int, args: argparse.Namespace) -> dict:
-    env = envs.make(name, engine=args.engine)
+    options = {} if args.awake is None else {"awake": args.awake}
+    env = envs.make(name, engine=args.engine, **options)
     if args.algo:
         config = algos.ALGOS[args.algo].config
         cfg = config(num_envs=num_envs, **({"horizon": args.horizon} if args.horizon else {}))
@@ -97,6 +98,7 @@ def measure(name: str, num_envs: int, args: argparse.Namespace) -> dict:
     return {
         "env": name,
         "engine": env.engine,
+        "awake": args.awake,
         "algo": args.algo,
         "num_envs": num_envs,
         "num_seeds": args.seeds,
@@ -138,6 +140,7 @@ def main() -> int:
     parser.add_argument("--num-envs", type=int, nargs="+", default=[256], help="of each seed")
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--engine", default="auto", help="auto, c, warp or jax")
+    parser.add_argument("--awake", type=int, metavar="K", help="vases, and gremlins, simulated at once")
     parser.add_argument("--algo", help="measure its update instead of random actions")
     parser.add_argument("--horizon", type=int, help="steps of each environment in a run")
     parser.add_argument("--repeats", type=int, default=5)

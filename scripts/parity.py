@@ -68,7 +68,7 @@ def verdict(comparison: Comparison) -> str:
     """'pass', or on how many strict steps something is past its tolerance."""
     if not comparison.failures():
         return "pass"
-    steps = np.any([comparison.past(name) for name in comparison.errors], axis=0).sum()
+    steps = int(np.any([comparison.past(name) for name in comparison.errors], axis=0).sum())
     return f"{steps} step{'s' * (steps > 1)} past" if steps else "events"
 
 
@@ -113,12 +113,13 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description="Replay recordings of the original engine.")
     parser.add_argument("recordings", nargs="+", type=Path, metavar="RECORDING", help=".npz files")
     parser.add_argument("--engine", default="auto", help="auto (default), c, warp or jax")
+    parser.add_argument("--awake", type=int, metavar="K", help="vases, and gremlins, simulated at once")
     parser.add_argument("--table", type=Path, metavar="FILE", help="also write a Markdown table")
     args = parser.parse_args(argv)
     comparisons = []
     try:
         for path in args.recordings:
-            comparisons.append(compare(Recording(path), args.engine))
+            comparisons.append(compare(Recording(path), args.engine, args.awake))
             print(report(comparisons[-1]), flush=True)
         if args.table:
             args.table.write_text(table(comparisons))
