@@ -16,12 +16,18 @@ from jaxsafe.algos import (
     pdo,
     pg,
     ppo,
+    ppo_early_terminated,
     ppo_lag,
     ppo_penalty,
+    ppo_saute,
+    ppo_simmer_pid,
     rcpo,
     trpo,
+    trpo_early_terminated,
     trpo_lag,
     trpo_pid,
+    trpo_saute,
+    trpo_simmer_pid,
 )
 from jaxsafe.on_policy import Algorithm
 
@@ -72,6 +78,12 @@ ALGOS: dict[str, Entry] = {
     ),
     "pg": Entry(pg.PGConfig, pg.make, "policy gradient, no constraint", pg.PUBLISHED),
     "ppo": Entry(ppo.PPOConfig, ppo.make, "clipped policy steps, no constraint", ppo.PUBLISHED),
+    "ppo_early_terminated": Entry(
+        ppo_early_terminated.PPOEarlyTerminatedConfig,
+        ppo_early_terminated.make,
+        "PPO whose training episodes end where they break the limit",
+        ppo_early_terminated.PUBLISHED,
+    ),
     "ppo_lag": Entry(
         ppo_lag.PPOLagConfig, ppo_lag.make, "PPO with an adaptive price on cost", ppo_lag.PUBLISHED
     ),
@@ -81,6 +93,18 @@ ALGOS: dict[str, Entry] = {
         "PPO with a fixed price on cost",
         ppo_penalty.PUBLISHED,
     ),
+    "ppo_saute": Entry(
+        ppo_saute.PPOSauteConfig,
+        ppo_saute.make,
+        "PPO that sees its budget on cost, and earns nothing without",
+        ppo_saute.PUBLISHED,
+    ),
+    "ppo_simmer_pid": Entry(
+        ppo_simmer_pid.PPOSimmerPIDConfig,
+        ppo_simmer_pid.make,
+        "PPO-Saute with a budget that a PID controller raises",
+        ppo_simmer_pid.PUBLISHED,
+    ),
     "rcpo": Entry(
         rcpo.RCPOConfig,
         rcpo.make,
@@ -88,6 +112,12 @@ ALGOS: dict[str, Entry] = {
         rcpo.PUBLISHED,
     ),
     "trpo": Entry(trpo.TRPOConfig, trpo.make, "trust-region steps, no constraint", trpo.PUBLISHED),
+    "trpo_early_terminated": Entry(
+        trpo_early_terminated.TRPOEarlyTerminatedConfig,
+        trpo_early_terminated.make,
+        "TRPO whose training episodes end where they break the limit",
+        trpo_early_terminated.PUBLISHED,
+    ),
     "trpo_lag": Entry(
         trpo_lag.TRPOLagConfig, trpo_lag.make, "TRPO with an adaptive price on cost", trpo_lag.PUBLISHED
     ),
@@ -96,5 +126,17 @@ ALGOS: dict[str, Entry] = {
         trpo_pid.make,
         "TRPO with a price on cost from a PID controller",
         trpo_pid.PUBLISHED,
+    ),
+    "trpo_saute": Entry(
+        trpo_saute.TRPOSauteConfig,
+        trpo_saute.make,
+        "TRPO that sees its budget on cost, and earns nothing without",
+        trpo_saute.PUBLISHED,
+    ),
+    "trpo_simmer_pid": Entry(
+        trpo_simmer_pid.TRPOSimmerPIDConfig,
+        trpo_simmer_pid.make,
+        "TRPO-Saute with a budget that a PID controller raises",
+        trpo_simmer_pid.PUBLISHED,
     ),
 }

@@ -25,7 +25,7 @@ from jaxsafe.config import ConfigError, nearest
 from jaxsafe.envs import physics as engines
 from jaxsafe.envs import scene as scenes
 from jaxsafe.envs.safety_gym import SafetyGym, World
-from jaxsafe.types import State
+from jaxsafe.types import Env, State
 
 FPS = 30
 BACKENDS = {"Linux": ("egl", "osmesa", "glfw"), "Darwin": ("cgl", "glfw")}
@@ -150,6 +150,7 @@ def render_episode(
     key: jax.Array,
     length: int | None = None,
     every: int | None = None,
+    task: Env | None = None,
     **renderer: Any,
 ) -> list[np.ndarray]:
     """One episode as frames, uint8 [H, W, 3], up to its termination.
@@ -159,12 +160,13 @@ def render_episode(
         length: most steps; None is the time limit.
         every: steps from a frame to the next; None is as near to real time at 30 frames a second as
             whole steps allow, and never less than one step.
+        task: `env` as the policy meets it, where an algorithm appends to its observation.
         renderer: arguments of `Renderer`.
     Raises:
         NoDisplay: this machine has neither EGL nor OSMesa nor a display.
     """
     draw = Renderer(env, **renderer)  # first: an episode is not worth simulating if it cannot be drawn
-    states = run_episode(env, policy, key, length or env.episode_length)
+    states = run_episode(task or env, policy, key, length or env.episode_length)
     steps = len(states.terminated)
     ends = np.flatnonzero(states.terminated)
     last = int(ends[0]) if len(ends) else steps - 1
@@ -172,7 +174,7 @@ def render_episode(
     return [draw.frame(jax.tree.map(lambda x, t=t: x[t], states)) for t in range(0, last + 1, every)]
 
 
-def run_episode(env: SafetyGym, policy: Callable, key: jax.Array, length: int) -> State:
+def run_episode(env: Env, policy: Callable, key: jax.Array, length: int) -> State:
     """The states of an episode on the host, [length + 1, ...]; the first is that of the reset."""
     reset_key, act_key = jax.random.split(key)
 
@@ -258,11 +260,11 @@ def named_camera(model: mujoco.MjModel, name: str) -> mujoco.MjvCamera:
 
 
 def split(obs: Any, spec: dict[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
-    """Components of an observation by name, each flat."""
+    """Components of an observation by name, each flat; what follows them is left out."""
     if isinstance(obs, dict):
         return {name: np.asarray(value).reshape(-1) for name, value in obs.items()}
-    ends = np.cumsum([int(np.prod(shape)) for shape in spec.values()])
-    return dict(zip(spec, np.split(np.asarray(obs), ends[:-1]), strict=True)) if spec else {}
+    ends = np.cumsum([int(np.prod(shape)) for shape in spec.values()], dtype=int)
+    return dict(zip(spec, np.split(np.asarray(obs), ends), strict=False))
 
 
 def colour(name: str) -> tuple[float, ...]:

@@ -36,6 +36,7 @@ from omegaconf.errors import OmegaConfBaseException
 import jaxsafe
 from jaxsafe import checkpoint, evaluation, plots, run_folder, runner
 from jaxsafe.config import ConfigError, from_dict, nearest
+from jaxsafe.on_policy import Algorithm
 from jaxsafe.progress import Report
 from jaxsafe.types import Env, PyTree
 
@@ -60,6 +61,9 @@ BOUNDS = {
     "cost_discount": (0.0, 1.0),
     "gae_lambda": (0.0, 1.0),
     "cost_gae_lambda": (0.0, 1.0),
+    "saute_discount": (0.01, 1.0),
+    "budget_init": (0.0, 1.0),
+    "simmer_window": (1, math.inf),
 }
 
 
@@ -415,8 +419,7 @@ def finish(settings: Settings, env: Env, envs: Any, algos: Any, folder: Path, re
         plots.curves(run_folder.read_metrics(folder), folder / "curves.png", title, limit)
 
     def evaluate() -> None:
-        act, ts = policy()
-        episodes = evaluation.run_episodes(env, act, ts, train.eval_episodes, seed=train.seed)
+        episodes = evaluation.run_episodes(*policy(), train.eval_episodes, seed=train.seed)
         rows = evaluation.summary(settings.env_name, episodes, limit, run_folder.read_metrics(folder))
         text = json.dumps({"episodes": train.eval_episodes, **evaluation.as_json(rows)}, indent=1)
         run_folder.replace_text(folder / "evaluation.json", text)
@@ -428,9 +431,9 @@ def finish(settings: Settings, env: Env, envs: Any, algos: Any, folder: Path, re
         )
 
     def video() -> None:
-        act, ts = policy()
+        algo, ts = policy()
         first = jax.tree.map(lambda x: x[0], ts)
-        film(envs, env, lambda obs, key: act(first, obs, key), folder / "video.mp4", train.seed)
+        film(envs, env, algo, first, folder / "video.mp4", train.seed)
 
     wanted = {
         "curves": (curves, True),
@@ -445,8 +448,10 @@ def finish(settings: Settings, env: Env, envs: Any, algos: Any, folder: Path, re
             report.line(f"no {name}: {one_line(error)}")
 
 
-def film(envs: Any, env: Env, policy: Callable, path: Path, seed: int) -> None:
-    """Write one episode as a video. The renderer is imported late: it looks for a display.
+def film(envs: Any, env: Env, algo: Algorithm, ts: PyTree, path: Path, seed: int) -> None:
+    """Write one episode of the deterministic policy as a video.
+
+    The renderer is imported late: it looks for a display.
 
     Raises:
         NoVideo: this machine has neither EGL nor OSMesa.
@@ -454,26 +459,26 @@ def film(envs: Any, env: Env, policy: Callable, path: Path, seed: int) -> None:
     render = importlib.import_module(f"{envs.__name__}.render")
     try:
         frames = render.render_episode(
-            env, policy, jax.random.fold_in(jax.random.key(seed), 0x66696C6D)
+            env,
+            lambda obs, _: algo.act(ts, obs, None),
+            jax.random.fold_in(jax.random.key(seed), 0x66696C6D),
+            task=algo.task(ts),
         )
     except render.NoDisplay as error:
         raise NoVideo(one_line(error)) from error
     render.write_video(frames, path, fps=30)
 
 
-def policy_of(
-    settings: Settings, env: Env, algos: Any, folder: Path
-) -> tuple[evaluation.Policy, PyTree]:
-    """The algorithm's deterministic `act`, and the newest policy of each seed in a train state."""
+def policy_of(settings: Settings, env: Env, algos: Any, folder: Path) -> tuple[Algorithm, PyTree]:
+    """The algorithm, and the newest policy of each seed in a train state."""
     algo = algos.ALGOS[settings.algo_name].make(env, None)
     alone = dataclasses.replace(settings.algo, num_envs=1, horizon=1, minibatches=1)
     floats = jax.tree.map(np.float32, alone)
     state = jax.eval_shape(lambda: algo.init(jax.random.key(0), floats))
-    arrays = runner.read_policy(folder)
+    arrays = runner.read_policy(folder, fields=runner.ACTING)
     rows = settings.train.num_seeds
-    return (lambda ts, obs, _: algo.act(ts, obs, None)), runner.policy_state(
-        state, arrays, rows, folder
-    )
+    ts = runner.policy_state(state, arrays, rows, folder)
+    return algo, dataclasses.replace(ts, config=jax.tree.map(lambda x: np.repeat(x, rows), floats))
 
 
 # ---- entry points ----------------------------------------------------------------------------
@@ -542,8 +547,8 @@ def run_parser(description: str) -> argparse.ArgumentParser:
     return parser
 
 
-def open_run(folder: Path, envs: Any, algos: Any) -> tuple[Settings, Env, evaluation.Policy, PyTree]:
-    """Settings, environment, policy and train states of a run folder. Executes nothing from it."""
+def open_run(folder: Path, envs: Any, algos: Any) -> tuple[Settings, Env, Algorithm, PyTree]:
+    """Settings, environment, algorithm and train states of a run folder. Executes nothing from it."""
     settings = settle(run_folder.read_config(folder), envs, algos)
     if not checkpoint.checkpoints(folder / "checkpoints"):
         raise ConfigError(f"{folder} holds no checkpoint")
@@ -561,7 +566,7 @@ def evaluate_main(envs: Any, algos: Any) -> int:
         if args.episodes < 1 or args.seed < 0:
             raise ConfigError("--episodes must be at least 1 and --seed at least 0")
         runner.use_compilation_cache()
-        settings, env, act, ts = open_run(args.run, envs, algos)
+        settings, _, algo, ts = open_run(args.run, envs, algos)
         limit = float(settings.algo.cost_limit)
         print(
             f"{settings.env_name} | {settings.algo_name} | "
@@ -569,7 +574,7 @@ def evaluate_main(envs: Any, algos: Any) -> int:
             f"deterministic policy | cost limit {limit:g}",
             flush=True,
         )
-        episodes = evaluation.run_episodes(env, act, ts, args.episodes, args.seed)
+        episodes = evaluation.run_episodes(algo, ts, args.episodes, args.seed)
         metrics = run_folder.read_metrics(args.run)
         print(evaluation.table(evaluation.summary(settings.env_name, episodes, limit, metrics)))
         return 0
@@ -588,11 +593,11 @@ def render_main(envs: Any, algos: Any) -> int:
         out = args.out or args.run / "video.mp4"
         if out.suffix not in (".mp4", ".gif"):
             raise ConfigError(f"--out {out}: expected a name that ends in .mp4 or .gif")
-        settings, env, act, states = open_run(args.run, envs, algos)
+        settings, env, algo, states = open_run(args.run, envs, algos)
         if not 0 <= args.index < settings.train.num_seeds:
             raise ConfigError(f"--index {args.index}: the run has {settings.train.num_seeds} seeds")
         ts = jax.tree.map(lambda x: x[args.index], states)
-        film(envs, env, lambda obs, key: act(ts, obs, key), out, args.seed)
+        film(envs, env, algo, ts, out, args.seed)
         print(out)
         return 0
 

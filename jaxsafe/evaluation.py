@@ -9,9 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsafe import scores
+from jaxsafe.on_policy import Algorithm
 from jaxsafe.types import Env, PyTree
-
-Policy = Callable[[PyTree, jax.Array, jax.Array], jax.Array]  # (train state, obs, key) -> action
 
 
 class Episodes(NamedTuple):
@@ -45,15 +44,17 @@ def episode(env: Env, act: Callable[[jax.Array, jax.Array], jax.Array], key: jax
     return jax.tree.map(lambda x: x.sum(0), sums)
 
 
-def run_episodes(env: Env, act: Policy, ts: PyTree, num_episodes: int, seed: int) -> Episodes:
+def run_episodes(algo: Algorithm, ts: PyTree, num_episodes: int, seed: int) -> Episodes:
     """`num_episodes` fresh episodes for each of the S train states in `ts` (leading axis), compiled.
 
-    Every train state meets the same episodes, so that seeds differ by their policy alone.
+    The policy is the deterministic one. Every train state meets the same episodes, so that seeds
+    differ by their policy alone.
     """
     keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), 0x6576616C), num_episodes)
 
     def one_seed(ts: PyTree) -> Episodes:
-        return jax.vmap(lambda key: episode(env, lambda obs, k: act(ts, obs, k), key))(keys)
+        task = algo.task(ts)
+        return jax.vmap(lambda key: episode(task, lambda obs, _: algo.act(ts, obs, None), key))(keys)
 
     return jax.tree.map(np.asarray, jax.jit(jax.vmap(one_seed))(ts))
 

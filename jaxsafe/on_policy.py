@@ -16,6 +16,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
+from jaxsafe.augment import Augmentation, nothing
 from jaxsafe.batch import all_finite, batch_mean, centre, masked_mean, psum, select, standardise
 from jaxsafe.config import ConfigError, config
 from jaxsafe.gaussian import Gaussian, entropy, log_prob, sample
@@ -107,15 +108,21 @@ class Batch:
 
 class Algorithm(NamedTuple):
     """init(key, cfg) -> ts; update(ts) -> (ts, metrics); act(ts, obs [..., O], key) -> action,
-    sampled, or the mean where key is None."""
+    sampled, or the mean where key is None; task(ts) -> the Env whose observations `act` takes."""
 
     init: Callable[[jax.Array, Any], TrainState]
     update: Callable[[TrainState], tuple[TrainState, Metrics]]
     act: Callable[[TrainState, jax.Array, jax.Array | None], jax.Array]
+    task: Callable[[TrainState], Env]
 
 
 def on_policy(
-    env: Env, treatment: Treatment, surrogate: Callable, step: Step, axis_name: str | None = None
+    env: Env,
+    treatment: Treatment,
+    surrogate: Callable,
+    step: Step,
+    axis_name: str | None = None,
+    augmentation: Augmentation = nothing,
 ) -> Algorithm:
     """Algorithms with one objective: the surrogate of the advantage that the treatment mixes."""
 
@@ -132,7 +139,7 @@ def on_policy(
         )
         return actor, opt_state, dual, metrics | treatment.metrics(dual)
 
-    return loop(env, step.init, treatment.init, improve, axis_name)
+    return loop(env, step.init, treatment.init, improve, axis_name, augmentation)
 
 
 def on_policy_pair(
@@ -183,6 +190,7 @@ def loop(
     init_dual: Callable[[Any], PyTree],
     improve: Callable[..., tuple[PyTree, PyTree, PyTree, Metrics]],
     axis_name: str | None,
+    augmentation: Augmentation = nothing,
 ) -> Algorithm:
     """The loop around `improve(ts, batch, episode_cost, episode_length, key)`, which returns
     (actor, opt_state, dual, metrics)."""
@@ -191,7 +199,9 @@ def loop(
         check(cfg)
         cfg = jax.tree.map(jnp.float32, cfg)
         params_key, rollout_key, key = jax.random.split(key, 3)
-        params = init_params(params_key, env.obs_size, env.action_size, cfg)
+        dual = init_dual(cfg)
+        wrapped = augmentation.wrap(env, cfg, dual)
+        params = init_params(params_key, wrapped.obs_size, wrapped.action_size, cfg)
         return TrainState(
             config=cfg,
             params=params,
@@ -199,13 +209,16 @@ def loop(
                 "actor": init_step(params["actor"], cfg),
                 "critics": jax.vmap(adam(cfg.critic_lr, cfg).init)(stack_critics(params)),
             },
-            dual=init_dual(cfg),
+            dual=dual,
             normaliser=init_normaliser(env.obs_size) if cfg.obs_normalize else (),
-            rollout=init_rollout(env, own(rollout_key, axis_name), cfg.num_envs, cfg.stagger),
+            rollout=init_rollout(wrapped, own(rollout_key, axis_name), cfg.num_envs, cfg.stagger),
             episode_length=jnp.float32(env.episode_length),
             key=key,
             iteration=jnp.int32(0),
         )
+
+    def task(ts: TrainState) -> Env:
+        return augmentation.wrap(env, ts.config, ts.dual)
 
     def update(ts: TrainState) -> tuple[TrainState, Metrics]:
         cfg = ts.config
@@ -216,8 +229,16 @@ def loop(
             action = sample(dist, key)
             return action, log_prob(dist, action)
 
-        rollout, traj = collect(env, behave, ts.rollout, own(rollout_key, axis_name), cfg.horizon)
-        batch, explained = estimate(ts, traj, axis_name)
+        pool = augmentation.renew(ts.rollout.pool, cfg, ts.dual)
+        rollout, traj = collect(
+            task(ts),
+            behave,
+            dataclasses.replace(ts.rollout, pool=pool),
+            own(rollout_key, axis_name),
+            cfg.horizon,
+            lambda episode: augmentation.stop(episode, cfg),
+        )
+        batch, explained = estimate(ts, traj, augmentation.reward(traj, cfg), axis_name)
         length = mean_length(ts.episode_length, traj.ended, traj.length, axis_name)
         cost_rate = batch_mean(traj.cost, axis_name)
 
@@ -226,7 +247,8 @@ def loop(
         critics, opt_critics, errors, skipped = jax.vmap(lambda c, o, y: fit(c, o, target=y))(
             stack_critics(ts.params), ts.opt_state["critics"], jnp.stack([batch.ret_r, batch.ret_c])
         )
-        normaliser = merge(ts.normaliser, traj.obs, axis_name) if cfg.obs_normalize else ()
+        seen = traj.obs[..., : env.obs_size]
+        normaliser = merge(ts.normaliser, seen, axis_name) if cfg.obs_normalize else ()
         # parameters are guarded step by step; what is not a step of a gradient is guarded here
         finite = psum(~all_finite((batch, normaliser)), axis_name) == 0
         dual, normaliser, length = select(
@@ -260,7 +282,7 @@ def loop(
         dist = policy(ts.params["actor"], see(ts, obs), ts.config)
         return dist.mean if key is None else sample(dist, key)
 
-    return Algorithm(init, update, act)
+    return Algorithm(init, update, act, task)
 
 
 def stack_critics(params: dict[str, PyTree]) -> PyTree:
@@ -274,8 +296,11 @@ def own(key: jax.Array, axis_name: str | None) -> jax.Array:
 
 
 def see(ts: TrainState, obs: jax.Array) -> jax.Array:
-    """`obs` [..., O] as the networks see it."""
-    return normalise(ts.normaliser, obs) if ts.config.obs_normalize else obs
+    """`obs` [..., O] as the networks see it: what an augmentation appended is left as it is."""
+    if not ts.config.obs_normalize:
+        return obs
+    size = ts.normaliser.mean.shape[-1]
+    return jnp.concatenate([normalise(ts.normaliser, obs[..., :size]), obs[..., size:]], -1)
 
 
 def check(cfg: Any) -> None:
@@ -292,8 +317,10 @@ def check(cfg: Any) -> None:
         )
 
 
-def estimate(ts: TrainState, traj: Trajectory, axis_name: str | None) -> tuple[Batch, Metrics]:
-    """Advantages and targets of reward and cost, under the parameters that acted."""
+def estimate(
+    ts: TrainState, traj: Trajectory, reward: jax.Array, axis_name: str | None
+) -> tuple[Batch, Metrics]:
+    """Advantages and targets of `reward` [T, N] and of cost, under the parameters that acted."""
     cfg = ts.config
     obs, next_obs = see(ts, traj.obs), see(ts, traj.next_obs)
 
@@ -303,7 +330,7 @@ def estimate(ts: TrainState, traj: Trajectory, axis_name: str | None) -> tuple[B
         adv = gae(signal, v, next_v, traj.terminated, traj.done, discount=discount, decay=decay)
         return adv, adv + v
 
-    adv_r, ret_r = both(ts.params["critic_r"], traj.reward, cfg.discount, cfg.gae_lambda)
+    adv_r, ret_r = both(ts.params["critic_r"], reward, cfg.discount, cfg.gae_lambda)
     adv_c, ret_c = both(ts.params["critic_c"], traj.cost, cfg.cost_discount, cfg.cost_gae_lambda)
     batch = Batch(
         obs=obs,

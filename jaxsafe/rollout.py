@@ -53,8 +53,8 @@ class Trajectory:
     """T steps of N environments; every field is [T, N, ...].
 
     obs is before the step and next_obs after it, before any reset; truncated means out of time and
-    not terminated; done is either. ended marks complete episodes that end with this step; there
-    episode and length (int32, steps) are their sums.
+    not terminated; done is either. episode and length (int32, steps) are sums so far, this step
+    included; ended marks complete episodes that end with it.
     """
 
     obs: jax.Array
@@ -92,13 +92,23 @@ def reset_all(env: Env, key: jax.Array, num_envs: int) -> State:
     return jax.vmap(env.reset)(jax.random.split(key, num_envs))
 
 
+def never(episode: Episode) -> jax.Array:
+    return jnp.bool_(False)
+
+
 def collect(
-    env: Env, policy_fn: PolicyFn, rollout: RolloutState, key: jax.Array, horizon: int
+    env: Env,
+    policy_fn: PolicyFn,
+    rollout: RolloutState,
+    key: jax.Array,
+    horizon: int,
+    stop: Callable[[Episode], jax.Array] = never,
 ) -> tuple[RolloutState, Trajectory]:
     """Step all environments `horizon` times.
 
     Args:
         policy_fn: (obs [N, O], key) -> action [N, A], log_prob [N].
+        stop: sums so far -> bool [N], where a step terminates its episode besides the environment.
     """
 
     def step(rollout: RolloutState, key: jax.Array) -> tuple[RolloutState, Trajectory]:
@@ -107,10 +117,11 @@ def collect(
         action, log_prob = policy_fn(obs, action_key)
         state = jax.vmap(env.step)(rollout.state, action)
         steps = rollout.steps + 1
-        truncated = (steps >= env.episode_length) & ~state.terminated
-        done = state.terminated | truncated
         last = Episode(state.reward, state.cost, state.costs, state.info)
         episode = jax.tree.map(jnp.add, rollout.episode, last)
+        terminated = state.terminated | stop(episode)
+        truncated = (steps >= env.episode_length) & ~terminated
+        done = terminated | truncated
         record = Trajectory(
             obs=obs,
             action=action,
@@ -118,7 +129,7 @@ def collect(
             reward=state.reward,
             cost=state.cost,
             costs=state.costs,
-            terminated=state.terminated,
+            terminated=terminated,
             truncated=truncated,
             done=done,
             next_obs=state.obs,

@@ -10,7 +10,7 @@ import dataclasses
 import math
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,7 +27,8 @@ from jaxsafe.types import Env, PyTree
 
 AXIS = "devices"
 OVERFLOW = "train/overflow"  # steps of an episode in which engine warp ran out of room
-POLICY = ("params", "normaliser")  # the fields of a train state that `act` reads
+POLICY = ("params", "normaliser")  # the fields of a train state that another run can start from
+ACTING = (*POLICY, "dual")  # what an algorithm's `act` and `task` read, beside its config
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -356,18 +357,22 @@ def mean(values: np.ndarray) -> float:
 # ---- the policy alone: other runs start from it, evaluation needs nothing else ----------------
 
 
-def read_policy(folder: Path, warn: Callable[[str], None] | None = None) -> dict[str, np.ndarray]:
-    """Parameters and normaliser in the newest checkpoint of a run folder, by leaf name, [rows, ...]."""
+def read_policy(
+    folder: Path, warn: Callable[[str], None] | None = None, fields: Sequence[str] = POLICY
+) -> dict[str, np.ndarray]:
+    """`fields` of the newest checkpoint of a run folder, by leaf name, [rows, ...]."""
     arrays, _ = checkpoint.load(folder / "checkpoints", warn)
     # rows beyond the seeds are the copies on the other devices of a split seed
     rows = max(1, int(run_folder.read_config(folder).get("num_seeds", 1)))
-    return {name: x[:rows] for name, x in arrays.items() if name.split(".")[0] in POLICY}
+    return {name: x[:rows] for name, x in arrays.items() if name.split(".")[0] in fields}
 
 
-def check_policy(like: PyTree, policy: dict[str, np.ndarray], source: Path) -> None:
-    """Raise ConfigError unless `policy` fits the train state `like`, apart from the number of rows."""
+def check_policy(
+    like: PyTree, policy: dict[str, np.ndarray], source: Path, fields: Sequence[str] = POLICY
+) -> None:
+    """Raise ConfigError unless `policy` fits `fields` of the train state `like`, whatever its rows."""
     expected = dict(zip(checkpoint.leaf_names(like), jax.tree.leaves(like), strict=True))
-    expected = {k: v for k, v in expected.items() if k.split(".")[0] in POLICY}
+    expected = {k: v for k, v in expected.items() if k.split(".")[0] in fields}
     for name in sorted({*expected, *policy}):
         have, want = (
             str(list(x[name].shape[1:])) if name in x else "absent" for x in (policy, expected)
@@ -394,7 +399,7 @@ def with_policy(ts: PyTree, policy: dict[str, np.ndarray]) -> PyTree:
 def policy_state(like: PyTree, policy: dict[str, np.ndarray], rows: int, source: Path) -> PyTree:
     """A train state with `rows` policies and zeros elsewhere; `like` is one, without that axis."""
     like = jax.tree.map(lambda x: jax.ShapeDtypeStruct((rows, *x.shape), x.dtype), like)
-    check_policy(like, policy, source)
+    check_policy(like, policy, source, ACTING)
     arrays = {
         name: policy[name] if name in policy else np.zeros(x.shape, x.dtype)
         for name, x in checkpoint.as_data(like).items()

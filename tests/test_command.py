@@ -246,23 +246,25 @@ def test_evaluate_prints_the_table(finished, tmp_path):
         assert any(line.startswith(row) for line in out.splitlines())
 
 
-def test_the_policy_of_a_run_is_read_whatever_its_minibatches_divide(tmp_path):
+@pytest.mark.parametrize("name", ["ppo_lag", "ppo_simmer_pid"])
+def test_the_policy_of_a_run_is_read_whatever_its_minibatches_divide(tmp_path, name):
     """Only the whole batch, 8 x 5, divides by 4: one environment's steps do not."""
     base: dict[str, Any] = {"env": {"name": "point_goal0", "num_steps": 40}}
-    base["algo"] = {"name": "ppo_lag", "num_envs": 8, "horizon": 5, "minibatches": 4, "hidden": [8, 8]}
+    base["algo"] = {"name": name, "num_envs": 8, "horizon": 5, "minibatches": 4, "hidden": [8, 8]}
     run = command.settle(base, envs, algos)
-    env, make = command.make_env(run, envs), algos.ALGOS["ppo_lag"].make
+    env, make = command.make_env(run, envs), algos.ALGOS[name].make
     program = runner.build(env, make, run.algo, run.train)
     zeros = jax.tree.map(
         lambda x: np.zeros(x.shape, x.dtype),
-        {k: getattr(jax.eval_shape(program.init, program.keys), k) for k in runner.POLICY},
+        {k: getattr(jax.eval_shape(program.init, program.keys), k) for k in runner.ACTING},
     )
     run_folder.write_config(tmp_path, run.plain())
     checkpoint.save(tmp_path / "checkpoints", zeros, 1, 40)
-    act, ts = command.policy_of(run, env, algos, tmp_path)
+    algo, ts = command.policy_of(run, env, algos, tmp_path)
     ts = jax.tree.map(lambda x: x[0], ts)
-    action = act(ts, jnp.zeros((1, env.obs_size)), jax.random.key(0))
+    action = algo.act(ts, jnp.zeros((1, algo.task(ts).obs_size)), None)
     assert action.shape == (1, env.action_size)
+    assert ts.config.cost_limit == 25.0  # of the settings: `task` may need it
 
 
 def test_evaluate_and_render_refuse_a_bad_folder_in_one_line(tmp_path, monkeypatch, capsys):

@@ -138,7 +138,7 @@ def test_an_episode_is_drawn_at_most_at_30_frames_a_second_and_until_it_terminat
     zero = lambda obs, key: jnp.zeros(2)  # noqa: E731
     env, _ = reset("point_goal0", num_steps=12)
     assert env.step_seconds == pytest.approx(0.02)
-    size = {"width": 64, "height": 48}
+    size: Any = {"width": 64, "height": 48}
     assert len(render.render_episode(env, zero, jax.random.key(0), **size)) == 7  # steps 0, 2, ..., 12
     assert len(render.render_episode(env, zero, jax.random.key(0), length=4, every=1, **size)) == 5
     at_goal, _ = reset("point_goal0", num_steps=12, continue_goal=False, goal_size=9.0)

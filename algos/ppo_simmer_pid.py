@@ -1,0 +1,56 @@
+"""PPO-Simmer: PPO-Saute whose episodes start with a part of the budget that a controller raises.
+
+    z_0 = B / cost_limit, then z, the reward and the step as in PPO-Saute
+    B = clip(d + u, 0, cost_limit),   u = clip(K_p e + K_i sum e + K_aw (u' - u'_raw), -U, U)
+    e = s e' + (1 - s) (d - J_c),   once an iteration; ' is the iteration before
+
+d rises on a line to cost_limit: the task starts safer than it has to be, and simmers up. u' is what
+the clips left of u'_raw, both at U and at the bounds of B, so that the sum does not wind up.
+
+Source: Sootla et al. (2022), "Effects of Safety State Augmentation on Safe Exploration",
+arXiv:2206.02675, PI Simmer; the filter, the sum over the last `simmer_window` errors and both clips
+are from the authors' code.
+Differs from it: d is a line, there a staircase. OmniSafe has B' for d, so that u adds up, and calls
+K_aw a derivative's gain; its episodes after the first of an epoch start at z = 1.
+"""
+
+from typing import Any
+
+from jaxsafe.algos import ppo
+from jaxsafe.augment import SimmerConfig, schedule, simmer
+from jaxsafe.config import config
+from jaxsafe.on_policy import Algorithm, on_policy
+from jaxsafe.steps import adam_epochs
+from jaxsafe.surrogates import clipped
+from jaxsafe.types import Env
+
+
+@config
+class PPOSimmerPIDConfig(SimmerConfig, ppo.PPOConfig):
+    pass
+
+
+# What PPOSimmerPID.yaml and TRPOSimmerPID.yaml add to those of PPO and TRPO: a budget that starts at
+# its bound, and steps of at most 1 of 25.
+OMNISAFE_SIMMER: dict[str, Any] = {
+    "saute_discount": 0.999,
+    "unsafe_reward": -1.0,
+    "budget_init": 1.0,
+    "budget_reach": 0.04,
+    "simmer_kp": 5e-4,
+    "simmer_ki": 1e-5,
+    "simmer_kaw": 0.0,
+    "simmer_smoothing": 0.995,
+    "simmer_window": 10,
+}
+
+# For Point and Car on Goal, and Point on Circle, PPOSimmerPID.yaml adds what PPOSaute.yaml does:
+# algo.saute_discount=0.9999 algo.unsafe_reward=-0.2 algo.epochs=80 algo.critic_epochs=80, and on Goal
+# algo.obs_normalize=false.
+PUBLISHED: dict[str, dict[str, Any]] = {
+    name: options | OMNISAFE_SIMMER for name, options in ppo.PUBLISHED.items()
+}
+
+
+def make(env: Env, axis_name: str | None = None) -> Algorithm:
+    return on_policy(env, schedule, clipped, adam_epochs, axis_name, simmer)
