@@ -13,6 +13,7 @@ import pytest
 from tasks import FAST
 from toys import Clock, Corridor, Lever
 
+from jaxsafe import evaluation
 from jaxsafe.algos import ALGOS
 from jaxsafe.config import ConfigError
 
@@ -230,21 +231,40 @@ PRICED: dict[str, dict[str, Any]] = {
 }
 
 
-def pull_levers(name, settings, iterations=100, window=30):
-    """Return and cost of an episode on Lever after training with a cost limit of 2.5, 2 seeds."""
+# A time limit bootstraps, so what is left of a budget is worth as much as the rewards it would buy
+# beyond the limit: the less, the more they are discounted. At 0.99 a third of it is saved.
+BUDGETED = {"unsafe_reward": -1.0, "discount": 0.9}
+SIMMERED = BUDGETED | {"budget_ramp": 50.0}
+AUGMENTED: dict[str, dict[str, Any]] = {
+    "ppo_early_terminated": FIRST_ORDER,
+    "ppo_saute": FIRST_ORDER | BUDGETED,
+    "ppo_simmer_pid": FIRST_ORDER | SIMMERED,
+    "trpo_early_terminated": {},
+    "trpo_saute": BUDGETED,
+    "trpo_simmer_pid": SIMMERED,
+}
+
+
+def train_on_levers(name, settings, iterations=100):
+    """2 seeds on Lever with a cost limit of 2.5: the algorithm, the train states, their metrics."""
     algo = ALGOS[name].make(Lever())
     sizes: dict[str, Any] = {"num_envs": 32, "horizon": 20, "minibatches": 2, "critic_epochs": 4}
     cfg = ALGOS[name].config(**sizes, hidden=(16,), cost_limit=2.5, **settings)
 
     def train(key):
-        return jax.lax.scan(lambda ts, _: algo.update(ts), algo.init(key, cfg), None, iterations)[1]
+        return jax.lax.scan(lambda ts, _: algo.update(ts), algo.init(key, cfg), None, iterations)
 
-    metrics = jax.jit(jax.vmap(train))(jax.random.split(jax.random.key(0), 2))
+    return algo, *jax.jit(jax.vmap(train))(jax.random.split(jax.random.key(0), 2))
+
+
+def pull_levers(name, settings, iterations=100, window=30):
+    """Return and cost of an episode at the end of that, over the last iterations."""
+    _, _, metrics = train_on_levers(name, settings, iterations)
     return tuple(np.asarray(metrics[k])[:, -window:].mean(1) for k in ("train/return", "train/cost"))
 
 
 def test_every_algorithm_pulls_levers():
-    assert sorted([*UNCONSTRAINED, *CONSTRAINED, *PRICED, "ppo_penalty"]) == NAMES
+    assert sorted([*UNCONSTRAINED, *CONSTRAINED, *PRICED, *AUGMENTED, "ppo_penalty"]) == NAMES
 
 
 def test_a_fixed_price_is_paid_until_cost_is_not_worth_it():
@@ -264,6 +284,17 @@ def test_constrained_algorithms_earn_what_the_limit_allows(name):
     ret, cost = pull_levers(name, CONSTRAINED[name])
     assert (cost < 2.5 * 1.1).all()
     assert (ret > 0.9 * 14.375).all()  # the best within the limit
+
+
+@pytest.mark.parametrize("name", AUGMENTED)
+def test_a_budget_or_an_early_end_holds_the_limit_in_every_episode(name):
+    """Up to 1 in 50: the policy is a smooth function, and is paid to come near the limit."""
+    algo, ts, metrics = train_on_levers(name, AUGMENTED[name])
+    whole = evaluation.run_episodes(algo, ts, 200, seed=0)
+    assert (whole.length == 10).all()
+    assert (whole.cost > 2.5).mean() < 0.02
+    assert (whole.ret.mean(1) > 0.9 * 14.375).all()  # the best within the limit
+    assert (metrics["train/episode_length"][:, -30:] > 9.5).all()
 
 
 @pytest.mark.parametrize("name", PRICED)
