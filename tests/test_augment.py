@@ -229,8 +229,7 @@ def test_a_schedule_comes_back_from_a_checkpoint(tmp_path):
 @pytest.mark.parametrize("limit, length", [(5.0, 3), (6.0, 4), (9.0, 5)])
 def test_an_episode_ends_for_good_where_it_breaks_the_limit(limit, length):
     cfg = ALGOS["ppo_early_terminated"].config(cost_limit=limit, termination_reward=-7.0)
-    stop = partial(augment.early.stop, cfg=cfg)
-    traj = run(Clock(episode_length=5), 2, 20, idle, stop=stop)
+    traj = run(Clock(episode_length=5), 2, 20, idle, stop=lambda sums: augment.early.stop(sums, cfg))
     ends = np.arange(length - 1, 20, length)
     np.testing.assert_array_equal(np.flatnonzero(traj.terminated[:, 0]), ends)
     assert not traj.truncated.any()
@@ -242,8 +241,8 @@ def test_an_episode_ends_for_good_where_it_breaks_the_limit(limit, length):
 
 
 def test_the_count_of_cost_begins_anew_with_every_episode():
-    stop = partial(augment.early.stop, cfg=ALGOS["ppo_early_terminated"].config(cost_limit=10.0))
-    traj = run(Clock(episode_length=5), 2, 20, idle, stop=stop)  # 10 an episode
+    cfg = ALGOS["ppo_early_terminated"].config(cost_limit=10.0)  # what an episode costs
+    traj = run(Clock(episode_length=5), 2, 20, idle, stop=lambda sums: augment.early.stop(sums, cfg))
     assert not traj.terminated.any() and traj.truncated.sum() == 8
 
 

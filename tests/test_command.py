@@ -254,17 +254,18 @@ def test_the_policy_of_a_run_is_read_whatever_its_minibatches_divide(tmp_path, n
     run = command.settle(base, envs, algos)
     env, make = command.make_env(run, envs), algos.ALGOS[name].make
     program = runner.build(env, make, run.algo, run.train)
-    zeros = jax.tree.map(
-        lambda x: np.zeros(x.shape, x.dtype),
+    ones = jax.tree.map(
+        lambda x: np.ones(x.shape, x.dtype),
         {k: getattr(jax.eval_shape(program.init, program.keys), k) for k in runner.ACTING},
     )
     run_folder.write_config(tmp_path, run.plain())
-    checkpoint.save(tmp_path / "checkpoints", zeros, 1, 40)
+    checkpoint.save(tmp_path / "checkpoints", ones, 1, 40)
     algo, ts = command.policy_of(run, env, algos, tmp_path)
     ts = jax.tree.map(lambda x: x[0], ts)
     action = algo.act(ts, jnp.zeros((1, algo.task(ts).obs_size)), None)
     assert action.shape == (1, env.action_size)
-    assert ts.config.cost_limit == 25.0  # of the settings: `task` may need it
+    assert ts.config.cost_limit == 25.0  # `task` may need the settings, and the dual
+    assert all((x == 1).all() for x in jax.tree.leaves((ts.params, ts.normaliser, ts.dual)))
 
 
 def test_evaluate_and_render_refuse_a_bad_folder_in_one_line(tmp_path, monkeypatch, capsys):

@@ -128,6 +128,14 @@ def test_the_halo_shows_the_lidars_of_the_observation(display, flat):
     assert with_halo - plain._geoms.ngeom == 3 * env.config.lidar_num_bins  # goal, hazards, vases
 
 
+def test_what_an_algorithm_appends_to_an_observation_is_not_drawn():
+    obs, spec = np.arange(5.0), {"goal_lidar": (3,), "velocimeter": (2,)}
+    for seen in (obs, np.append(obs, 9.0)):
+        parts = render.split(seen, spec)
+        np.testing.assert_array_equal(parts["goal_lidar"], [0, 1, 2])
+        np.testing.assert_array_equal(parts["velocimeter"], [3, 4])
+
+
 def test_an_unknown_camera_is_named_with_the_nearest():
     env, _ = reset("point_goal0")
     with pytest.raises(ConfigError, match=r"'fixedfur'.*fixedfar"):
