@@ -35,7 +35,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 import jaxsafe
 from jaxsafe import checkpoint, evaluation, plots, run_folder, runner
-from jaxsafe.config import ConfigError, from_dict, nearest
+from jaxsafe.config import ConfigError, float_fields, from_dict, nearest
 from jaxsafe.on_policy import Algorithm
 from jaxsafe.progress import Report
 from jaxsafe.types import Env, PyTree
@@ -77,15 +77,23 @@ class Settings(NamedTuple):
     env_name: str
     env_options: dict[str, Any]  # all of them
     algo_name: str
-    algo: Any  # the algorithm's config
+    configs: tuple[Any, ...]  # the algorithm's, one a setting; they differ in floats alone
     train: runner.TrainConfig
 
+    @property
+    def algo(self) -> Any:
+        """The first setting, for what all have in common."""
+        return self.configs[0]
+
     def plain(self) -> dict[str, Any]:
-        """As config.yaml has it."""
+        """As config.yaml has it: a float in which the settings differ is a list of one a setting."""
+        fields = [dataclasses.asdict(cfg) for cfg in self.configs]
+        swept = [name for name in fields[0] if any(f[name] != fields[0][name] for f in fields)]
+        algo = fields[0] | {name: [f[name] for f in fields] for name in swept}
         return to_plain(
             {
                 "env": {"name": self.env_name, **self.env_options},
-                "algo": {"name": self.algo_name, **dataclasses.asdict(self.algo)},
+                "algo": {"name": self.algo_name, **algo},
                 **dataclasses.asdict(self.train),
             }
         )
@@ -287,15 +295,35 @@ def settle(config: dict[str, Any], envs: Any, algos: Any) -> Settings:
     for name in env:
         if name not in defaults:
             raise ConfigError(f"unknown option env.{name}{nearest(name, defaults)}")
-    algo_config = from_dict(algos.ALGOS[algo_name].config, algo, "algo.")
-    for name, value in dataclasses.asdict(algo_config).items():
+    kind = algos.ALGOS[algo_name].config
+    configs = tuple(from_dict(kind, setting, "algo.") for setting in settings_in(algo, kind))
+    for name, value in (pair for cfg in configs for pair in dataclasses.asdict(cfg).items()):
         low, high = BOUNDS.get(name, (-math.inf, math.inf))
         if isinstance(value, int | float) and not low <= value <= high:  # NaN is in no interval
             expected = f"at least {low:g}" if high == math.inf else f"between {low:g} and {high:g}"
             raise ConfigError(
                 f"algo.{name}={value}: expected {expected if name in BOUNDS else 'a number'}"
             )
-    return Settings(env_name, to_plain({**defaults, **env}), algo_name, algo_config, train)
+    return Settings(env_name, to_plain({**defaults, **env}), algo_name, configs, train)
+
+
+def settings_in(algo: dict[str, Any], kind: type) -> list[dict[str, Any]]:
+    """One set of options a setting, where lists stand for floats: the first of each, the second, ..."""
+    lists = {
+        name: algo[name] for name in float_fields(kind) if isinstance(algo.get(name), list | tuple)
+    }
+    lengths = {name: len(values) for name, values in lists.items()}
+    if len({*lengths.values()}) > 1 or 0 in lengths.values():
+        raise ConfigError(
+            "lists of numbers stand for settings, one from each: expected equal lengths, not "
+            + ", ".join(f"{n} of algo.{name}" for name, n in lengths.items())
+        )
+    rows = list(zip(*lists.values(), strict=True)) or [()]
+    for row in rows:
+        if rows.count(row) > 1:
+            same = ", ".join(f"algo.{name}={v}" for name, v in zip(lists, row, strict=True))
+            raise ConfigError(f"{same} occurs twice")
+    return [algo | dict(zip(lists, row, strict=True)) for row in rows]
 
 
 def make_env(settings: Settings, envs: Any) -> Env:
@@ -368,24 +396,40 @@ def same(settings: Settings, folder: Path, envs: Any, algos: Any) -> bool:
 # ---- a run -----------------------------------------------------------------------------------
 
 
-def run(settings: Settings, envs: Any, algos: Any, job: int | None = None) -> int:
-    """Train, then draw, evaluate and film. Returns the exit status."""
+def prepare(settings: Settings, envs: Any, algos: Any) -> tuple[Env, runner.Program]:
+    """The environment and the program to train, not yet compiled.
+
+    Raises:
+        ConfigError: sizes that do not fit each other, the devices or, as runner.TooLarge, the memory.
+    """
+    train = settings.train
     runner.use_compilation_cache()
-    report = Report()
-    folder = choose_folder(settings, envs, algos, job, report.line)
-    train, cfg = settings.train, settings.algo
     runner.check_devices(train)
     env = make_env(settings, envs)
-    runner.check_memory(env, cfg, train)
-    program = runner.build(env, algos.ALGOS[settings.algo_name].make, cfg, train)
+    runner.check_memory(env, settings.algo, len(settings.configs) * train.num_seeds, train.devices)
+    program = runner.build(env, algos.ALGOS[settings.algo_name].make, settings.configs, train)
     runner.check_state_memory(program, train)
+    return env, program
+
+
+def run(
+    settings: Settings,
+    env: Env,
+    program: runner.Program,
+    folder: Path,
+    envs: Any,
+    algos: Any,
+    report: Report,
+    again: str,
+) -> int:
+    """Train in `folder`, then draw, evaluate and film. `again` is the command that continues this.
+
+    Returns the exit status.
+    """
+    train, cfg = settings.train, settings.algo
     adapt = None
     if train.init_from is not None and run_folder.progress(folder) is None:
-        source = Path(train.init_from).expanduser()
-        run_folder.read_config(source)
-        policy = runner.read_policy(source, report.line)
-        runner.check_policy(jax.eval_shape(program.init, program.keys), policy, source)
-        adapt = lambda ts: runner.with_policy(ts, policy)  # noqa: E731
+        adapt = warm_start(settings, program, envs, algos, report.line)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         run_folder.write_config(folder, settings.plain())
@@ -393,14 +437,14 @@ def run(settings: Settings, envs: Any, algos: Any, job: int | None = None) -> in
         run_folder.append_versions(folder, runner.device_name(), engine)
     except OSError as error:
         raise checkpoint.CheckpointError(f"cannot write to {folder}: {error.strerror}") from error
+    several = f"{len(settings.configs)} settings x " if len(settings.configs) > 1 else ""
     seeds = f"{train.num_seeds} seed{'s' if train.num_seeds > 1 else ''} x {cfg.num_envs} envs"
     where = runner.device_name() + (f" x {train.devices}" if train.devices > 1 else "")
     report.line(
-        f"jaxsafe {jaxsafe.__version__} | {settings.env_name} | {settings.algo_name} | {seeds} | "
-        f"{where}, engine {engine} | compiling rollout and update ..."
+        f"jaxsafe {jaxsafe.__version__} | {settings.env_name} | {settings.algo_name} | "
+        f"{several}{seeds} | {where}, engine {engine} | compiling rollout and update ..."
     )
-    again = f"python scripts/train.py resume={shlex.quote(str(folder))}"
-    outcome = runner.train(program, cfg, train, folder, report, again, adapt)
+    outcome = runner.train(program, train, folder, report, again, adapt)
     if outcome.interrupted:
         return 130
     finish(settings, env, envs, algos, folder, report)
@@ -408,27 +452,89 @@ def run(settings: Settings, envs: Any, algos: Any, job: int | None = None) -> in
     return 0
 
 
+def warm_start(
+    settings: Settings, program: runner.Program, envs: Any, algos: Any, say: Callable[[str], None]
+) -> Callable[[PyTree], PyTree]:
+    """What gives a fresh train state the parameters and normalisers of the run `init_from`.
+
+    A seed starts from the same seed there, or, where there is none, from the one it equals modulo
+    their number; of settings trained side by side there, the first counts.
+
+    Raises:
+        ConfigError: no run, or one whose networks have other shapes.
+    """
+    source = Path(settings.train.init_from or "").expanduser()
+    saved = settle(run_folder.read_config(source), envs, algos)
+    if not checkpoint.checkpoints(source / "checkpoints"):
+        raise ConfigError(f"init_from={source} holds no checkpoint")
+    first, count = saved.train.seed, saved.train.num_seeds
+    policy = runner.read_policy(source, count, say)
+    there, here = flat(saved.plain()), flat(settings.plain())
+    options = [k for k in here if k.startswith("env.") and saved.env_name == settings.env_name]
+    differ = [
+        f"{name} is {there.get(name)} there, {here[name]} here"
+        for name in ("env.name", "algo.hidden", "algo.obs_normalize", *options)
+        if there.get(name) != here[name]
+    ]
+    like = jax.eval_shape(program.init, program.start)
+    runner.check_policy(like, policy, source, why="; ".join(["", *differ[:3]]))
+    rows = [(m.seed - first) % count for m in program.members]
+    pairs = {m.seed: first + row for m, row in zip(program.members, rows, strict=True)}
+    of = f" of its setting {runner.members(saved.configs, saved.train)[0].setting}"
+    say(
+        f"starting from {source}: seed "
+        + ", ".join(f"{seed} from its seed {old}" for seed, old in pairs.items())
+        + of * (len(saved.configs) > 1)
+    )
+    return lambda ts: runner.with_policy(ts, policy, rows)
+
+
+class Scores(NamedTuple):
+    """What evaluation found for one setting."""
+
+    name: str  # '' where there is but one
+    cost_limit: float
+    episodes: int  # of all its seeds
+    rows: dict[str, evaluation.Estimate]
+
+
+def evaluate(
+    settings: Settings, algo: Algorithm, ts: PyTree, num: int, seed: int, folder: Path
+) -> list[Scores]:
+    """`num` fresh episodes of each seed in each setting."""
+    episodes = evaluation.run_episodes(algo, ts, num, seed)
+    tables = list(run_folder.by_setting(run_folder.read_metrics(folder)).values())
+    seeds, scores = settings.train.num_seeds, []
+    for i, member in enumerate(runner.members(settings.configs, settings.train)[::seeds]):
+        own = evaluation.Episodes(*(x[i * seeds : (i + 1) * seeds] for x in episodes))
+        limit, metrics = float(member.algo.cost_limit), tables[i] if i < len(tables) else {}
+        rows = evaluation.summary(settings.env_name, own, limit, metrics)
+        scores.append(Scores(member.setting, limit, own.ret.size, rows))
+    return scores
+
+
 def finish(settings: Settings, env: Env, envs: Any, algos: Any, folder: Path, report: Report) -> None:
     """Curves, evaluation and video. What fails costs one line, never the training."""
     train = settings.train
-    limit = float(settings.algo.cost_limit)
     title = f"{settings.env_name}, {settings.algo_name}"
     policy = functools.cache(lambda: policy_of(settings, env, algos, folder))
 
     def curves() -> None:
+        limit = float(settings.algo.cost_limit)
         plots.curves(run_folder.read_metrics(folder), folder / "curves.png", title, limit)
 
-    def evaluate() -> None:
-        episodes = evaluation.run_episodes(*policy(), train.eval_episodes, seed=train.seed)
-        rows = evaluation.summary(settings.env_name, episodes, limit, run_folder.read_metrics(folder))
-        text = json.dumps({"episodes": train.eval_episodes, **evaluation.as_json(rows)}, indent=1)
+    def scores() -> None:
+        found = evaluate(settings, *policy(), train.eval_episodes, train.seed, folder)
+        tables = {s.name: evaluation.as_json(s.rows) for s in found}
+        text = json.dumps({"episodes": train.eval_episodes, **tables.get("", tables)}, indent=1)
         run_folder.replace_text(folder / "evaluation.json", text)
-        ret, cost, rate = rows["return"], rows["cost"], rows["violation rate"]
-        report.line(
-            f"final policy: return {ret.mean:.4g} [{ret.low:.4g}, {ret.high:.4g}], "
-            f"cost {cost.mean:.4g} [{cost.low:.4g}, {cost.high:.4g}] (limit {limit:g}), "
-            f"{100 * rate.mean:.0f}% of {episodes.ret.size} episodes over it"
-        )
+        for name, limit, episodes, rows in found:
+            ret, cost, rate = rows["return"], rows["cost"], rows["violation rate"]
+            report.line(
+                f"final policy{name and ', ' + name}: return {ret.mean:.4g} [{ret.low:.4g}, "
+                f"{ret.high:.4g}], cost {cost.mean:.4g} [{cost.low:.4g}, {cost.high:.4g}] "
+                f"(limit {limit:g}), {100 * rate.mean:.0f}% of {episodes} episodes over it"
+            )
 
     def video() -> None:
         algo, ts = policy()
@@ -437,7 +543,7 @@ def finish(settings: Settings, env: Env, envs: Any, algos: Any, folder: Path, re
 
     wanted = {
         "curves": (curves, True),
-        "evaluation": (evaluate, train.eval_episodes > 0),
+        "evaluation": (scores, train.eval_episodes > 0),
         "video": (video, train.video),
     }
     for name, (task, yes) in wanted.items():
@@ -472,13 +578,27 @@ def film(envs: Any, env: Env, algo: Algorithm, ts: PyTree, path: Path, seed: int
 def policy_of(settings: Settings, env: Env, algos: Any, folder: Path) -> tuple[Algorithm, PyTree]:
     """The algorithm, and the newest policy of each seed in a train state."""
     algo = algos.ALGOS[settings.algo_name].make(env, None)
-    alone = dataclasses.replace(settings.algo, num_envs=1, horizon=1, minibatches=1)
-    floats = jax.tree.map(np.float32, alone)
-    state = jax.eval_shape(lambda: algo.init(jax.random.key(0), floats))
-    arrays = runner.read_policy(folder, fields=runner.ACTING)
-    rows = settings.train.num_seeds
-    ts = runner.policy_state(state, arrays, rows, folder)
-    return algo, dataclasses.replace(ts, config=jax.tree.map(lambda x: np.repeat(x, rows), floats))
+
+    def one_step(cfg: Any) -> Any:
+        return dataclasses.replace(cfg, num_envs=1, horizon=1, minibatches=1)
+
+    state = jax.eval_shape(
+        lambda: algo.init(jax.random.key(0), jax.tree.map(np.float32, one_step(settings.algo)))
+    )
+    members = runner.members(settings.configs, settings.train)
+    arrays = runner.read_policy(folder, len(members), fields=runner.ACTING)
+    ts = runner.policy_state(state, arrays, len(members), folder)
+    floats = jax.tree.map(lambda *x: np.array(x, np.float32), *[one_step(m.algo) for m in members])
+    return algo, dataclasses.replace(ts, config=floats)
+
+
+def compose(texts: list[str], envs: Any, algos: Any) -> Settings:
+    """The settings that train.py would have from these arguments."""
+    request = read_arguments(texts, envs, algos)
+    register(request)
+    with hydra.initialize(version_base="1.3", config_path=None):
+        config = hydra.compose("train", overrides=request.argv)
+    return settle(OmegaConf.to_container(config, resolve=True), envs, algos)  # type: ignore[arg-type]
 
 
 # ---- entry points ----------------------------------------------------------------------------
@@ -490,8 +610,15 @@ def train_main(envs: Any, algos: Any) -> int:
     def job(config: Any) -> None:
         plain = OmegaConf.to_container(config, resolve=True)
         number = HydraConfig.get().job.num if HydraConfig.get().mode == RunMode.MULTIRUN else None
-        # guarded here already: Hydra prints the overrides of a job that raises
-        status = guarded(lambda: run(settle(plain, envs, algos), envs, algos, number))  # type: ignore[arg-type]
+
+        def train() -> int:
+            settings, report = settle(plain, envs, algos), Report()  # type: ignore[arg-type]
+            folder = choose_folder(settings, envs, algos, number, report.line)
+            env, program = prepare(settings, envs, algos)
+            again = f"python scripts/train.py resume={shlex.quote(str(folder))}"
+            return run(settings, env, program, folder, envs, algos, report, again)
+
+        status = guarded(train)  # here already: Hydra prints the overrides of a job that raises
         if status:
             raise SystemExit(status)
 
@@ -567,16 +694,18 @@ def evaluate_main(envs: Any, algos: Any) -> int:
             raise ConfigError("--episodes must be at least 1 and --seed at least 0")
         runner.use_compilation_cache()
         settings, _, algo, ts = open_run(args.run, envs, algos)
-        limit = float(settings.algo.cost_limit)
+        alone = len(settings.configs) == 1
         print(
             f"{settings.env_name} | {settings.algo_name} | "
-            f"{settings.train.num_seeds} x {args.episodes} episodes, "
-            f"deterministic policy | cost limit {limit:g}",
+            f"{settings.train.num_seeds} x {args.episodes} episodes, deterministic policy"
+            + f" | cost limit {settings.algo.cost_limit:g}"
+            * alone,
             flush=True,
         )
-        episodes = evaluation.run_episodes(algo, ts, args.episodes, args.seed)
-        metrics = run_folder.read_metrics(args.run)
-        print(evaluation.table(evaluation.summary(settings.env_name, episodes, limit, metrics)))
+        for s in evaluate(settings, algo, ts, args.episodes, args.seed, args.run):
+            if not alone:
+                print(f"\n{s.name} | cost limit {s.cost_limit:g}")
+            print(evaluation.table(s.rows))
         return 0
 
     return guarded(command)
@@ -588,14 +717,16 @@ def render_main(envs: Any, algos: Any) -> int:
     def command() -> int:
         parser = run_parser("Film one episode of the policy of a run.")
         parser.add_argument("--out", type=Path, help="an .mp4 or .gif (default RUN/video.mp4)")
-        parser.add_argument("--index", type=int, default=0, help="which of the run's seeds (default 0)")
+        parser.add_argument(
+            "--index", type=int, default=0, help="which of the run's policies (default 0)"
+        )
         args = parser.parse_args()
         out = args.out or args.run / "video.mp4"
         if out.suffix not in (".mp4", ".gif"):
             raise ConfigError(f"--out {out}: expected a name that ends in .mp4 or .gif")
         settings, env, algo, states = open_run(args.run, envs, algos)
-        if not 0 <= args.index < settings.train.num_seeds:
-            raise ConfigError(f"--index {args.index}: the run has {settings.train.num_seeds} seeds")
+        if not 0 <= args.index < (rows := len(settings.configs) * settings.train.num_seeds):
+            raise ConfigError(f"--index {args.index}: the run has {rows} policies")
         ts = jax.tree.map(lambda x: x[args.index], states)
         film(envs, env, algo, ts, out, args.seed)
         print(out)

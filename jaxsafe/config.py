@@ -25,11 +25,15 @@ def config(cls: type[T]) -> type[T]:
     field is a new program.
     """
     cls = dataclasses.dataclass(frozen=True, kw_only=True)(cls)
-    hints = typing.get_type_hints(cls)
-    leaves = [f.name for f in dataclasses.fields(cls) if hints[f.name] is float]  # type: ignore[arg-type]
-    static = [f.name for f in dataclasses.fields(cls) if hints[f.name] is not float]  # type: ignore[arg-type]
+    leaves = float_fields(cls)
+    static = [f.name for f in dataclasses.fields(cls) if f.name not in leaves]  # type: ignore[arg-type]
     jax.tree_util.register_dataclass(cls, data_fields=leaves, meta_fields=static)
     return cls
+
+
+def float_fields(cls: type) -> list[str]:
+    hints = typing.get_type_hints(cls)
+    return [f.name for f in dataclasses.fields(cls) if hints[f.name] is float]  # type: ignore[arg-type]
 
 
 def nearest(name: str, names: typing.Iterable[str]) -> str:

@@ -2,6 +2,7 @@
 
 import math
 import time
+from collections.abc import Sequence
 from types import TracebackType
 
 from rich.console import Console
@@ -55,8 +56,9 @@ class Report:
     def line(self, text: str) -> None:
         self.console.print(text, markup=False)
 
-    def start(self, total_steps: int, steps: int, cost_limit: float) -> None:
-        self.total, self.cost_limit = total_steps, cost_limit
+    def start(self, total_steps: int, steps: int, cost_limits: Sequence[float]) -> None:
+        self.total = total_steps
+        self.limits = "-".join(map(short, sorted({min(cost_limits), max(cost_limits)})))
         self.begun, self.begun_at = time.perf_counter(), steps
         if self.console.is_terminal:
             columns: list[ProgressColumn] = [
@@ -72,17 +74,17 @@ class Report:
             )
             self.live.start()
 
-    def update(self, steps: int, num_seeds: int, ret: float, cost: float, lam: float) -> None:
-        """Show the state after `steps` environment steps of each seed; NaN keeps the last value."""
+    def update(self, steps: int, num_members: int, ret: float, cost: float, lam: float) -> None:
+        """Show the state after `steps` environment steps of each member; NaN keeps the last value."""
         now = time.perf_counter()
         self.last.update(
             {k: v for k, v in (("ret", ret), ("cost", cost), ("lam", lam)) if math.isfinite(v)}
         )
         rate = (steps - self.begun_at) / max(now - self.begun, 1e-9)  # of one seed
         text = (
-            f"{count(steps)}/{count(self.total)} steps  {count(rate * num_seeds)} steps/s  "
+            f"{count(steps)}/{count(self.total)} steps  {count(rate * num_members)} steps/s  "
             f"return {short(self.last['ret'])}  "
-            f"cost {short(self.last['cost'])}/{short(self.cost_limit)}  "
+            f"cost {short(self.last['cost'])}/{self.limits}  "
             f"lam {short(self.last['lam'])}  left {clock((self.total - steps) / max(rate, 1e-9))}"
         )
         if self.live:

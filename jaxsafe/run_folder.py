@@ -2,8 +2,9 @@
 
 config.yaml     every setting, resolved
 versions.json   package versions, commit, device and command of each start
-metrics.csv     one row an iteration and seed; an empty cell where there was no value
-tensorboard/    the same for TensorBoard, one folder a seed
+metrics.csv     one row an iteration and seed; an empty cell where there was no value. Where settings
+                train side by side, a row for each with each seed, and a column a float they differ in
+tensorboard/    the same for TensorBoard, one folder a seed (and setting)
 checkpoints/    see jaxsafe.checkpoint
 curves.png, video.mp4, evaluation.json   written at the end
 """
@@ -204,6 +205,33 @@ def read_metrics(folder: Path) -> dict[str, np.ndarray]:
     except ValueError as error:
         raise ConfigError(f"{path} cannot be read: {error}") from error
     return dict(zip(header, table.reshape(-1, len(header)).T, strict=True))
+
+
+def by_setting(metrics: dict[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
+    """The tables of settings trained side by side, by name; {'': metrics} if there is but one."""
+    names = [name for name in metrics if name.startswith("algo.")]
+    if not names:
+        return {"": metrics}
+    values = np.stack([metrics[name] for name in names], axis=1)
+    _, first, which = np.unique(values, axis=0, return_index=True, return_inverse=True)
+    return {
+        setting_name(dict(zip(names, values[first[i]], strict=True))): {
+            name: column[which.ravel() == i] for name, column in metrics.items()
+        }
+        for i in np.argsort(first)
+    }
+
+
+def setting_name(swept: Mapping[str, Any]) -> str:
+    return ", ".join(f"{k}={v:.9g}" if isinstance(v, float) else f"{k}={v}" for k, v in swept.items())
+
+
+def last_tenth(metrics: dict[str, np.ndarray], name: str) -> np.ndarray:
+    """The mean of a metric over the last 10 % of training so far, [S]; NaN for a seed without value."""
+    late = metrics["iteration"] > 0.9 * metrics["iteration"].max()
+    late &= np.isfinite(metrics[name])
+    values = (metrics[name][late & (metrics["seed"] == s)] for s in np.unique(metrics["seed"]))
+    return np.array([v.mean() if len(v) else np.nan for v in values])
 
 
 def progress(folder: Path) -> tuple[int, int] | None:

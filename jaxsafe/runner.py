@@ -1,8 +1,8 @@
 """The training loop: compile once, call `update`, log, checkpoint, stop when asked.
 
-Every array of the train state carries a leading axis here: over seeds, or over the devices
-that share the environments of one seed. The loop stays one update ahead of what it logs, so
-the device does not wait for the host.
+Every array of the train state carries a leading axis here: over members (each setting of the
+algorithm's floats with each seed), or over the devices that share the environments of a lone one.
+The loop stays one update ahead of what it logs, so the device does not wait for the host.
 """
 
 import contextlib
@@ -27,6 +27,7 @@ from jaxsafe.types import Env, PyTree
 
 AXIS = "devices"
 OVERFLOW = "train/overflow"  # steps of an episode in which engine warp ran out of room
+ROOM = 0.8  # of the memory that a program may take by `capacity`
 POLICY = ("params", "normaliser")  # the fields of a train state that another run can start from
 ACTING = (*POLICY, "dual")  # what an algorithm's `act` and `task` read, beside its config
 
@@ -39,7 +40,7 @@ class TrainConfig:
     num_envs: int | None = None  # of one seed; null: algo.num_envs
     num_seeds: int = 1  # trained at once: seed, seed + 1, ...
     seed: int = 0
-    devices: int = 1  # the seeds are split over them or, for one seed, its environments
+    devices: int = 1  # the seeds are split over them or, for a lone one, its environments
     preset: str = "fast"  # the algorithm's defaults: fast, published, or one of its published settings
     run_dir: str | None = None  # null: runs/<env>-<algo>/<time>-seed<seed>
     resume: bool | str = False  # true: run_dir, or the newest unfinished run like this one; or a folder
@@ -58,28 +59,42 @@ class TrainConfig:
                 raise ConfigError(f"{name}={value}: expected at least 0")
         if self.seed + self.num_seeds > 2**31:
             raise ConfigError(f"seed={self.seed}: expected less than {2**31 - self.num_seeds + 1}")
-        if self.devices > 1 and self.num_seeds % self.devices and self.num_seeds > 1:
-            raise ConfigError(
-                f"num_seeds={self.num_seeds} does not split over devices={self.devices}: "
-                f"expected a multiple of {self.devices}, or 1"
-            )
+
+
+class TooLarge(ConfigError):
+    """What was asked cannot fit the memory."""
+
+
+class Member(NamedTuple):
+    """One of the runs that train side by side: a setting of the algorithm with a seed."""
+
+    algo: Any  # its config
+    seed: int
+    swept: dict[str, float]  # those of its floats in which the settings differ, as algo.<field>
 
     @property
-    def seeds(self) -> list[int]:
-        return list(range(self.seed, self.seed + self.num_seeds))
+    def setting(self) -> str:
+        return run_folder.setting_name(self.swept)
 
-    @property
-    def splits_envs(self) -> bool:
-        """One seed on several devices, each with a share of its environments."""
-        return self.devices > 1 and self.num_seeds == 1
+
+def members(configs: Sequence[Any], settings: TrainConfig) -> list[Member]:
+    """Every setting with every seed, seeds fastest."""
+    plain = [dataclasses.asdict(c) for c in configs]
+    swept = [name for name, value in plain[0].items() if any(c[name] != value for c in plain)]
+    return [
+        Member(cfg, settings.seed + i, {f"algo.{name}": getattr(cfg, name) for name in swept})
+        for cfg in configs
+        for i in range(settings.num_seeds)
+    ]
 
 
 class Program(NamedTuple):
-    """`init(keys) -> ts` and `update(ts) -> (ts, metrics)`, over the leading axis; not yet compiled."""
+    """`init(start) -> ts` and `update(ts) -> (ts, metrics)` over the leading axis, not yet compiled."""
 
-    init: Callable[[jax.Array], PyTree]
+    init: Callable[[PyTree], PyTree]
     update: Callable[[PyTree], tuple[PyTree, dict[str, jax.Array]]]
-    keys: jax.Array  # [S], or [devices] for one split seed
+    start: PyTree  # (keys, config): [M], or [devices] for one split member
+    members: list[Member]
     sharding: jax.sharding.Sharding
 
 
@@ -100,39 +115,43 @@ def use_compilation_cache() -> None:
             jax.config.update("jax_compilation_cache_dir", str(folder))
 
 
-def build(env: Env, make: Callable, algo_config: Any, settings: TrainConfig) -> Program:
-    """Spread one algorithm over seeds and devices.
+def build(env: Env, make: Callable, configs: Sequence[Any], settings: TrainConfig) -> Program:
+    """Spread one algorithm over settings, seeds and devices.
 
     Args:
         env: the environment.
         make: `make(env, axis_name) -> Algorithm` of the algorithm.
-        algo_config: its config.
+        configs: its config in each setting; they differ in floats alone.
         settings: seeds and devices.
     Raises:
-        ConfigError: the environments do not split over the devices.
+        ConfigError: the members, or the environments of a lone one, do not split over the devices.
     """
-    devices = settings.devices
-    if settings.splits_envs:
-        if algo_config.num_envs % devices:
-            raise ConfigError(f"num_envs={algo_config.num_envs} does not split over devices={devices}")
-        algo_config = dataclasses.replace(algo_config, num_envs=algo_config.num_envs // devices)
-    if math.isinf(algo_config.total_iterations):
-        per_update = (
-            algo_config.num_envs * algo_config.horizon * (devices if settings.splits_envs else 1)
+    devices, run = settings.devices, members(configs, settings)
+    share = devices if len(run) == 1 else 1  # devices among which the environments of one are split
+    if len(run) % devices and share == 1:
+        raise ConfigError(
+            f"{len(run)} seeds do not split over devices={devices}: "
+            f"expected a multiple of {devices}, or 1"
         )
-        iterations = -(-settings.total_steps // per_update)
-        algo_config = dataclasses.replace(algo_config, total_iterations=float(iterations))
-    floats = jax.tree.map(jnp.float32, algo_config)
-    algo = make(env, AXIS if settings.splits_envs else None)
-    rows = settings.num_seeds // devices if not settings.splits_envs else 1  # on each device
-    init = over_rows(lambda key: algo.init(key, floats), rows)
-    update = over_rows(algo.update, rows)
+    if configs[0].num_envs % share:
+        raise ConfigError(f"num_envs={configs[0].num_envs} does not split over devices={devices}")
+
+    def settled(cfg: Any) -> Any:
+        ends = cfg.total_iterations
+        if math.isinf(ends):
+            ends = float(-(-settings.total_steps // (cfg.num_envs * cfg.horizon)))
+        return dataclasses.replace(cfg, num_envs=cfg.num_envs // share, total_iterations=ends)
+
     # A split seed has one key for all its devices: the algorithm folds the device's index in.
-    keys = jax.vmap(jax.random.key)(
-        np.array(settings.seeds * (devices if settings.splits_envs else 1), np.uint32)
-    )
+    keys = jax.vmap(jax.random.key)(np.array([m.seed for m in run] * share, np.uint32))
+    floats = jax.tree.map(lambda *x: np.array(x, np.float32), *[settled(m.algo) for m in run * share])
+    algo = make(env, AXIS if share > 1 else None)
+    rows = max(1, len(run) // devices)  # on each device
+    init = over_rows(lambda start: algo.init(*start), rows)
+    update = over_rows(algo.update, rows)
     if devices == 1:
-        return Program(init, update, keys, jax.sharding.SingleDeviceSharding(jax.local_devices()[0]))
+        one = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
+        return Program(init, update, (keys, floats), run, one)
     if getattr(env, "engine", None) == "warp":
         # In JAX 0.11 Shardy crashes on programs around Warp's calls; the older partitioner crashes on
         # the callbacks of engine c.
@@ -145,7 +164,7 @@ def build(env: Env, make: Callable, algo_config: Any, settings: TrainConfig) -> 
     def split(fn: Callable) -> Callable:
         return jax.shard_map(fn, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
 
-    return Program(split(init), split(update), keys, NamedSharding(mesh, spec))
+    return Program(split(init), split(update), (keys, floats), run, NamedSharding(mesh, spec))
 
 
 def over_rows(fn: Callable[[PyTree], PyTree], rows: int) -> Callable[[PyTree], PyTree]:
@@ -167,18 +186,18 @@ def check_devices(settings: TrainConfig) -> None:
         )
 
 
-def check_memory(env: Env, algo_config: Any, settings: TrainConfig) -> None:
+def check_memory(env: Env, algo_config: Any, num_members: int, devices: int) -> None:
     """Refuse, before anything compiles, a trajectory that cannot fit the device.
 
     A lower bound: observations before and after each step, actions and a few scalars.
     """
     limit, what = device_memory()
     step = 4 * (2 * env.obs_size + env.action_size + 8 + len(env.cost_names))  # bytes
-    need = step * algo_config.num_envs * algo_config.horizon * settings.num_seeds // settings.devices
+    need = step * algo_config.num_envs * algo_config.horizon * num_members // devices
     if need > limit:
-        raise ConfigError(
+        raise TooLarge(
             f"num_envs={algo_config.num_envs} x horizon={algo_config.horizon} x "
-            f"num_seeds={settings.num_seeds} needs at least {need / 2**30:,.1f} GiB a device, "
+            f"{num_members} seeds needs at least {need / 2**30:,.1f} GiB a device, "
             f"{what} has {limit / 2**30:,.1f}; use fewer num_envs"
         )
 
@@ -186,17 +205,34 @@ def check_memory(env: Env, algo_config: Any, settings: TrainConfig) -> None:
 def check_state_memory(program: Program, settings: TrainConfig) -> None:
     """Like `check_memory`, for the train state itself (old and new), known once it is traced."""
     limit, what = device_memory()
-    leaves = jax.tree.leaves(jax.eval_shape(program.init, program.keys))
+    leaves = jax.tree.leaves(jax.eval_shape(program.init, program.start))
     need = (
         2
         * sum(x.size * (8 if checkpoint.is_key(x) else x.dtype.itemsize) for x in leaves)
         // settings.devices
     )
     if need > limit:
-        raise ConfigError(
+        raise TooLarge(
             f"the train state needs {need / 2**30:,.1f} GiB a device, {what} has {limit / 2**30:,.1f}; "
             "use fewer num_envs or num_seeds"
         )
+
+
+def capacity(program: Program) -> int:
+    """How many of its members fit the memory at once, by the compiled update's own account."""
+    like = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=program.sharding),
+        jax.eval_shape(program.init, program.start),
+    )
+    used: Any = compiled(program, like).memory_analysis()
+    need = used.temp_size_in_bytes + used.argument_size_in_bytes + used.output_size_in_bytes
+    share = ROOM * device_memory()[0] / (need - used.alias_size_in_bytes)  # of the members
+    return max(1, int(min(1.0, share) * len(program.members)))
+
+
+def compiled(program: Program, ts: PyTree) -> Any:
+    """The update for a train state of these shapes; JAX remembers it."""
+    return jax.jit(program.update, donate_argnums=0).lower(ts).compile()
 
 
 def device_memory() -> tuple[float, str]:
@@ -221,7 +257,6 @@ def device_name() -> str:
 
 def train(
     program: Program,
-    algo_config: Any,
     settings: TrainConfig,
     folder: Path,
     report: Report,
@@ -232,8 +267,7 @@ def train(
 
     Args:
         program: from `build`.
-        algo_config: for the steps of an update and the cost limit.
-        settings: the rest of the settings.
+        settings: those it was built with.
         folder: the run folder; gets metrics.csv, tensorboard/ and checkpoints/.
         report: where progress goes.
         resume_command: printed when the run is stopped early.
@@ -243,7 +277,8 @@ def train(
     Raises:
         checkpoint.CheckpointError, OSError: the disk failed; the last good checkpoint stays.
     """
-    per_update = algo_config.num_envs * algo_config.horizon  # steps of one seed
+    cfg = program.members[0].algo
+    per_update = cfg.num_envs * cfg.horizon  # steps of one seed
     iterations = -(-settings.total_steps // per_update)
     store = folder / "checkpoints"
     resuming = bool(checkpoint.checkpoints(store))
@@ -254,23 +289,24 @@ def train(
         start = time.perf_counter()
         iteration = 0
         if resuming:
-            like = jax.eval_shape(program.init, program.keys)
+            like = jax.eval_shape(program.init, program.start)
             ts, manifest = checkpoint.restore(store, like, report.line)
             ts, iteration = jax.device_put(ts, program.sharding), manifest.iteration
             report.line(f"resuming at {manifest.steps:,} steps")
         else:
-            ts = jax.jit(program.init)(jax.device_put(program.keys, program.sharding))
+            ts = jax.jit(program.init)(jax.device_put(program.start, program.sharding))
             ts = jax.device_put(adapt(ts), program.sharding) if adapt else ts
         if iteration >= iterations:
             report.line("nothing left to train")
             return Outcome(ts, iteration, iteration * per_update, False)
         names = sorted(jax.eval_shape(program.update, ts)[1])
-        update = jax.jit(program.update, donate_argnums=0).lower(ts).compile()
+        update = compiled(program, ts)
         report.line(f"compiled in {time.perf_counter() - start:.1f} s")
         stop.nothing_to_save = ""
 
-        with Log(folder, names, settings, iteration, per_update) as log:
-            report.start(iterations * per_update, iteration * per_update, float(algo_config.cost_limit))
+        with Log(folder, names, program.members, iteration, per_update) as log:
+            limits = [m.algo.cost_limit for m in program.members]
+            report.start(iterations * per_update, iteration * per_update, limits)
             pending, saved_at = None, time.perf_counter()
             while iteration < iterations:
                 ts, metrics = update(ts)
@@ -299,14 +335,18 @@ class Log:
     """Metrics to metrics.csv, TensorBoard and the progress report."""
 
     def __init__(
-        self, folder: Path, names: list[str], settings: TrainConfig, iteration: int, per_update: int
+        self, folder: Path, names: list[str], members: list[Member], iteration: int, per_update: int
     ):
-        self.settings, self.per_update, self.warned = settings, per_update, False
-        self.csv = run_folder.Metrics(folder, names, iteration)
+        self.seeds, self.per_update, self.warned = [m.seed for m in members], per_update, False
+        self.swept = {name: np.array([m.swept[name] for m in members]) for name in members[0].swept}
+        self.csv = run_folder.Metrics(folder, [*self.swept, *names], iteration)
         self.begun = time.perf_counter() - self.csv.seconds
         self.boards = [
-            run_folder.Board(folder / "tensorboard" / f"seed{seed}", iteration * per_update)
-            for seed in settings.seeds
+            run_folder.Board(
+                folder / "tensorboard" / m.setting.replace(", ", "-") / f"seed{m.seed}",
+                iteration * per_update,
+            )
+            for m in members
         ]
 
     def __enter__(self) -> "Log":
@@ -326,12 +366,12 @@ class Log:
                 f"warning: contacts found no room in some steps ({OVERFLOW} in metrics.csv); "
                 "raise env.contact_room"
             )
-        self.csv.append(iteration, steps, self.settings.seeds, seconds, values)
+        self.csv.append(iteration, steps, self.seeds, seconds, values | self.swept)
         for s, board in enumerate(self.boards):
             board.append(steps, {name: float(value[s]) for name, value in values.items()})
         report.update(
             steps,
-            self.settings.num_seeds,
+            len(self.seeds),
             **{
                 short: mean(values[name]) if name in values else float("nan")
                 for short, name in (
@@ -358,17 +398,28 @@ def mean(values: np.ndarray) -> float:
 
 
 def read_policy(
-    folder: Path, warn: Callable[[str], None] | None = None, fields: Sequence[str] = POLICY
+    folder: Path,
+    rows: int,
+    warn: Callable[[str], None] | None = None,
+    fields: Sequence[str] = POLICY,
 ) -> dict[str, np.ndarray]:
-    """`fields` of the newest checkpoint of a run folder, by leaf name, [rows, ...]."""
+    """`fields` of the newest checkpoint of a run folder, by leaf name, [rows, ...].
+
+    Rows beyond the run's members are the copies on the other devices of a split one.
+    """
     arrays, _ = checkpoint.load(folder / "checkpoints", warn)
-    # rows beyond the seeds are the copies on the other devices of a split seed
-    rows = max(1, int(run_folder.read_config(folder).get("num_seeds", 1)))
-    return {name: x[:rows] for name, x in arrays.items() if name.split(".")[0] in fields}
+    policy = {name: x[:rows] for name, x in arrays.items() if name.split(".")[0] in fields}
+    if any(len(x) != rows for x in policy.values()):
+        raise ConfigError(f"{folder} holds fewer than the {rows} policies of its config.yaml")
+    return policy
 
 
 def check_policy(
-    like: PyTree, policy: dict[str, np.ndarray], source: Path, fields: Sequence[str] = POLICY
+    like: PyTree,
+    policy: dict[str, np.ndarray],
+    source: Path,
+    fields: Sequence[str] = POLICY,
+    why: str = "",
 ) -> None:
     """Raise ConfigError unless `policy` fits `fields` of the train state `like`, whatever its rows."""
     expected = dict(zip(checkpoint.leaf_names(like), jax.tree.leaves(like), strict=True))
@@ -378,21 +429,21 @@ def check_policy(
             str(list(x[name].shape[1:])) if name in x else "absent" for x in (policy, expected)
         )
         if have != want:
-            raise ConfigError(f"the policy of {source} does not fit: {name} is {have}, expected {want}")
-    rows, wanted = len(next(iter(policy.values()))), len(jax.tree.leaves(like)[0])
-    if rows not in (1, wanted):
-        raise ConfigError(f"{source} has {rows} seeds, expected 1 or {wanted}")
+            raise ConfigError(
+                f"the policy of {source} does not fit: {name} is {have}, expected {want}{why}"
+            )
 
 
-def with_policy(ts: PyTree, policy: dict[str, np.ndarray]) -> PyTree:
-    """`ts` with the parameters and normaliser of `policy`; one row serves all."""
+def with_policy(ts: PyTree, policy: dict[str, np.ndarray], rows: Sequence[int]) -> PyTree:
+    """`ts` with the parameters and normaliser of `policy`: row `rows[i]` of it for member i.
+
+    The copies of a member on several devices share its row.
+    """
     leaves, treedef = jax.tree.flatten(ts)
+    picks = np.resize(rows, len(leaves[0]))
     named = zip(checkpoint.leaf_names(ts), leaves, strict=True)
     return treedef.unflatten(
-        [
-            jnp.broadcast_to(jnp.asarray(policy[n], x.dtype), x.shape) if n in policy else x
-            for n, x in named
-        ]
+        [jnp.asarray(policy[name][picks], x.dtype) if name in policy else x for name, x in named]
     )
 
 

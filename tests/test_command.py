@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import yaml
+from tasks import FAST
 
 from jaxsafe import algos, checkpoint, command, envs, run_folder, runner
 from jaxsafe.config import ConfigError
@@ -253,10 +254,10 @@ def test_the_policy_of_a_run_is_read_whatever_its_minibatches_divide(tmp_path, n
     base["algo"] = {"name": name, "num_envs": 8, "horizon": 5, "minibatches": 4, "hidden": [8, 8]}
     run = command.settle(base, envs, algos)
     env, make = command.make_env(run, envs), algos.ALGOS[name].make
-    program = runner.build(env, make, run.algo, run.train)
+    program = runner.build(env, make, run.configs, run.train)
     ones = jax.tree.map(
         lambda x: np.ones(x.shape, x.dtype),
-        {k: getattr(jax.eval_shape(program.init, program.keys), k) for k in runner.ACTING},
+        {k: getattr(jax.eval_shape(program.init, program.start), k) for k in runner.ACTING},
     )
     run_folder.write_config(tmp_path, run.plain())
     checkpoint.save(tmp_path / "checkpoints", ones, 1, 40)
@@ -306,24 +307,82 @@ def test_two_devices_share_seeds_or_the_environments_of_one(finished, tmp_path, 
             )
 
 
-def test_a_run_starts_from_the_policy_of_another(finished, tmp_path):
-    algo = algos.ALGOS["ppo_lag"]
-    env: Any = envs.make("point_goal0", num_steps=40)
-    cfg = algo.config(num_envs=2, horizon=4, minibatches=1, hidden=(8, 8))
-    program = runner.build(env, algo.make, cfg, runner.TrainConfig(num_seeds=2))
-    like = runner.jax.eval_shape(program.init, program.keys)
-    policy = runner.read_policy(finished[0])
-    runner.check_policy(like, policy, finished[0])
-    named = dict(zip(checkpoint.leaf_names(like), range(10**6), strict=False))
-    fresh = runner.jax.tree.map(
-        lambda x: runner.jnp.zeros(x.shape), {k: like.__dict__[k] for k in runner.POLICY}
-    )
-    taken = checkpoint.to_arrays(runner.with_policy(fresh, policy))
-    assert taken.keys() == policy.keys() <= named.keys()
-    for name, value in policy.items():
-        np.testing.assert_array_equal(taken[name], np.broadcast_to(value, taken[name].shape))
-    wide = runner.build(
-        env, algo.make, algo.config(num_envs=2, horizon=4, minibatches=1), runner.TrainConfig()
-    )
-    with pytest.raises(ConfigError, match=r"does not fit: params\..* is \[.*\], expected \["):
-        runner.check_policy(runner.jax.eval_shape(wide.init, wide.keys), policy, finished[0])
+def policy_rows(run: Path) -> dict[str, np.ndarray]:
+    return {k: v for k, v in arrays(run).items() if k.split(".")[0] in runner.POLICY}
+
+
+def warm(*args: str, **algo: Any):
+    """A train state of ppo without an update, before and after it takes over a policy."""
+    base = {k: yaml.safe_load(v) for k, v in (a.split("=") for a in args)}
+    sizes = {"num_envs": 2, "horizon": 4, "minibatches": 1, "hidden": [8, 8]}
+    groups = {
+        "env": {"name": "point_goal0", "num_steps": 40},
+        "algo": {"name": "ppo", **sizes, **algo},
+    }
+    run = command.settle({**groups, **base}, envs, algos)
+    said: list[str] = []
+    _, program = command.prepare(run, envs, algos)
+    adapt = command.warm_start(run, program, envs, algos, said.append)
+    fresh = jax.jit(program.init, compiler_options=FAST)(program.start)
+    return checkpoint.to_arrays(fresh), checkpoint.to_arrays(adapt(fresh)), said[0]
+
+
+def test_a_run_starts_from_the_parameters_and_normaliser_of_another_and_nothing_else(finished):
+    policy = policy_rows(finished[0])
+    fresh, taken, said = warm(f"init_from={finished[0]}", "num_seeds=2", cost_limit=[1.0, 2.0])
+    assert {name.split(".")[0] for name in policy} == set(runner.POLICY)
+    for name, value in taken.items():
+        expected = np.repeat(policy[name], 4, axis=0) if name in policy else fresh[name]
+        np.testing.assert_array_equal(value, expected, err_msg=name)
+    assert said == f"starting from {finished[0]}: seed 0 from its seed 0, 1 from its seed 0"
+    kernel = "params.actor.mean.params.Dense_0.kernel"
+    assert (fresh[kernel] != taken[kernel]).any() and (taken["opt_state.actor.iteration"] == 0).all()
+
+
+def test_each_seed_starts_from_the_same_seed_where_there_is_one(finished, tmp_path):
+    source = tmp_path / "run"
+    source.mkdir()
+    run_folder.write_config(source, run_folder.read_config(finished[0]) | {"seed": 4, "num_seeds": 3})
+    three = {k: np.concatenate([v, v + 1, v + 2]) for k, v in policy_rows(finished[0]).items()}
+    checkpoint.save(source / "checkpoints", three, 1, 64)
+    _, taken, said = warm(f"init_from={source}", "seed=5", "num_seeds=3")
+    for name, value in three.items():
+        np.testing.assert_array_equal(taken[name], value[[1, 2, 0]])
+    assert said.endswith("seed 5 from its seed 5, 6 from its seed 6, 7 from its seed 4")
+
+
+@pytest.mark.parametrize(
+    ("args", "algo", "expected"),
+    [
+        ((), {"hidden": [4]}, ("is [8], expected [4]; algo.hidden is [8, 8] there, [4] here",)),
+        ((), {"obs_normalize": False}, ("expected absent", "algo.obs_normalize is True there")),
+        (
+            ("env={name: point_goal1, num_steps: 40}",), {},
+            ("[60]", "[28]", "env.name is point_goal0 there, point_goal1 here"),
+        ),
+    ],
+)  # fmt: skip
+def test_a_policy_of_other_shapes_is_refused_by_what_differs(finished, args, algo, expected):
+    with pytest.raises(ConfigError) as error:
+        warm(f"init_from={finished[0]}", *args, **algo)
+    assert all(part in str(error.value) for part in ("does not fit", *expected)), error.value
+    assert "\n" not in str(error.value)
+
+
+def test_a_run_without_checkpoint_is_no_policy_to_start_from(tmp_path):
+    run_folder.write_config(tmp_path, settings().plain())
+    with pytest.raises(ConfigError, match="holds no checkpoint"):
+        warm(f"init_from={tmp_path}")
+
+
+def test_a_resumed_run_does_not_start_from_the_other_policy_again(finished, tmp_path):
+    source = tmp_path / "source"
+    shutil.copytree(finished[0], source)
+    args = (*SMALL, "run_dir=run", "init_from=source")
+    status, out, err = call("train.py", *args, "total_steps=320", cwd=tmp_path)
+    assert status == 0 and "starting from source" in out, err
+    shutil.rmtree(source)
+    status, out, err = call("train.py", *args, "resume=true", cwd=tmp_path)
+    assert status == 0 and "starting from" not in out, err
+    assert run_folder.read_config(tmp_path / "run")["init_from"] == "source"
+    assert run_folder.progress(tmp_path / "run") == (10, 640)

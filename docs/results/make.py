@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxsafe import plots
+from jaxsafe import plots, run_folder
 from jaxsafe.evaluation import estimate
 
 HERE = Path(__file__).parent
@@ -53,10 +53,7 @@ def final_policy(name: str) -> str:
 
 def last_tenth(metrics: dict[str, np.ndarray], name: str) -> str:
     """Mean over the last 10% of training, and its 95% interval over seeds."""
-    late = metrics["iteration"] > 0.9 * metrics["iteration"].max()
-    seeds = np.unique(metrics["seed"])
-    values = [np.nanmean(metrics[name][late & (metrics["seed"] == seed)]) for seed in seeds]
-    e = estimate(np.array(values)[:, None])
+    e = estimate(run_folder.last_tenth(metrics, name)[:, None])
     return f"{e.mean:.2f} [{e.low:.2f}, {e.high:.2f}]"
 
 

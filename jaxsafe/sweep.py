@@ -1,0 +1,395 @@
+"""A grid of settings, trained side by side where one compiled program can hold them.
+
+The command line is train.py's, with several values for some options. Floats of the algorithm are
+arrays to the program, so their grid and the seeds are the members of one; any other option with
+several values makes a group, and so a program, of each. A group that does not fit the memory is
+split into equal parts of whole settings or, where the seeds of one are too many, of seeds.
+
+    SWEEP/sweep.yaml                   what was asked; how many members of a group run at once
+    SWEEP/000-<env>-<algo>...[.part0]/ a run folder as of train.py, of a group or a part of one
+    SWEEP/summary.md, .csv, .png       a row a setting, rewritten after each run folder
+"""
+
+import argparse
+import csv
+import hashlib
+import io
+import itertools
+import json
+import re
+import shlex
+import shutil
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import yaml
+from hydra.core.override_parser.types import Override, ValueType
+
+from jaxsafe import checkpoint, command, on_policy, plots, run_folder, runner
+from jaxsafe.command import Settings, compose, flat, guarded, one_line, parse, settle
+from jaxsafe.config import ConfigError, float_fields
+from jaxsafe.evaluation import Estimate
+from jaxsafe.interrupts import Interrupts
+from jaxsafe.progress import Report
+
+EPILOG = """\
+Options are those of train.py (python scripts/train.py --help), and
+
+  max_parallel=N   members (settings x seeds) trained at once; default: what the memory holds
+  run_dir=FOLDER   the sweep's folder; default: runs/sweep-<env>-<algo>-<a hash of the settings>
+
+The same command again goes on where it was stopped."""
+
+
+class Sweep(NamedTuple):
+    """What a command line asks for."""
+
+    swept: list[str]  # the options with several values, as `flat` names them
+    groups: dict[str, Settings]  # by the name of their folders
+    folder: Path
+    max_parallel: int | None
+
+
+# ---- from the command line to groups ---------------------------------------------------------
+
+
+def read(texts: list[str], envs: Any, algos: Any) -> Sweep:
+    """The groups of a command line, every one of them checked.
+
+    Raises:
+        ConfigError: an option that no run could use, or nothing to sweep.
+    """
+    own, given = {}, []
+    for text in texts:
+        override = parse(text)
+        key = override.key_or_group
+        if key in ("max_parallel", "run_dir"):
+            own[key] = str(override.value())
+        elif key == "resume":
+            raise ConfigError(f"{text}: a sweep goes on when the same command is given again")
+        else:
+            given.append(override)
+    several = {o.key_or_group: choices(o) for o in given if o.is_sweep_override()}
+    command.read_arguments(["--multirun", *(o.input_line for o in given)], envs, algos)
+    if not several:
+        raise ConfigError(
+            "nothing to sweep: give an option several values, as in algo.cost_limit=5,10,25, "
+            "or train one setting with scripts/train.py"
+        )
+    single = {o.key_or_group: str(o.value()) for o in given if not o.is_sweep_override()}
+    algo = several.get("algo", [single.get("algo", command.DEFAULT["algo"])])[0]
+    floats = [f"algo.{f}" for f in float_fields(algos.ALGOS[algo].config)]
+    lists = {k: v for k, v in several.items() if k in floats}
+    grid = list(zip(*itertools.product(*lists.values()), strict=True))
+    side_by_side = [f"{k}=[{','.join(v)}]" for k, v in zip(lists, grid, strict=True)]
+    fixed = [o.input_line for o in given if not o.is_sweep_override()]
+    groups = {}
+    apart = {k: v for k, v in several.items() if k not in floats}
+    for i, values in enumerate(itertools.product(*apart.values())):
+        texts = [f"{k}={v}" for k, v in zip(apart, values, strict=True)]
+        settings = compose([*fixed, *side_by_side, *texts], envs, algos)
+        command.make_env(settings, envs)
+        on_policy.check(settings.algo)
+        rest = [t for t in texts if not t.startswith(("env=", "algo="))]
+        name = "-".join([f"{i:03d}", settings.env_name, settings.algo_name, *rest])
+        groups[re.sub(r"[^\w.=+-]+", "_", name)[:100]] = settings
+    parallel = own.get("max_parallel")
+    if parallel is not None and not (parallel.isdigit() and int(parallel)):
+        raise ConfigError(f"max_parallel={parallel}: expected a whole number of at least 1")
+    swept = [f"{k}.name" if k in ("env", "algo") else k for k in several]
+    folder = own.get("run_dir") or default_folder(groups)
+    return Sweep(swept, groups, Path(folder).expanduser(), int(parallel) if parallel else None)
+
+
+def choices(override: Override) -> list[str]:
+    """The values of an option, as they were written."""
+    key = override.key_or_group
+    if override.value_type is ValueType.GLOB_CHOICE_SWEEP:
+        raise ConfigError(f"{override.input_line}: name the values, a pattern has none")
+    found = list(override.sweep_string_iterator())
+    for value in found:
+        if found.count(value) > 1:
+            raise ConfigError(f"{key}={value} occurs twice")
+    return found
+
+
+def identity(settings: Settings) -> dict[str, Any]:
+    """What a sweep's folder must agree on."""
+    return {k: v for k, v in flat(settings.plain()).items() if k not in command.NOT_COMPARED}
+
+
+def default_folder(groups: dict[str, Settings]) -> Path:
+    first = next(iter(groups.values()))
+    text = json.dumps([identity(s) for s in groups.values()], sort_keys=True)
+    digest = hashlib.sha256(text.encode()).hexdigest()[:8]
+    return Path("runs") / f"sweep-{first.env_name}-{first.algo_name}-{digest}"
+
+
+# ---- the folder ------------------------------------------------------------------------------
+
+
+def open_folder(sweep: Sweep) -> dict[str, int]:
+    """How many members of each group run at once, as far as the folder's sweep knows already.
+
+    Raises:
+        ConfigError: the folder holds something else.
+    """
+    asked = {name: identity(settings) for name, settings in sweep.groups.items()}
+    if not (sweep.folder / "sweep.yaml").exists():
+        if sweep.folder.exists() and (not sweep.folder.is_dir() or any(sweep.folder.iterdir())):
+            raise ConfigError(f"run_dir={sweep.folder} holds something else than a sweep")
+        return {}
+    saved = read_folder(sweep.folder)
+    other = f"{sweep.folder} belongs to another sweep"
+    if [*asked] != [*saved["groups"]]:
+        raise ConfigError(f"{other}, of {', '.join(saved['groups'])}; choose another run_dir")
+    for name, settings in asked.items():
+        for key, value in settings.items():
+            if (old := saved["groups"][name].get(key)) != value:
+                raise ConfigError(
+                    f"{other}: {key} is {old} there, {value} here; choose another run_dir"
+                )
+    return saved["parallel"]
+
+
+def read_folder(folder: Path) -> dict[str, Any]:
+    path = folder / "sweep.yaml"
+    if not path.is_file():
+        raise ConfigError(f"{folder} is not a sweep's folder: it has no sweep.yaml")
+    try:
+        saved = yaml.safe_load(path.read_text())
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} cannot be read: {one_line(error)}") from error
+    if not isinstance(saved, dict) or not {"swept", "groups", "parallel"} <= saved.keys():
+        raise ConfigError(f"{path} does not describe a sweep")
+    return saved
+
+
+def write_folder(sweep: Sweep, parallel: dict[str, int]) -> None:
+    asked = {name: identity(settings) for name, settings in sweep.groups.items()}
+    saved = {"swept": sweep.swept, "parallel": parallel, "groups": asked}
+    try:
+        sweep.folder.mkdir(parents=True, exist_ok=True)
+        run_folder.replace_text(sweep.folder / "sweep.yaml", yaml.safe_dump(saved, sort_keys=False))
+    except OSError as error:
+        raise checkpoint.CheckpointError(f"cannot write to {sweep.folder}: {error.strerror}") from error
+
+
+# ---- training --------------------------------------------------------------------------------
+
+
+def parts(settings: Settings, parallel: int) -> list[Settings]:
+    """`settings` in parts of at most `parallel` members, whose sizes differ by one at most."""
+    train, configs = settings.train, settings.configs
+    if train.num_seeds <= parallel:
+        return [
+            settings._replace(configs=configs[piece])
+            for piece in slices(len(configs), parallel // train.num_seeds)
+        ]
+    seeds = [
+        replace(train, seed=train.seed + piece.start, num_seeds=piece.stop - piece.start)
+        for piece in slices(train.num_seeds, parallel)
+    ]
+    return [settings._replace(configs=(c,), train=t) for c in configs for t in seeds]
+
+
+def slices(count: int, most: int) -> list[slice]:
+    """Of 0 .. count, as few as hold at most `most` each, whose sizes differ by one at most."""
+    number = -(-count // most)
+    ends = [count * i // number for i in range(number + 1)]
+    return [slice(a, b) for a, b in itertools.pairwise(ends)]
+
+
+def fitting(settings: Settings, most: int | None, envs: Any, algos: Any) -> tuple[int, runner.Program]:
+    """How many members run at once, `most` or what the memory holds; and the first part's program."""
+    members = len(settings.configs) * settings.train.num_seeds
+    parallel = min(members, most or members)
+    while True:
+        part = parts(settings, parallel)[0]
+        try:
+            _, program = command.prepare(part, envs, algos)
+        except runner.TooLarge:
+            if parallel == 1 or most:
+                raise
+            parallel = -(-parallel // 2)
+            continue
+        if part.train.init_from:  # what is wrong with it shows before anything compiles
+            command.warm_start(part, program, envs, algos, lambda line: None)
+        held = parallel if parallel == 1 or most else runner.capacity(program)
+        return (held if held < len(program.members) else parallel), program
+
+
+def train(sweep: Sweep, envs: Any, algos: Any, again: str, report: Report) -> int:
+    """Train every group that is not finished. Returns the exit status."""
+    known = open_folder(sweep)
+    for name, settings in sweep.groups.items():
+        members = len(settings.configs) * settings.train.num_seeds
+        programs: dict[int, runner.Program] = {}  # by the number of their members
+        begun = list(sweep.folder.glob(f"{name}*"))
+        if not any(checkpoint.checkpoints(f / "checkpoints") for f in begun):
+            for leftover in begun:  # stopped before a first checkpoint, perhaps in other parts
+                shutil.rmtree(leftover)
+            with Interrupts(report.line) as stop:
+                stop.nothing_to_save = f"stopped before the first update; {again}"
+                known[name], program = fitting(settings, sweep.max_parallel, envs, algos)
+            programs[len(program.members)] = program
+            write_folder(sweep, known)
+        elif sweep.max_parallel not in (None, known[name]) and known[name] < members:
+            report.line(f"{name} goes on as it began, {known[name]} members at once")
+        pieces = parts(settings, known[name])
+        if len(pieces) > 1:
+            report.line(f"{name}: {members} members in {len(pieces)} parts, one after the other")
+        for i, piece in enumerate(pieces):
+            folder = sweep.folder / (name if len(pieces) == 1 else f"{name}.part{i:03d}")
+            if finished(piece, folder):
+                report.line(f"finished already: {folder}")
+                continue
+            piece = piece._replace(train=replace(piece.train, run_dir=str(folder), resume=True))
+            env, program = command.prepare(piece, envs, algos)
+            # what differs between parts of one size is data, so they share what is compiled
+            same = programs.setdefault(len(program.members), program)
+            program = program._replace(init=same.init, update=same.update)
+            status = command.run(piece, env, program, folder, envs, algos, report, again)
+            summarise(sweep.folder, envs, algos)
+            if status:
+                return status
+    return 0
+
+
+def finished(settings: Settings, folder: Path) -> bool:
+    done, train = run_folder.progress(folder), settings.train
+    evaluated = (folder / "evaluation.json").exists() or not train.eval_episodes
+    return done is not None and done[1] >= train.total_steps and evaluated
+
+
+# ---- the summary -----------------------------------------------------------------------------
+
+
+class Row(NamedTuple):
+    """A setting: the last 10 % of its training so far, over its seeds."""
+
+    swept: dict[str, Any]
+    env: str
+    cost_limit: float
+    steps: int
+    returns: np.ndarray  # [S], a mean over complete episodes; NaN where a seed had none
+    costs: np.ndarray
+
+    @property
+    def name(self) -> str:
+        return run_folder.setting_name(self.swept)
+
+    @property
+    def ret(self) -> Estimate:
+        return over_seeds(self.returns)
+
+    @property
+    def cost(self) -> Estimate:
+        return over_seeds(self.costs)
+
+    @property
+    def held(self) -> str:
+        """Whether the limit is: 'unclear' where the mean is above it and its interval is not."""
+        if np.isnan(self.cost.mean):
+            return "-"
+        if self.cost.mean <= self.cost_limit:
+            return "yes"
+        return "unclear" if self.cost.low <= self.cost_limit else "no"
+
+
+def over_seeds(values: np.ndarray) -> Estimate:
+    mean, low, high = plots.interval(values[:, None])
+    return Estimate(mean.item(), low.item(), high.item())
+
+
+def rows_of(folder: Path, envs: Any, algos: Any) -> list[Row]:
+    """A row for each setting that has begun."""
+    swept, rows = read_folder(folder)["swept"], {}
+    for path in sorted(folder.glob("*/config.yaml")):
+        saved = settle(run_folder.read_config(path.parent), envs, algos)
+        tables = run_folder.by_setting(run_folder.read_metrics(path.parent)).values()
+        for cfg, table in zip(saved.configs, tables, strict=False):
+            if not len(table.get("steps", ())):
+                continue
+            plain = flat(saved._replace(configs=(cfg,)).plain())
+            values = {name.removesuffix(".name"): plain[name] for name in swept}
+            late = (run_folder.last_tenth(table, f"train/{name}") for name in ("return", "cost"))
+            row = Row(values, saved.env_name, cfg.cost_limit, int(table["steps"].max()), *late)
+            if (old := rows.get(row.name)) is not None:  # other seeds of this setting
+                row = row._replace(
+                    steps=min(old.steps, row.steps),
+                    returns=np.append(old.returns, row.returns),
+                    costs=np.append(old.costs, row.costs),
+                )
+            rows[row.name] = row
+    return list(rows.values())
+
+
+def summarise(folder: Path, envs: Any, algos: Any) -> str:
+    """Write summary.md, .csv and .png of a sweep; returns the table."""
+    rows = rows_of(folder, envs, algos)
+    text = markdown(rows)
+    run_folder.replace_text(folder / "summary.md", text)
+    run_folder.replace_text(folder / "summary.csv", as_csv(rows))
+    plots.trade_off(rows, folder / "summary.png", "last 10 % of training, mean and 95 % interval")
+    return text
+
+
+def markdown(rows: list[Row]) -> str:
+    def cell(e: Estimate) -> str:
+        interval = "" if e.low == e.high or np.isnan(e.mean) else f" [{e.low:.4g}, {e.high:.4g}]"
+        return f"{e.mean:.4g}{interval}".replace("nan", "-")
+
+    names = list(rows[0].swept) if rows else []
+    lines = [[*names, "seeds", "steps", "return", "cost", "limit", "limit held"]]
+    lines += [["---", *["---:"] * (len(lines[0]) - 2), "---"]]
+    for r in rows:
+        figures = [str(len(r.costs)), f"{r.steps:,}", cell(r.ret), cell(r.cost), f"{r.cost_limit:g}"]
+        values = [f"{v:.9g}" if isinstance(v, float) else str(v) for v in r.swept.values()]
+        lines.append([*values, *figures, r.held])
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def as_csv(rows: list[Row]) -> str:
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    bounds = [f"{name}{end}" for name in ("return", "cost") for end in ("", "_low", "_high")]
+    names = list(rows[0].swept) if rows else []
+    writer.writerow([*names, "seeds", "steps", *bounds, "cost_limit", "held"])
+    for r in rows:
+        head = [*r.swept.values(), len(r.costs), r.steps]
+        writer.writerow([*head, *r.ret, *r.cost, r.cost_limit, r.held])
+    return out.getvalue()
+
+
+def main(envs: Any, algos: Any) -> int:
+    """scripts/sweep.py. Exit status as of train.py."""
+
+    def sweep() -> int:
+        parser = argparse.ArgumentParser(
+            description="Train a grid: python scripts/sweep.py algo=ppo_lag algo.cost_limit=5,10,25",
+            epilog=EPILOG,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        parser.error = command.fail  # type: ignore[method-assign]
+        parser.add_argument("options", nargs="*", metavar="key=value[,value...]")
+        parser.add_argument("--summary", type=Path, metavar="SWEEP", help="only rewrite its summary")
+        args = parser.parse_args()
+        if args.summary:
+            print(summarise(args.summary, envs, algos), end="")
+            return 0
+        asked, report = read(args.options, envs, algos), Report()
+        settings = [len(s.configs) for s in asked.groups.values()]
+        report.line(
+            f"sweep: {sum(settings)} settings in {len(settings)} group{'s' * (len(settings) > 1)}, "
+            f"in {asked.folder}"
+        )
+        again = f"python scripts/sweep.py {shlex.join(sys.argv[1:])}"
+        status = train(asked, envs, algos, again, report)
+        print(summarise(asked.folder, envs, algos) + f"sweep folder: {asked.folder}")
+        return status
+
+    return guarded(sweep)

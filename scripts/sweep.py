@@ -1,0 +1,9 @@
+"""Train a grid of settings: python scripts/sweep.py algo=ppo_lag algo.cost_limit=5,10,25"""
+
+import sys
+
+from jaxsafe import algos, envs
+from jaxsafe.sweep import main
+
+if __name__ == "__main__":
+    sys.exit(main(envs, algos))
