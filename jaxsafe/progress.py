@@ -42,8 +42,6 @@ class Report:
     def __init__(self, console: Console | None = None):
         self.console = console or Console(highlight=False, soft_wrap=True)
         self.live: Progress | None = None
-        self.last = {"ret": math.nan, "cost": math.nan, "lam": math.nan}  # finite values seen last
-        self.printed = -math.inf
 
     def __enter__(self) -> "Report":
         return self
@@ -58,6 +56,8 @@ class Report:
 
     def start(self, total_steps: int, steps: int, cost_limits: Sequence[float]) -> None:
         self.total = total_steps
+        self.last = {"ret": math.nan, "cost": math.nan, "lam": math.nan}  # finite values seen last
+        self.printed = -math.inf
         self.limits = "-".join(map(short, sorted({min(cost_limits), max(cost_limits)})))
         self.begun, self.begun_at = time.perf_counter(), steps
         if self.console.is_terminal:
