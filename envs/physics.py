@@ -101,9 +101,10 @@ def make_engine(
     if name == "warp":
         return Engine(name, *warp_engine(scene, max_substeps, outputs, alike, room))
     if name == "jax":
-        from jaxsafe.envs.physics_jax import jax_engine  # MJX is slow to import
+        from jaxsafe.envs import physics_jax  # late: MJX is slow to import
 
-        return Engine(name, jax_engine(scene, max_substeps, outputs), jax_engine(scene, 0, outputs))
+        maker: Any = physics_jax.jax_engine
+        return Engine(name, maker(scene, max_substeps, outputs), maker(scene, 0, outputs))
     raise ConfigError(f"env.engine={name!r}{nearest(name, ('auto', *ENGINES))}")
 
 

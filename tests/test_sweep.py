@@ -232,8 +232,8 @@ def test_the_policies_of_a_group_are_evaluated_setting_by_setting(finished):
     (folder,) = finished.glob("0*")
     settings = command.settle(run_folder.read_config(folder), TOYS, algos)
     env = command.make_env(settings, TOYS)
-    act, ts = command.policy_of(settings, env, algos, folder)
-    found = command.evaluate(settings, env, act, ts, 3, 0, folder)
+    algo, ts = command.policy_of(settings, env, algos, folder)
+    found = command.evaluate(settings, algo, ts, 3, 0, folder)
     assert [(s.name, s.cost_limit, s.episodes) for s in found] == [
         (f"algo.cost_limit={limit:g}, algo.dual_lr={rate:g}", limit, 6)
         for limit in (0.5, 5.0)
@@ -241,7 +241,7 @@ def test_the_policies_of_a_group_are_evaluated_setting_by_setting(finished):
     ]
     for i, s in enumerate(found):
         own = jax.tree.map(lambda x, i=i: x[2 * i : 2 * i + 2], ts)
-        alone = command.evaluation.run_episodes(env, act, own, 3, 0)
+        alone = command.evaluation.run_episodes(algo, own, 3, 0)
         assert s.rows["return"].mean == pytest.approx(alone.ret.mean(), rel=1e-5)
 
 
