@@ -17,6 +17,7 @@ from jaxsafe.envs.config import SafetyGymConfig
 
 ASSETS = Path(__file__).parent / "assets"
 OBJECT = {"condim": 6, "friction": (1.0, 0.005, 0.0001)}
+FIXED = OBJECT | {"contype": 0}  # meets what moves, and not what is fixed as well
 RGBA = {
     "goal": (0, 1, 0, 0.25),
     "hazard": (0, 0, 1, 0.25),
@@ -117,7 +118,7 @@ def build(cfg: SafetyGymConfig, mjx: bool = False, drawn: bool = False) -> Scene
     world = spec.worldbody
     half = max(map(abs, cfg.placements_extents)) + 0.1 if cfg.floor_display_mode else 3.5
     floor = world.add_geom(
-        name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(half, half, 0.1), **OBJECT
+        name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(half, half, 0.1), **FIXED
     )
     if drawn:
         decorate(spec, floor)
@@ -273,7 +274,7 @@ def add_gremlin_guide(spec: mujoco.MjSpec, i: int, drawn_size: float | None) -> 
 
 def add_fixed(spec: mujoco.MjSpec, name: str, kind: str, shape: mujoco.mjtGeom, size: tuple) -> None:
     body = spec.worldbody.add_body(name=name, mocap=True)
-    body.add_geom(name=name, type=shape, size=size, **OBJECT, **look(kind))
+    body.add_geom(name=name, type=shape, size=size, **FIXED, **look(kind))
 
 
 def decorate(spec: mujoco.MjSpec, floor: mujoco.MjsGeom) -> None:

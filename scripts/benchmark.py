@@ -11,6 +11,7 @@ import os
 import platform
 import resource
 import statistics
+import subprocess
 import sys
 import time
 from importlib.metadata import version
@@ -19,7 +20,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
-from jaxsafe import algos, envs
+from jaxsafe import algos, envs, runner
 from jaxsafe.config import ConfigError
 from jaxsafe.rollout import collect, init_rollout
 from jaxsafe.runner import device_name, use_compilation_cache
@@ -58,13 +59,13 @@ def stepping(env, num_envs: int, seeds: int, horizon: int):
     return per_seed(init, seeds), lambda state: jax.vmap(run)(state)[0]
 
 
-def training(env, algo: str, cfg, seeds: int):
+def training(env, algo: str, cfg, seeds: int, devices: int):
     """(state, fn): one update of `algo`."""
-    algorithm = algos.ALGOS[algo].make(env)
-    return (
-        per_seed(lambda key: algorithm.init(key, cfg), seeds),
-        lambda ts: jax.vmap(algorithm.update)(ts)[0],
-    )
+    settings = runner.TrainConfig(num_seeds=seeds, devices=devices)
+    runner.check_devices(settings)
+    program = runner.build(env, algos.ALGOS[algo].make, [cfg], settings)
+    state = jax.jit(program.init)(jax.device_put(program.start, program.sharding))
+    return state, lambda ts: program.update(ts)[0]
 
 
 def per_seed(init, seeds: int):
@@ -88,7 +89,7 @@ def measure(name: str, num_envs: int, args: argparse.Namespace) -> dict:
         config = algos.ALGOS[args.algo].config
         cfg = config(num_envs=num_envs, **({"horizon": args.horizon} if args.horizon else {}))
         horizon = cfg.horizon
-        state, fn = training(env, args.algo, cfg, args.seeds)
+        state, fn = training(env, args.algo, cfg, args.seeds, args.devices)
     else:
         horizon = args.horizon or 100
         state, fn = stepping(env, num_envs, args.seeds, horizon)
@@ -102,6 +103,7 @@ def measure(name: str, num_envs: int, args: argparse.Namespace) -> dict:
         "algo": args.algo,
         "num_envs": num_envs,
         "num_seeds": args.seeds,
+        "devices": args.devices if args.algo else 1,
         "horizon": horizon,
         "env_steps_per_s": rate,
         "physics_steps_per_s": rate * env.config.frameskip_binom_n,
@@ -111,6 +113,21 @@ def measure(name: str, num_envs: int, args: argparse.Namespace) -> dict:
         "compile_s": compile_time,
         "memory_bytes": memory(),
     }
+
+
+def measure_peer(spec: str) -> list[dict]:
+    """The rows of scripts/peers.py, by the Python that has the peer installed."""
+    name, _, python = spec.partition("=")
+    script = Path(__file__).with_name("peers.py")
+    try:
+        done = subprocess.run(
+            [python or sys.executable, script, name], stdout=subprocess.PIPE, text=True
+        )
+    except OSError as error:
+        raise ConfigError(f"--peer {spec}: {error.strerror}: {python}") from None
+    if done.returncode:
+        raise ConfigError(f"--peer {spec}: it ended with status {done.returncode}; see above")
+    return [json.loads(line) for line in done.stdout.splitlines()]
 
 
 def versions() -> dict[str, str]:
@@ -127,40 +144,58 @@ def versions() -> dict[str, str]:
 def show(row: dict) -> str:
     what = row["algo"] or "steps"
     return (
-        f"{row['env']:<14} {row['engine']:<5} {what:<8} {row['num_seeds']:>3} x {row['num_envs']:<6} "
+        f"{row['env']:<16} {row['engine']:<5} {what:<8} {row['num_seeds']:>3} x {row['num_envs']:<6} "
         f"{row['env_steps_per_s']:>11,.0f} {row['physics_steps_per_s']:>12,.0f} "
         f"{row['simulated_s_per_s']:>10,.0f} {row['compile_s']:>8.1f} "
         f"{row['memory_bytes'] / 2**30:>7.2f}"
     )
 
 
+def show_peer(row: dict) -> str:
+    what = f"{row['peer']}: {row['algo'] or 'steps'}"
+    return f"{row['env']:<22} {what:<14} {row['num_envs']:>6} {row['env_steps_per_s']:>11,.0f}"
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("envs", nargs="+", metavar="ENV")
+    parser.add_argument("envs", nargs="*", metavar="ENV")
     parser.add_argument("--num-envs", type=int, nargs="+", default=[256], help="of each seed")
     parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--devices", type=int, default=1, help="over which --algo splits its seeds")
     parser.add_argument("--engine", default="auto", help="auto, c, warp or jax")
     parser.add_argument("--awake", type=int, metavar="K", help="vases, and gremlins, simulated at once")
     parser.add_argument("--algo", help="measure its update instead of random actions")
     parser.add_argument("--horizon", type=int, help="steps of each environment in a run")
     parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument(
+        "--peer", nargs="*", default=[], metavar="NAME=PYTHON", help="also measure crax, ... (peers.py)"
+    )
     parser.add_argument("--json", type=Path, help="append the rows to this file, a line each")
     args = parser.parse_args()
     use_compilation_cache()
-    print(f"{' '.join(f'{k} {v}' for k, v in versions().items())}")
+    about = versions()
+    print(f"{' '.join(f'{k} {v}' for k, v in about.items())}")
     print(
-        f"{'env':<14} {'engine':<5} {'what':<8} {'seeds x envs':<12} {'env steps/s':>11} "
+        f"{'env':<16} {'engine':<5} {'what':<8} {'seeds x envs':<12} {'env steps/s':>11} "
         f"{'physics/s':>12} {'sim s/s':>10} {'compile':>8} {'GiB':>7}"
     )
+
+    def keep(row: dict) -> None:
+        if args.json:
+            with args.json.open("a") as file:
+                command = "python " + " ".join(sys.argv)
+                file.write(json.dumps(row | {"command": command, **about}) + "\n")
+
     try:
         for name in args.envs:
             for num_envs in args.num_envs:
                 row = measure(name, num_envs, args)
                 print(show(row), flush=True)
-                if args.json:
-                    with args.json.open("a") as file:
-                        command = "python " + " ".join(sys.argv)
-                        file.write(json.dumps(row | {"command": command, **versions()}) + "\n")
+                keep(row)
+        for spec in args.peer:
+            for row in measure_peer(spec):
+                print(show_peer(row), flush=True)
+                keep(row)
     except ConfigError as error:
         print(error, file=sys.stderr)
         return 2
