@@ -9,6 +9,7 @@ import json
 import lzma
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 
 from jaxsafe import plots, run_folder
@@ -57,7 +58,29 @@ def last_tenth(metrics: dict[str, np.ndarray], name: str) -> str:
     return f"{e.mean:.2f} [{e.low:.2f}, {e.high:.2f}]"
 
 
+def throughput(path: Path) -> None:
+    """Environment steps a second, random actions, against the number of environments."""
+    figure, axes = plt.subplots(figsize=(7, 4.5))
+    for file, style in (("benchmark_h200.jsonl", "o-"), ("benchmark_cpu.jsonl", "s--")):
+        found: dict[str, dict[int, float]] = {}
+        for line in (HERE / file).read_text().splitlines():
+            row = json.loads(line)
+            if row["algo"] is None:
+                best = found.setdefault(row["env"], {})
+                best[row["num_envs"]] = max(best.get(row["num_envs"], 0), row["env_steps_per_s"])
+        device = "H200" if "h200" in file else "2 CPU cores"
+        for env, points in sorted(found.items()):
+            axes.loglog(*zip(*sorted(points.items()), strict=True), style, label=f"{env}, {device}")
+    axes.set_xlabel("environments")
+    axes.set_ylabel("environment steps / s")
+    axes.grid(True, which="both", alpha=0.3)
+    axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5))
+    figure.savefig(path, dpi=130, bbox_inches="tight")
+    plt.close(figure)
+
+
 def main() -> None:
+    throughput(HERE / "throughput.png")
     print("| run | seeds | return | cost (limit 25) | final policy | published | minutes |")
     print("|---|---:|---:|---:|---|---|---:|")
     for name in PUBLISHED:
