@@ -1,15 +1,29 @@
 import importlib.util
 import re
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).parent.parent
 
 
-def test_the_tables_of_the_readme_are_those_of_the_registries():
-    spec = importlib.util.spec_from_file_location("tables", ROOT / "docs" / "tables.py")
+def script(name: str) -> Any:
+    """A script of docs/, as a module."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / f"{name}.py")
     assert spec and spec.loader
-    tables = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(tables)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_pages_of_the_algorithms_are_those_of_the_code():
+    pages = script("pages").pages()
+    assert {path.name for path in (ROOT / "docs" / "algorithms").iterdir()} == {p.name for p in pages}
+    for path, text in pages.items():
+        assert path.read_text() == text, f"{path.name}: run python docs/pages.py"
+
+
+def test_the_tables_of_the_readme_are_those_of_the_registries():
+    tables = script("tables")
     text = (ROOT / "README.md").read_text()
     assert text.count("<!-- table:") == 2
     assert tables.filled(text) == text

@@ -22,8 +22,8 @@ LIMIT = 25.0
 PUBLISHED = {
     "point_goal1-ppo_lag": "OmniSafe 12.96 ± 6.95, cost 25.80 ± 34.99",
     "point_goal1-cpo": "OmniSafe 20.46 ± 1.38, cost 28.84 ± 7.76",
-    "point_goal1-ppo_lag-published": "the same",
-    "point_goal1-cpo-published": "the same",
+    "point_goal1-ppo_lag-published": "OmniSafe 12.96 ± 6.95, cost 25.80 ± 34.99",
+    "point_goal1-cpo-published": "OmniSafe 20.46 ± 1.38, cost 28.84 ± 7.76",
     "car_push1-ppo_lag": "none (unconstrained PPO: 3.085, cost 61.94)",
     "car_push1-cpo": "none (unconstrained PPO: 3.085, cost 61.94)",
 }
