@@ -11,6 +11,7 @@ Imported by the engine itself only: it needs Warp.
 # pyright: reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false
 
 import dataclasses
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -153,6 +154,7 @@ def warp_engine(
     inputs, results = widths(model, outputs)
     results |= {"overflow": 1}
     batches: dict[tuple[str, int], Worlds] = {}
+    one_at_a_time = threading.Lock()  # several devices call from several threads
 
     def prepare(worlds: int) -> Worlds:
         m = mujoco_warp.put_model(model)
@@ -221,6 +223,10 @@ def warp_engine(
                     wp.copy(column, floats(getattr(data, name)))
 
         def run(packed: wp.array2d[float], result: wp.array2d[float]):
+            with one_at_a_time:
+                launch(packed, result)
+
+        def launch(packed: wp.array2d[float], result: wp.array2d[float]) -> None:
             device = wp.get_device()
             place = (str(device), packed.shape[0])
             if place not in batches:
@@ -230,11 +236,11 @@ def warp_engine(
             if not device.is_cuda:
                 advance(w)
             else:
-                if run not in w.graphs:
+                if launch not in w.graphs:
                     with wp.ScopedCapture() as capture:
                         advance(w)
-                    w.graphs[run] = capture.graph
-                wp.capture_launch(w.graphs[run])
+                    w.graphs[launch] = capture.graph
+                wp.capture_launch(w.graphs[launch])
             wp.copy(result, w.out)
 
         call = wp.jax_callable(run, graph_mode=wp.JaxCallableGraphMode.NONE)

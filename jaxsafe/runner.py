@@ -152,10 +152,6 @@ def build(env: Env, make: Callable, configs: Sequence[Any], settings: TrainConfi
     if devices == 1:
         one = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
         return Program(init, update, (keys, floats), run, one)
-    if getattr(env, "engine", None) == "warp":
-        # In JAX 0.11 Shardy crashes on programs around Warp's calls; the older partitioner crashes on
-        # the callbacks of engine c.
-        jax.config.update("jax_use_shardy_partitioner", False)
     mesh = jax.make_mesh(
         (devices,), (AXIS,), devices=jax.local_devices()[:devices], axis_types=(AxisType.Auto,)
     )
