@@ -22,7 +22,7 @@ from jaxsafe.config import ConfigError, config
 from jaxsafe.gaussian import Gaussian, entropy, log_prob, sample
 from jaxsafe.networks import init_params, policy, value
 from jaxsafe.normalise import init_normaliser, merge, normalise
-from jaxsafe.returns import gae, mean_length
+from jaxsafe.returns import Estimator, advantages, mean_length
 from jaxsafe.rollout import RolloutState, Trajectory, collect, init_rollout
 from jaxsafe.steps import Step, adam, fit_critic
 from jaxsafe.treatments import Treatment
@@ -41,6 +41,7 @@ class OnPolicyConfig:
     init: Literal["orthogonal", "torch"] = "orthogonal"  # weights; [O] torch
     init_log_std: float = -0.5  # of the actions' standard deviation [S]
     obs_normalize: bool = True  # by running mean and variance [O]
+    estimator: Estimator = "gae"  # of advantages and of the critics' targets [O]
     discount: float = 0.99  # [O, S]
     gae_lambda: float = 0.95  # [O]
     cost_discount: float = 0.99  # [O, S], who name it but use `discount`
@@ -323,28 +324,35 @@ def estimate(
     """Advantages and targets of `reward` [T, N] and of cost, under the parameters that acted."""
     cfg = ts.config
     obs, next_obs = see(ts, traj.obs), see(ts, traj.next_obs)
+    old = policy(ts.params["actor"], obs, cfg)
+    ratio = jnp.exp(log_prob(old, traj.action) - traj.log_prob)  # 1: the policy is still the same
 
     def both(critic: PyTree, signal: jax.Array, discount: jax.Array, decay: jax.Array):
         v = value(critic, obs, cfg)
         next_v = value(critic, next_obs, cfg)
-        adv = gae(signal, v, next_v, traj.terminated, traj.done, discount=discount, decay=decay)
-        return adv, adv + v
+        ends = traj.terminated, traj.done
+        adv, error = advantages(
+            cfg.estimator, signal, v, next_v, *ends, ratio, discount=discount, decay=decay
+        )
+        return adv, error, error + v
 
-    adv_r, ret_r = both(ts.params["critic_r"], reward, cfg.discount, cfg.gae_lambda)
-    adv_c, ret_c = both(ts.params["critic_c"], traj.cost, cfg.cost_discount, cfg.cost_gae_lambda)
+    adv_r, error_r, ret_r = both(ts.params["critic_r"], reward, cfg.discount, cfg.gae_lambda)
+    adv_c, error_c, ret_c = both(
+        ts.params["critic_c"], traj.cost, cfg.cost_discount, cfg.cost_gae_lambda
+    )
     batch = Batch(
         obs=obs,
         action=traj.action,
         log_prob=traj.log_prob,
-        old=policy(ts.params["actor"], obs, cfg),
+        old=old,
         adv_r=standardise(adv_r, axis_name),
         adv_c=centre(adv_c, axis_name),
         ret_r=ret_r,
         ret_c=ret_c,
     )
     metrics = {
-        "train/explained_variance_r": explained_variance(adv_r, ret_r, axis_name),
-        "train/explained_variance_c": explained_variance(adv_c, ret_c, axis_name),
+        "train/explained_variance_r": explained_variance(error_r, ret_r, axis_name),
+        "train/explained_variance_c": explained_variance(error_c, ret_c, axis_name),
     }
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch), metrics
 

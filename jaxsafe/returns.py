@@ -1,10 +1,15 @@
 """Advantages, and what an episode costs."""
 
+from functools import partial
+from typing import Literal
+
 import chex
 import jax
 import jax.numpy as jnp
 
 from jaxsafe.batch import psum
+
+Estimator = Literal["gae", "gae_rtg", "plain", "vtrace"]
 
 
 def gae(
@@ -39,7 +44,7 @@ def gae(
         Generalized Advantage Estimation", section 3.
     """
     chex.assert_equal_shape([reward, value, next_value, terminated, done])
-    delta = reward + discount * jnp.where(terminated, 0.0, next_value) - value
+    delta = td_error(reward, value, next_value, terminated, discount)
 
     def backward(advantage: jax.Array, x: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         delta, done = x
@@ -47,6 +52,93 @@ def gae(
         return advantage, advantage
 
     return jax.lax.scan(backward, jnp.zeros_like(value[0]), (delta, done), reverse=True)[1]
+
+
+def td_error(
+    reward: jax.Array,
+    value: jax.Array,
+    next_value: jax.Array,
+    terminated: jax.Array,
+    discount: jax.Array | float,
+) -> jax.Array:
+    return reward + discount * jnp.where(terminated, 0.0, next_value) - value
+
+
+def vtrace(
+    reward: jax.Array,
+    value: jax.Array,
+    next_value: jax.Array,
+    terminated: jax.Array,
+    done: jax.Array,
+    ratio: jax.Array,
+    *,
+    discount: jax.Array | float,
+) -> jax.Array:
+    """V-trace: advantages for a policy pi from the data of another, mu.
+
+        A_t = rho_t (r_t + discount v_{t+1} - V(s_t)),   v_t = V(s_t) + A_t,   rho_t = min(1, pi / mu)
+
+    where v_{t+1} is 0 if terminated_t, else V(s_{t+1}) if done_t. Both of the paper's clips, rho and
+    c, are at 1, which makes one recursion of its two: v_t - V(s_t) is A_t. With pi = mu it is
+    `gae` with a decay of 1.
+
+    Args:
+        ratio: float [T, N], pi(a_t | s_t) / mu(a_t | s_t); the others as for `gae`.
+    Returns:
+        Advantages, float [T, N]. With `value` added they are the targets v.
+    Source: Espeholt et al. (2018), "IMPALA: Scalable Distributed Deep-RL with Importance Weighted
+        Actor-Learner Architectures", arXiv:1802.01561, equation 1 and section 4.2.
+    """
+    chex.assert_equal_shape([reward, value, next_value, terminated, done, ratio])
+    delta = td_error(reward, value, next_value, terminated, discount)
+
+    def backward(advantage: jax.Array, x: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
+        delta, done, rho = x
+        advantage = rho * (delta + discount * jnp.where(done, 0.0, advantage))
+        return advantage, advantage
+
+    rho = jnp.minimum(1.0, ratio)
+    return jax.lax.scan(backward, jnp.zeros_like(value[0]), (delta, done, rho), reverse=True)[1]
+
+
+def advantages(
+    estimator: Estimator,
+    reward: jax.Array,
+    value: jax.Array,
+    next_value: jax.Array,
+    terminated: jax.Array,
+    done: jax.Array,
+    ratio: jax.Array,
+    *,
+    discount: jax.Array | float,
+    decay: jax.Array | float,
+) -> tuple[jax.Array, jax.Array]:
+    """Advantages, and the errors of the critic: its targets less `value`. OmniSafe's four:
+
+        gae:      generalised advantages; their own TD(lambda) returns as targets
+        gae_rtg:  generalised advantages; discounted rewards to go as targets
+        plain:    temporal differences of one step; rewards to go as targets
+        vtrace:   V-trace, for both
+
+    Rewards to go run to the end of the episode or of the batch and add the value there, unless it
+    terminated: V(s) plus `gae` with a decay of 1.
+
+    Args: as for `vtrace` and `gae`; only those two names with gae in them read `decay`.
+    """
+    sums = partial(gae, reward, value, next_value, terminated, done, discount=discount)
+    match estimator:
+        case "gae":
+            advantage = error = sums(decay=decay)
+        case "gae_rtg":
+            advantage, error = sums(decay=decay), sums(decay=1.0)
+        case "plain":
+            advantage = td_error(reward, value, next_value, terminated, discount)
+            error = sums(decay=1.0)
+        case "vtrace":
+            advantage = error = vtrace(
+                reward, value, next_value, terminated, done, ratio, discount=discount
+            )
+    return advantage, error
 
 
 def mean_length(
