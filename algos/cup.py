@@ -24,7 +24,7 @@ from jaxsafe.gaussian import kl
 from jaxsafe.networks import policy
 from jaxsafe.on_policy import Algorithm, Batch, TrainState, loop
 from jaxsafe.steps import AdamState, adam_epochs
-from jaxsafe.surrogates import clipped, plain
+from jaxsafe.surrogates import clipped, plain, with_entropy
 from jaxsafe.treatments import LagrangianConfig, lagrangian
 from jaxsafe.types import Env, Metrics, PyTree
 
@@ -57,7 +57,8 @@ def make(env: Env, axis_name: str | None = None) -> Algorithm:
         keys = jax.random.split(key)
 
         def earn(actor: PyTree, batch: Batch) -> tuple[jax.Array, Metrics]:
-            return clipped(policy(actor, batch.obs, cfg), batch, batch.adv_r, cfg)
+            earned = with_entropy(clipped, ts.iteration)
+            return earned(policy(actor, batch.obs, cfg), batch, batch.adv_r, cfg)
 
         actor, opt_state, metrics = adam_epochs.update(
             ts.params["actor"], ts.opt_state["actor"], earn, batch, keys[0], cfg, axis_name

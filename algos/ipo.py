@@ -6,7 +6,7 @@
 Source: Liu, Ding and Liu (2020), "IPO: Interior-point Policy Optimization under Constraints",
 arXiv:1910.09615.
 Differs from it, as OmniSafe does: the barrier enters by its gradient at the present policy. OmniSafe
-also normalises rewards and costs, which is not done here.
+also normalises rewards and costs, as the published settings do here.
 """
 
 from typing import Any
@@ -27,7 +27,10 @@ class IPOConfig(ppo.PPOConfig):
 
 
 PUBLISHED: dict[str, dict[str, Any]] = {
-    name: options | {"epochs": 10, "critic_epochs": 10} for name, options in ppo.PUBLISHED.items()
+    name: options
+    | {"epochs": 10, "critic_epochs": 10}
+    | {"reward_normalize": True, "cost_normalize": True}
+    for name, options in ppo.PUBLISHED.items()
 }
 
 

@@ -6,7 +6,7 @@
 Source: Chow et al. (2018), "Risk-Constrained Reinforcement Learning with Percentile Risk Criteria",
 arXiv:1512.01629.
 Differs from it, as OmniSafe does: the constraint is on the expected cost, where the paper's is on its
-CVaR or on a chance. OmniSafe also normalises rewards and costs, which is not done here.
+CVaR or on a chance. OmniSafe also normalises rewards and costs, as the published settings do here.
 """
 
 from typing import Any
@@ -26,7 +26,9 @@ class PDOConfig(LagrangianConfig, pg.PGConfig):
 
 
 PUBLISHED: dict[str, dict[str, Any]] = {
-    name: options | {"epochs": 40, "critic_epochs": 40, "dual_lr": 0.035}
+    name: options
+    | {"epochs": 40, "critic_epochs": 40, "dual_lr": 0.035}
+    | {"reward_normalize": True, "cost_normalize": True}
     for name, options in pg.PUBLISHED.items()
 }
 

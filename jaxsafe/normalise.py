@@ -1,4 +1,4 @@
-"""Running mean and variance of observations, merged over batches and devices.
+"""Running mean and variance of observations, rewards and costs, merged over batches and devices.
 
     w = n / (count + n);  d = mean_batch - mean
     mean <- mean + w d;   var <- var + w (var_batch - var) + w (1 - w) d^2
@@ -15,7 +15,7 @@ import jax.numpy as jnp
 
 from jaxsafe.batch import batch_mean, psum
 
-MIN_STD = 0.01  # in units of the observation
+MIN_STD = 0.01  # in units of what is normalised
 CLIP = 5.0  # standard deviations
 
 

@@ -25,6 +25,7 @@ from jaxsafe.normalise import init_normaliser, merge, normalise
 from jaxsafe.returns import Estimator, advantages, mean_length
 from jaxsafe.rollout import RolloutState, Trajectory, collect, init_rollout
 from jaxsafe.steps import Step, adam, fit_critic
+from jaxsafe.surrogates import Surrogate, with_entropy
 from jaxsafe.treatments import Treatment
 from jaxsafe.types import Env, Metrics, PyTree
 
@@ -36,11 +37,15 @@ class OnPolicyConfig:
     num_envs: int = 512  # per device; with horizon 20,480 steps a batch, near the 20,000 of [O]
     horizon: int = 40  # steps of each environment per iteration; shorter ones learn less from a step
     stagger: bool = True  # spread the first episodes' ends over time
-    total_iterations: float = float("inf")  # where learning rates reach 0; inf: total_steps' end
+    total_iterations: float = float("inf")  # where what decays reaches 0; inf: total_steps' end
     hidden: tuple[int, ...] = (64, 64)  # tanh units of each network [O]
     init: Literal["orthogonal", "torch"] = "orthogonal"  # weights; [O] torch
     init_log_std: float = -0.5  # of the actions' standard deviation [S]
     obs_normalize: bool = True  # by running mean and variance [O]
+    reward_normalize: bool = False  # likewise, for the learner alone [O]
+    cost_normalize: bool = False  # likewise [O]; limits and metrics are of costs as they are
+    entropy_coef: float = 0.0  # times the policy's entropy, added to what it maximises [O]
+    entropy_decay: bool = False  # of entropy_coef, linearly to 0 at total_iterations
     estimator: Estimator = "gae"  # of advantages and of the critics' targets [O]
     discount: float = 0.99  # [O, S]
     gae_lambda: float = 0.95  # [O]
@@ -74,6 +79,7 @@ class TrainState:
     opt_state: {'actor': the step's own, 'critics': Adam's for both, stacked}.
     dual: the treatment's state.
     normaliser: Normaliser, or () without `obs_normalize`.
+    signals: Normaliser of [reward, cost], or () without `reward_normalize` and `cost_normalize`.
     rollout: this device's environments.
     episode_length: float [], running mean length of an episode, in steps.
     """
@@ -83,6 +89,7 @@ class TrainState:
     opt_state: dict[str, PyTree]
     dual: PyTree
     normaliser: PyTree
+    signals: PyTree
     rollout: RolloutState
     episode_length: jax.Array
     key: jax.Array
@@ -94,7 +101,8 @@ class Batch:
     """B = T * N transitions, as the policy sees them: observations are normalised.
 
     obs [B, O]; action [B, A]; log_prob [B] and old (Gaussian [B, A]) of the policy that acted;
-    adv_r standardised, adv_c only centred, in cost units; ret_r, ret_c: the critics' targets [B].
+    adv_r standardised, adv_c only centred, in cost units or, with `cost_normalize`, in standard
+    deviations of a step's; ret_r, ret_c: the critics' targets [B].
     """
 
     obs: jax.Array
@@ -120,7 +128,7 @@ class Algorithm(NamedTuple):
 def on_policy(
     env: Env,
     treatment: Treatment,
-    surrogate: Callable,
+    surrogate: Surrogate,
     step: Step,
     axis_name: str | None = None,
     augmentation: Augmentation = nothing,
@@ -133,7 +141,8 @@ def on_policy(
 
         def objective(actor: PyTree, batch: Batch) -> tuple[jax.Array, Metrics]:
             advantage = treatment.advantage(dual, batch.adv_r, batch.adv_c)
-            return surrogate(policy(actor, batch.obs, cfg), batch, advantage, cfg)
+            earned = with_entropy(surrogate, ts.iteration)
+            return earned(policy(actor, batch.obs, cfg), batch, advantage, cfg)
 
         actor, opt_state, metrics = step.update(
             ts.params["actor"], ts.opt_state["actor"], objective, batch, key, cfg, axis_name
@@ -145,10 +154,10 @@ def on_policy(
 
 def on_policy_pair(
     env: Env,
-    surrogate: Callable,
+    surrogate: Surrogate,
     step: Step,
     axis_name: str | None = None,
-    surrogate_c: Callable | None = None,
+    surrogate_c: Surrogate | None = None,
 ) -> Algorithm:
     """Algorithms whose step weighs reward against cost itself, so that it takes two objectives:
     `surrogate` of the reward's advantage, and `surrogate_c` (or the same) of the cost's.
@@ -162,7 +171,8 @@ def on_policy_pair(
         cfg = ts.config
 
         def objective_r(actor: PyTree, batch: Batch) -> tuple[jax.Array, Metrics]:
-            return surrogate(policy(actor, batch.obs, cfg), batch, batch.adv_r, cfg)
+            earned = with_entropy(surrogate, ts.iteration)
+            return earned(policy(actor, batch.obs, cfg), batch, batch.adv_r, cfg)
 
         def objective_c(actor: PyTree, batch: Batch) -> tuple[jax.Array, Metrics]:
             dist = policy(actor, batch.obs, cfg)
@@ -182,7 +192,15 @@ def on_policy_pair(
         )
         return actor, opt_state, (), metrics
 
-    return loop(env, step.init, lambda cfg: (), improve, axis_name)
+    def init_dual(cfg: Any) -> tuple[()]:
+        if cfg.cost_normalize:
+            raise ConfigError(
+                "cost_normalize=True: expected False for an algorithm that adds what it estimates of "
+                "the cost to the violation, which is in units of cost"
+            )
+        return ()
+
+    return loop(env, step.init, init_dual, improve, axis_name)
 
 
 def loop(
@@ -212,6 +230,7 @@ def loop(
             },
             dual=dual,
             normaliser=init_normaliser(env.obs_size) if cfg.obs_normalize else (),
+            signals=init_normaliser(2) if cfg.reward_normalize or cfg.cost_normalize else (),
             rollout=init_rollout(wrapped, own(rollout_key, axis_name), cfg.num_envs, cfg.stagger),
             episode_length=jnp.float32(env.episode_length),
             key=key,
@@ -239,7 +258,8 @@ def loop(
             cfg.horizon,
             lambda episode: augmentation.stop(episode, cfg),
         )
-        batch, explained = estimate(ts, traj, augmentation.reward(traj, cfg), axis_name)
+        reward, cost, signals = learned(ts, augmentation.reward(traj, cfg), traj.cost, axis_name)
+        batch, explained = estimate(ts, traj, reward, cost, axis_name)
         length = mean_length(ts.episode_length, traj.ended, traj.length, axis_name)
         cost_rate = batch_mean(traj.cost, axis_name)
 
@@ -251,9 +271,11 @@ def loop(
         seen = traj.obs[..., : env.obs_size]
         normaliser = merge(ts.normaliser, seen, axis_name) if cfg.obs_normalize else ()
         # parameters are guarded step by step; what is not a step of a gradient is guarded here
-        finite = psum(~all_finite((batch, normaliser)), axis_name) == 0
-        dual, normaliser, length = select(
-            finite, (dual, normaliser, length), (ts.dual, ts.normaliser, ts.episode_length)
+        finite = psum(~all_finite((batch, normaliser, signals)), axis_name) == 0
+        dual, normaliser, signals, length = select(
+            finite,
+            (dual, normaliser, signals, length),
+            (ts.dual, ts.normaliser, ts.signals, ts.episode_length),
         )
         critic_r, critic_c = (jax.tree.map(operator.itemgetter(i), critics) for i in range(2))
         metrics |= episode_metrics(env, traj, axis_name) | explained
@@ -272,6 +294,7 @@ def loop(
             opt_state={"actor": opt_actor, "critics": opt_critics},
             dual=dual,
             normaliser=normaliser,
+            signals=signals,
             rollout=rollout,
             episode_length=length,
             key=key,
@@ -304,6 +327,27 @@ def see(ts: TrainState, obs: jax.Array) -> jax.Array:
     return jnp.concatenate([normalise(ts.normaliser, obs[..., :size]), obs[..., size:]], -1)
 
 
+def learned(
+    ts: TrainState, reward: jax.Array, cost: jax.Array, axis_name: str | None
+) -> tuple[jax.Array, jax.Array, PyTree]:
+    """Reward and cost [T, N] as the learner sees them, and `ts.signals` with them added.
+
+    Unlike observations, on which the policy has acted already, a batch is normalised by statistics
+    that include it, as in OmniSafe, so that the critics' first targets have the scale of all others.
+    """
+    cfg = ts.config
+    if not (cfg.reward_normalize or cfg.cost_normalize):
+        return reward, cost, ()
+    both = jnp.stack([reward, cost], -1)
+    signals = merge(ts.signals, both, axis_name)
+    scaled = normalise(signals, both)
+    return (
+        scaled[..., 0] if cfg.reward_normalize else reward,
+        scaled[..., 1] if cfg.cost_normalize else cost,
+        signals,
+    )
+
+
 def check(cfg: Any) -> None:
     """Refuse sizes that do not fit each other."""
     for name in ("num_envs", "horizon", "minibatches"):
@@ -319,9 +363,9 @@ def check(cfg: Any) -> None:
 
 
 def estimate(
-    ts: TrainState, traj: Trajectory, reward: jax.Array, axis_name: str | None
+    ts: TrainState, traj: Trajectory, reward: jax.Array, cost: jax.Array, axis_name: str | None
 ) -> tuple[Batch, Metrics]:
-    """Advantages and targets of `reward` [T, N] and of cost, under the parameters that acted."""
+    """Advantages and targets of `reward` and `cost` [T, N], under the parameters that acted."""
     cfg = ts.config
     obs, next_obs = see(ts, traj.obs), see(ts, traj.next_obs)
     old = policy(ts.params["actor"], obs, cfg)
@@ -337,9 +381,7 @@ def estimate(
         return adv, error, error + v
 
     adv_r, error_r, ret_r = both(ts.params["critic_r"], reward, cfg.discount, cfg.gae_lambda)
-    adv_c, error_c, ret_c = both(
-        ts.params["critic_c"], traj.cost, cfg.cost_discount, cfg.cost_gae_lambda
-    )
+    adv_c, error_c, ret_c = both(ts.params["critic_c"], cost, cfg.cost_discount, cfg.cost_gae_lambda)
     batch = Batch(
         obs=obs,
         action=traj.action,

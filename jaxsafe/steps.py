@@ -40,6 +40,12 @@ def adam(lr: jax.Array | float, cfg: Any) -> optax.GradientTransformation:
     return optax.chain(optax.clip_by_global_norm(cfg.max_grad_norm), optax.adam(lr))
 
 
+def remaining(iteration: jax.Array, cfg: Any) -> jax.Array:
+    """The share of training that is left: 1 at first, 0 from `cfg.total_iterations` on."""
+    total = jnp.where(cfg.total_iterations > 0, cfg.total_iterations, jnp.inf)
+    return jnp.maximum(0.0, 1.0 - iteration / total)
+
+
 def descend(
     optimiser: optax.GradientTransformation, params: PyTree, opt_state: PyTree, grads: PyTree
 ) -> tuple[PyTree, PyTree, jax.Array]:
@@ -89,8 +95,7 @@ def update_adam(
     The KL is the mean over the whole batch, taken after each pass; there is no way back. The
     learning rate falls linearly to 0 at `cfg.total_iterations`, if `cfg.lr_decay`.
     """
-    total = jnp.where(cfg.total_iterations > 0, cfg.total_iterations, jnp.inf)
-    left = jnp.maximum(0.0, 1.0 - opt_state.iteration / total) if cfg.lr_decay else 1.0
+    left = remaining(opt_state.iteration, cfg) if cfg.lr_decay else 1.0
     optimiser = adam(cfg.lr * left, cfg)
 
     def minibatch_step(carry: PyTree, batch: Any) -> tuple[PyTree, jax.Array]:

@@ -6,13 +6,17 @@ of the batch of something to maximise. dist is the new policy at `batch.obs`, an
     w = pi(a | s) / pi_old(a | s)
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from jaxsafe.gaussian import Gaussian, kl, log_prob
+from jaxsafe.gaussian import Gaussian, entropy, kl, log_prob
+from jaxsafe.steps import remaining
 from jaxsafe.types import Metrics
+
+Surrogate = Callable[[Gaussian, Any, jax.Array, Any], tuple[jax.Array, Metrics]]
 
 
 def plain(dist: Gaussian, batch: Any, advantage: jax.Array, cfg: Any) -> tuple[jax.Array, Metrics]:
@@ -52,3 +56,19 @@ def near_old(dist: Gaussian, batch: Any, advantage: jax.Array, cfg: Any) -> tupl
     w = jnp.exp(jnp.where(inside, log_prob(dist, batch.action) - batch.log_prob, 0.0))
     gain = w * advantage / cfg.temperature - divergence
     return jnp.mean(jnp.where(inside, gain, 0.0)), {"train/inside": jnp.mean(inside)}
+
+
+def with_entropy(surrogate: Surrogate, iteration: jax.Array) -> Surrogate:
+    """`surrogate` + entropy_coef E[H(pi)], whose coefficient falls linearly to 0 at
+    `cfg.total_iterations`, if `cfg.entropy_decay`.
+
+    Source: Williams and Peng (1991), "Function Optimization Using Connectionist Reinforcement
+    Learning Algorithms"; Schulman et al. (2017), equation 9.
+    """
+
+    def value(dist: Gaussian, batch: Any, advantage: jax.Array, cfg: Any) -> tuple[jax.Array, Metrics]:
+        gain, metrics = surrogate(dist, batch, advantage, cfg)
+        left = remaining(iteration, cfg) if cfg.entropy_decay else 1.0
+        return gain + cfg.entropy_coef * left * jnp.mean(entropy(dist)), metrics
+
+    return value
