@@ -473,11 +473,17 @@ def warm_start(
     options = [k for k in here if k.startswith("env.") and saved.env_name == settings.env_name]
     differ = [
         f"{name} is {there.get(name)} there, {here[name]} here"
-        for name in ("env.name", "algo.hidden", "algo.obs_normalize", *options)
+        for name in ("env.name", "algo.hidden", "algo.std", "algo.obs_normalize", *options)
         if there.get(name) != here[name]
     ]
     like = jax.eval_shape(program.init, program.start)
     runner.check_policy(like, policy, source, why="; ".join(["", *differ[:3]]))
+    units = [plain.get("algo.activation") for plain in (there, here)]  # no shape tells them apart
+    if units[0] != units[1]:
+        raise ConfigError(
+            f"the policy of {source} does not fit: "
+            f"algo.activation is {units[0]} there, {units[1]} here; expected the same"
+        )
     rows = [(m.seed - first) % count for m in program.members]
     pairs = {m.seed: first + row for m, row in zip(program.members, rows, strict=True)}
     of = f" of its setting {runner.members(saved.configs, saved.train)[0].setting}"

@@ -11,9 +11,12 @@ import jax.numpy as jnp
 from jaxsafe.gaussian import Gaussian
 from jaxsafe.types import PyTree
 
+# range of a std that depends on the state; Haarnoja et al. (2018), the code of "Soft Actor-Critic"
+LOG_STD = (-20.0, 2.0)
+
 
 class MLP(nn.Module):
-    """Tanh layers and a linear one, float [..., I] -> [..., out].
+    """Layers of `activation` and a linear one, float [..., I] -> [..., out].
 
     weights 'orthogonal': gain sqrt(2), `gain` for the last layer, zero biases (Andrychowicz et al.,
     2021, "What Matters in On-Policy Reinforcement Learning?"). 'torch': weights and biases uniform
@@ -23,12 +26,13 @@ class MLP(nn.Module):
     hidden: tuple[int, ...]
     out: int
     weights: str
+    activation: str
     gain: float = 1.0
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         for size in self.hidden:
-            x = nn.tanh(self._dense(size, math.sqrt(2.0), x.shape[-1])(x))
+            x = ACTIVATIONS[self.activation](self._dense(size, math.sqrt(2.0), x.shape[-1])(x))
         return self._dense(self.out, self.gain, x.shape[-1])(x)
 
     def _dense(self, size: int, gain: float, fan_in: int) -> nn.Dense:
@@ -44,30 +48,44 @@ def torch_uniform(fan_in: int) -> Callable[..., jax.Array]:
     return init
 
 
+ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {"tanh": nn.tanh, "relu": nn.relu}
 INITS = {  # name -> (gain, fan in) -> initialisers of weights and of biases
     "orthogonal": lambda gain, fan_in: (nn.initializers.orthogonal(gain), nn.initializers.zeros),
     "torch": lambda gain, fan_in: (torch_uniform(fan_in), torch_uniform(fan_in)),
 }
 
 
+def mlp(cfg: Any, out: int, gain: float = 1.0) -> MLP:
+    return MLP(cfg.hidden, out, cfg.init, cfg.activation, gain)
+
+
+def policy_outputs(action_size: int, cfg: Any) -> int:
+    return 2 * action_size if cfg.std == "state" else action_size
+
+
 def init_params(key: jax.Array, obs_size: int, action_size: int, cfg: Any) -> dict[str, PyTree]:
-    """{'actor': {'mean', 'log_std' [A]}, 'critic_r', 'critic_c'}; the std depends on no state."""
+    """{'actor': {'mean', 'log_std' [A]}, 'critic_r', 'critic_c'}, where with `std` 'state' the second
+    half of what 'mean' gives is added to log_std."""
     keys, obs = jax.random.split(key, 3), jnp.zeros(obs_size)
     actor = {
-        "mean": MLP(cfg.hidden, action_size, cfg.init, gain=0.01).init(keys[0], obs),
+        "mean": mlp(cfg, policy_outputs(action_size, cfg), gain=0.01).init(keys[0], obs),
         "log_std": jnp.full(action_size, cfg.init_log_std, jnp.float32),
     }
-    critic_r, critic_c = (MLP(cfg.hidden, 1, cfg.init).init(key, obs) for key in keys[1:])
+    critic_r, critic_c = (mlp(cfg, 1).init(key, obs) for key in keys[1:])
     return {"actor": actor, "critic_r": critic_r, "critic_c": critic_c}
 
 
 def policy(actor: PyTree, obs: jax.Array, cfg: Any) -> Gaussian:
     """The policy's action distribution for `obs` [..., O]; its mean and log std are [..., A]."""
-    mean: Any = MLP(cfg.hidden, actor["log_std"].shape[-1], cfg.init).apply(actor["mean"], obs)
-    return Gaussian(mean, jnp.broadcast_to(actor["log_std"], mean.shape))
+    size = actor["log_std"].shape[-1]
+    out: Any = mlp(cfg, policy_outputs(size, cfg)).apply(actor["mean"], obs)
+    if cfg.std == "state":
+        mean, change = jnp.split(out, 2, axis=-1)
+        return Gaussian(mean, jnp.clip(actor["log_std"] + change, *LOG_STD))
+    return Gaussian(out, jnp.broadcast_to(actor["log_std"], out.shape))
 
 
 def value(critic: PyTree, obs: jax.Array, cfg: Any) -> jax.Array:
     """A critic's estimate for `obs` [..., O], float [...], in units of reward or of cost."""
-    out: Any = MLP(cfg.hidden, 1, cfg.init).apply(critic, obs)
+    out: Any = mlp(cfg, 1).apply(critic, obs)
     return out[..., 0]

@@ -38,9 +38,11 @@ class OnPolicyConfig:
     horizon: int = 40  # steps of each environment per iteration; shorter ones learn less from a step
     stagger: bool = True  # spread the first episodes' ends over time
     total_iterations: float = float("inf")  # where what decays reaches 0; inf: total_steps' end
-    hidden: tuple[int, ...] = (64, 64)  # tanh units of each network [O]
-    init: Literal["orthogonal", "torch"] = "orthogonal"  # weights; [O] torch
+    hidden: tuple[int, ...] = (64, 64)  # units of each network [O]
+    activation: Literal["tanh", "relu"] = "tanh"  # [O, S]
+    init: Literal["orthogonal", "torch"] = "orthogonal"  # weights; [O] torch, its kaiming_uniform
     init_log_std: float = -0.5  # of the actions' standard deviation [S]
+    std: Literal["free", "state"] = "free"  # a parameter of its own [O, S], or a function of the state
     obs_normalize: bool = True  # by running mean and variance [O]
     reward_normalize: bool = False  # likewise, for the learner alone [O]
     cost_normalize: bool = False  # likewise [O]; limits and metrics are of costs as they are

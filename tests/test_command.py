@@ -359,13 +359,15 @@ def test_each_seed_starts_from_the_same_seed_where_there_is_one(finished, tmp_pa
     [
         ((), {"hidden": [4]}, ("is [8], expected [4]; algo.hidden is [8, 8] there, [4] here",)),
         ((), {"obs_normalize": False}, ("expected absent", "algo.obs_normalize is True there")),
+        ((), {"activation": "relu"}, ("algo.activation is tanh there, relu here",)),
+        ((), {"std": "state"}, ("is [2], expected [4]; algo.std is free there, state here",)),
         (
             ("env={name: point_goal1, num_steps: 40}",), {},
             ("[60]", "[28]", "env.name is point_goal0 there, point_goal1 here"),
         ),
     ],
 )  # fmt: skip
-def test_a_policy_of_other_shapes_is_refused_by_what_differs(finished, args, algo, expected):
+def test_a_policy_of_another_kind_is_refused_by_what_differs(finished, args, algo, expected):
     with pytest.raises(ConfigError) as error:
         warm(f"init_from={finished[0]}", *args, **algo)
     assert all(part in str(error.value) for part in ("does not fit", *expected)), error.value

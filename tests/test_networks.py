@@ -1,9 +1,11 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from jaxsafe.algos.ppo import PPOConfig
-from jaxsafe.networks import init_params, policy, value
+from jaxsafe.gaussian import log_prob
+from jaxsafe.networks import LOG_STD, init_params, policy, value
 
 
 def params(**settings):
@@ -32,3 +34,42 @@ def test_the_critics_differ_and_give_one_value_a_state():
     tree, obs = params(), jnp.ones((4, 2, 5))
     a, b = (value(tree[k], obs, PPOConfig()) for k in ("critic_r", "critic_c"))
     assert a.shape == (4, 2) and (a != b).all()
+
+
+def test_relu_networks_are_piecewise_linear_and_tanh_networks_are_bounded():
+    far = 1e4 * jax.random.normal(jax.random.key(1), (20, 5))
+    relu, tanh = (PPOConfig(activation=name, init="torch", hidden=(8,)) for name in ("relu", "tanh"))
+    tree = params(init="torch", hidden=(8,))  # of either: the activation has no parameters
+    twice, once = value(tree["critic_r"], 2 * far, relu), value(tree["critic_r"], far, relu)
+    np.testing.assert_allclose(twice, 2 * once, rtol=1e-2, atol=1)  # biases are lost in the distance
+    assert jnp.abs(once).max() > 100
+    bound = sum(jnp.abs(x).sum() for x in tree["critic_r"]["params"]["Dense_1"].values())
+    assert (jnp.abs(value(tree["critic_r"], far, tanh)) <= bound).all()
+    means = [policy(tree["actor"], far, cfg).mean for cfg in (relu, tanh)]
+    assert jnp.abs(means[0]).max() > 100 and jnp.abs(means[1]).max() < 10
+
+
+def test_a_std_of_the_state_starts_near_the_free_one_differs_by_state_and_is_clipped():
+    cfg = PPOConfig(std="state")
+    tree, obs = params(std="state"), jax.random.normal(jax.random.key(1), (4, 9, 5))
+    dist = policy(tree["actor"], obs, cfg)
+    assert dist.mean.shape == dist.log_std.shape == (4, 9, 3)
+    np.testing.assert_allclose(dist.log_std, -0.5, atol=0.1)
+    assert (dist.log_std[0, 0] != dist.log_std[0, 1]).all()
+    for offset, bound in zip((-99.0, 99.0), LOG_STD, strict=True):
+        moved = tree["actor"] | {"log_std": tree["actor"]["log_std"] + offset}
+        np.testing.assert_array_equal(policy(moved, obs, cfg).log_std, jnp.full((4, 9, 3), bound))
+
+
+@pytest.mark.parametrize("settings", [{"activation": "relu"}, {"std": "state"}, {"init": "torch"}])
+def test_gradients_reach_every_parameter_and_are_finite(settings):
+    cfg = PPOConfig(**settings)
+    tree, obs = params(**settings), jax.random.normal(jax.random.key(1), (64, 5))
+
+    def total(tree):
+        dist = policy(tree["actor"], obs, cfg)
+        likelihood = log_prob(dist, jnp.ones((64, 3))).sum()
+        return likelihood + sum(value(tree[k], obs, cfg).sum() for k in ("critic_r", "critic_c"))
+
+    for x in jax.tree.leaves(jax.grad(total)(tree)):
+        assert jnp.isfinite(x).all() and (x != 0).any()

@@ -16,6 +16,7 @@ from toys import Clock, Corridor, Lever
 from jaxsafe import evaluation
 from jaxsafe.algos import ALGOS
 from jaxsafe.config import ConfigError
+from jaxsafe.on_policy import learned
 
 NAMES = sorted(ALGOS)
 TINY: dict[str, Any] = {"num_envs": 8, "horizon": 25, "minibatches": 2, "hidden": (8,)}
@@ -62,6 +63,100 @@ def test_update_keeps_the_structure_and_stays_finite(name):
         (a != b).any() for a, b in zip(*map(jax.tree.leaves, (ts.params, after.params)), strict=True)
     ]
     assert all(moved)
+
+
+OPTIONS: dict[str, Any] = {
+    "reward_normalize": True,
+    "cost_normalize": True,
+    "entropy_coef": 0.01,
+    "entropy_decay": True,
+    "total_iterations": 3.0,
+    "activation": "relu",
+    "std": "state",
+}
+PAIRS = ("cpo", "p3o", "pcpo")  # their cost has a unit
+CHOICES = {"cup": "vtrace", "ppo_saute": "gae_rtg", "focops": "plain", "p3o": "vtrace", "cpo": "plain"}
+
+
+def every_option(name):
+    return OPTIONS | {"estimator": CHOICES.get(name, "vtrace"), "cost_normalize": name not in PAIRS}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_update_with_every_option_at_once_keeps_the_structure(name):
+    algo = ALGOS[name].make(Corridor())
+    cfg = ALGOS[name].config(**TINY | every_option(name))
+    before = jax.eval_shape(lambda key: algo.init(key, cfg), jax.random.key(0))
+    after, _ = jax.eval_shape(algo.update, before)
+    assert jax.tree.structure(before) == jax.tree.structure(after)
+    assert all(a.shape == b.shape for a, b in zip(*map(jax.tree.leaves, (before, after)), strict=True))
+
+
+@pytest.mark.parametrize("name", [*CHOICES, "trpo_lag"])
+def test_two_updates_with_every_option_at_once_are_finite(name):
+    ts = start(name, **every_option(name))
+    for _ in range(2):
+        ts, metrics = build(name)[1](ts)
+    assert all(jnp.isfinite(x).all() for x in jax.tree.leaves((ts.params, ts.signals, metrics)))
+    assert metrics["train/nonfinite"] == 0 and ts.signals.count == 2 * 8 * 25
+
+
+@pytest.mark.parametrize("name", PAIRS)
+def test_normalised_costs_are_refused_where_the_violation_is_in_units_of_cost(name):
+    with pytest.raises(ConfigError, match="cost_normalize=True: expected False"):
+        start(name, cost_normalize=True)
+
+
+def test_what_the_learner_sees_is_normalised_by_all_batches_up_to_this_one():
+    reward = jnp.array([[[1.0, 3.0]], [[5.0, 11.0]]])  # two batches of [T, N] = [1, 2]
+    cost = jnp.array([[[0.0, 1.0]], [[1.0, 0.0]]])
+    ts = start("pdo", reward_normalize=True, cost_normalize=True)
+    a, _, signals = learned(ts, reward[0], cost[0], None)
+    np.testing.assert_allclose(a, [[-1, 1]], rtol=1e-6)  # mean 2, standard deviation 1
+    a, b, signals = learned(dataclasses.replace(ts, signals=signals), reward[1], cost[1], None)
+    # 1, 3, 5, 11: mean 5, variance (16 + 4 + 0 + 36) / 4 = 14; 0, 1, 1, 0: mean and deviation 1/2
+    np.testing.assert_allclose(a, [[0, 6 / 14**0.5]], rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(b, [[1, -1]], rtol=1e-6)
+    np.testing.assert_allclose(signals.mean, [5, 0.5])
+    np.testing.assert_allclose(signals.var, [14, 0.25], rtol=1e-6)
+    for reward_too, cost_too in ((True, False), (False, True)):
+        ts = start("pdo", reward_normalize=reward_too, cost_normalize=cost_too)
+        a, b, _ = learned(ts, reward[0], cost[0], None)
+        assert (a == reward[0]).all() == (not reward_too) and (b == cost[0]).all() == (not cost_too)
+
+
+def test_the_constraint_and_the_metrics_see_rewards_and_costs_as_they_are():
+    algo, update = build("pdo", Clock(episode_length=5))
+    sizes = TINY | {"stagger": False, "horizon": 5, "cost_limit": 9.0}
+    runs = [
+        update(algo.init(jax.random.key(0), ALGOS["pdo"].config(**sizes | normalised)))
+        for normalised in ({}, {"reward_normalize": True, "cost_normalize": True})
+    ]
+    for ts, m in runs:
+        assert (m["train/return"], m["train/cost"], m["train/cost_estimate"]) == (5, 10, 10)
+        assert m["train/cost_rate"] == 2 and m["train/return_estimate"] == 5
+        np.testing.assert_allclose(ts.dual.lam, 0.001 + 0.1, rtol=1e-4)  # a violation of 1, Adam's step
+    plain, scaled = (m["train/value_loss_c"] for _, m in runs)
+    assert scaled < plain / 2  # the critic's targets are near 0, not near 2 / (1 - discount)
+
+
+def test_a_batch_that_is_not_finite_leaves_the_statistics_of_rewards_alone():
+    ts, _ = build("pdo")[1](start("pdo", reward_normalize=True))
+    state = dataclasses.replace(ts.rollout.state, physics=ts.rollout.state.physics.at[0].set(jnp.nan))
+    broken = dataclasses.replace(ts, rollout=dataclasses.replace(ts.rollout, state=state))
+    after, metrics = build("pdo")[1](broken)
+    assert metrics["train/nonfinite"] > 0
+    for a, b in zip(jax.tree.leaves(ts.signals), jax.tree.leaves(after.signals), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("name", ["ppo_lag", "cup", "trpo", "cpo"])
+def test_an_entropy_bonus_raises_the_entropy_and_a_malus_lowers_it(name):
+    low, none, high = (
+        float(build(name)[1](start(name, entropy_coef=coef))[1]["train/entropy"])
+        for coef in (-100.0, 0.0, 100.0)
+    )
+    assert low < none - 1e-3 < none + 1e-3 < high  # by steps of 3e-4, or within 0.02 nats
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -171,6 +266,7 @@ import jax, jax.numpy as jnp, numpy as np
 from jax.sharding import AxisType, PartitionSpec as P
 from toys import Corridor
 from jaxsafe.algos import ALGOS
+from jaxsafe.on_policy import learned
 
 mesh = jax.make_mesh((2,), ("devices",), axis_types=(AxisType.Auto,))
 def split(fn):
@@ -181,18 +277,32 @@ def split(fn):
 
 for name, entry in ALGOS.items():
     algo = entry.make(Corridor(), "devices")
-    cfg = entry.config(num_envs=4, horizon=10, minibatches=2, hidden=(4,), critic_epochs=2)
+    sizes = dict(num_envs=4, horizon=10, minibatches=2, hidden=(4,), critic_epochs=2)
+    cfg = entry.config(**sizes, reward_normalize=True)
     keys = jnp.stack([jax.random.key(0)] * 2)
     ts = split(lambda key: algo.init(key, cfg))(keys)
     update = split(algo.update)
     for _ in range(2):
         ts, metrics = update(ts)
-        shared = (ts.params, ts.opt_state, ts.dual, ts.normaliser, ts.episode_length, metrics)
+        statistics = (ts.normaliser, ts.signals, ts.episode_length)
+        shared = (ts.params, ts.opt_state, ts.dual, statistics, metrics)
         for x in jax.tree.leaves(shared):
             np.testing.assert_array_equal(x[0], x[1])  # the devices agree
         obs = np.asarray(ts.rollout.state.obs)
         assert (obs[0] != obs[1]).any()  # on environments of their own
     print(name, "ok")
+
+keys = jax.random.split(jax.random.key(1))  # rewards and costs of 2 x 4 environments, by both at once
+reward, cost = (jax.random.normal(key, (2, 10, 4)) for key in keys)
+halves = split(lambda x: learned(*x, "devices"))((ts, reward, cost))
+one, flat = jax.tree.map(lambda x: x[0], ts), lambda x: jnp.concatenate(list(x), 1)
+whole = learned(one, flat(reward), flat(cost), None)
+np.testing.assert_allclose(flat(halves[0]), whole[0], rtol=1e-4, atol=1e-5)
+for x, y in zip(jax.tree.leaves(halves[2]), jax.tree.leaves(whole[2])):
+    np.testing.assert_allclose(x[0], y, rtol=1e-5)
+    np.testing.assert_array_equal(x[0], x[1])
+assert whole[2].count == one.signals.count + 80
+print("learned ok")
 """
 
 
@@ -201,7 +311,7 @@ def test_two_devices_keep_the_same_parameters():
     here = os.path.dirname(__file__)
     out = subprocess.run([sys.executable, "-c", SHARDED, here], env=env, capture_output=True, text=True)
     assert out.returncode == 0, out.stderr[-3000:]
-    assert out.stdout.split() == [word for name in ALGOS for word in (name, "ok")]
+    assert out.stdout.split() == [word for name in [*ALGOS, "learned"] for word in (name, "ok")]
 
 
 FIRST_ORDER = {"lr": 1e-2, "lr_decay": False, "target_kl": 0.1, "epochs": 8}

@@ -11,7 +11,7 @@ from jaxsafe.gaussian import log_prob, sample
 from jaxsafe.networks import init_params, policy, value
 from jaxsafe.on_policy import Batch
 from jaxsafe.steps import adam, adam_epochs, fit_critic, one_pass
-from jaxsafe.surrogates import clipped, plain
+from jaxsafe.surrogates import clipped, plain, with_entropy
 
 SMALL: dict[str, Any] = {"hidden": (8,), "num_envs": 8, "horizon": 8, "minibatches": 4}
 
@@ -126,3 +126,21 @@ def test_the_clipped_surrogate_by_hand(w, advantage, expected):
     np.testing.assert_allclose(objective, expected, rtol=1e-4)
     assert metrics["train/clip_fraction"] == 1
     np.testing.assert_allclose(plain(batch.old, batch, adv, cfg)[0], w * advantage, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("iteration", "decay", "share"), [(0, True, 1.0), (3, True, 0.7), (12, True, 0.0), (3, False, 1.0)]
+)
+def test_the_entropy_bonus_by_hand(iteration, decay, share):
+    cfg = PPOConfig(**SMALL, entropy_coef=0.2, entropy_decay=decay, total_iterations=10.0)
+    params, batch, _ = problem(cfg)
+
+    def bonus(log_std):
+        dist = policy(params["actor"] | {"log_std": log_std}, batch.obs, cfg)
+        surrogate = with_entropy(plain, jnp.int32(iteration))
+        return surrogate(dist, batch, batch.adv_r, cfg)[0] - plain(dist, batch, batch.adv_r, cfg)[0]
+
+    gain, slope = jax.value_and_grad(bonus)(jnp.array([0.0, -1.0]))
+    # entropies log std + log(2 pi e) / 2, of two dimensions: 1.41894 each at a std of 1
+    np.testing.assert_allclose(gain, 0.2 * share * (2 * 1.4189385 - 1), rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(slope, 0.2 * share * np.ones(2), rtol=1e-3, atol=1e-6)
