@@ -70,6 +70,16 @@ def from_arrays(like: PyTree, arrays: dict[str, np.ndarray]) -> PyTree:
     return jax.tree.unflatten(treedef, restored)
 
 
+def orbax_checkpointer() -> ocp.Checkpointer:
+    """One that waits for no other process."""
+    index = jax.process_index()
+    alone = ocp.options.MultiprocessingOptions(
+        primary_host=index, active_processes={index}, barrier_sync_key_prefix=f"process{index}"
+    )
+    handler = ocp.StandardCheckpointHandler(multiprocessing_options=alone)
+    return ocp.Checkpointer(handler, multiprocessing_options=alone)
+
+
 def save(folder: Path, ts: PyTree, iteration: int, steps: int) -> Path:
     """Write `ts` as the newest checkpoint under `folder` and drop all but the last `KEEP`.
 
@@ -82,7 +92,7 @@ def save(folder: Path, ts: PyTree, iteration: int, steps: int) -> Path:
             shutil.rmtree(leftover)
         part.mkdir(parents=True)
         arrays = to_arrays(ts)
-        with ocp.Checkpointer(ocp.StandardCheckpointHandler()) as orbax:
+        with orbax_checkpointer() as orbax:
             orbax.save(
                 (part / "state").absolute(),
                 args=ocp.args.StandardSave({k: v for k, v in arrays.items() if v.size}),  # type: ignore[call-arg]
@@ -176,7 +186,7 @@ def read_arrays(path: Path, manifest: Manifest) -> dict[str, np.ndarray]:
     like = {
         k: np.zeros(shape, dtype) for k, (dtype, shape) in manifest.leaves.items() if 0 not in shape
     }
-    with ocp.Checkpointer(ocp.StandardCheckpointHandler()) as orbax:
+    with orbax_checkpointer() as orbax:
         restored = orbax.restore((path / "state").absolute(), args=ocp.args.StandardRestore(like))  # type: ignore[call-arg]
     for name, (dtype, shape) in manifest.leaves.items():
         if name in like and (str(restored[name].dtype), restored[name].shape) != (dtype, shape):

@@ -32,9 +32,10 @@ from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from rich.console import Console
 
 import jaxsafe
-from jaxsafe import checkpoint, evaluation, plots, run_folder, runner
+from jaxsafe import checkpoint, distributed, evaluation, plots, run_folder, runner
 from jaxsafe.config import ConfigError, float_fields, from_dict, nearest
 from jaxsafe.on_policy import Algorithm
 from jaxsafe.progress import Report
@@ -94,7 +95,11 @@ class Settings(NamedTuple):
             {
                 "env": {"name": self.env_name, **self.env_options},
                 "algo": {"name": self.algo_name, **algo},
-                **dataclasses.asdict(self.train),
+                **{
+                    k: v
+                    for k, v in dataclasses.asdict(self.train).items()
+                    if k not in distributed.OPTIONS
+                },
             }
         )
 
@@ -129,6 +134,8 @@ def read_arguments(argv: list[str], envs: Any, algos: Any) -> Request:
     overrides = [parse(text) for text in args.overrides]
     given = {o.key_or_group: o for o in overrides}
     base = dataclasses.asdict(runner.TrainConfig())
+    if args.multirun and given.keys() & {*distributed.OPTIONS}:
+        raise ConfigError(f"{', '.join(distributed.OPTIONS)} are for one run, without --multirun")
     for name in ("preset", "resume"):
         if name in given and given[name].is_sweep_override():
             raise ConfigError(f"{name} takes one value, not a sweep")
@@ -374,11 +381,33 @@ def choose_folder(
     return folder
 
 
+def agree_on_folder(
+    settings: Settings, envs: Any, algos: Any, job: int | None, say: Callable[[str], None]
+) -> Path:
+    """`choose_folder` of process 0, for all processes.
+
+    Raises:
+        ConfigError: as there, or this process has other settings than process 0.
+    """
+    if jax.process_count() == 1:
+        return choose_folder(settings, envs, algos, job, say)
+    mine = flat(settings.plain())
+    folder = choose_folder(settings, envs, algos, job, say) if distributed.leads() else ""
+    folder, theirs = json.loads(distributed.first_text(json.dumps([str(folder), mine])))
+    for name, value in mine.items():
+        if theirs.get(name) != value:
+            raise ConfigError(f"{name}={value} in this process, {theirs.get(name)} in process 0")
+    return Path(folder)
+
+
 def compare(settings: Settings, folder: Path, envs: Any, algos: Any) -> None:
     """Raise ConfigError if the run in `folder` has other settings than these."""
     saved = flat(settle(run_folder.read_config(folder), envs, algos).plain())
+    free = {*NOT_COMPARED}
+    if len(settings.configs) * settings.train.num_seeds > 1:
+        free.add("devices")  # each member is whole on one of them
     for name, value in flat(settings.plain()).items():
-        if name not in NOT_COMPARED and saved.get(name) != value:
+        if name not in free and saved.get(name) != value:
             raise ConfigError(
                 f"{name}={value} but {folder} was trained with {saved.get(name)}; "
                 f"for a new run from its policy use init_from={folder}"
@@ -428,25 +457,32 @@ def run(
     """
     train, cfg = settings.train, settings.algo
     adapt = None
-    if train.init_from is not None and run_folder.progress(folder) is None:
+    begun = distributed.first(np.array(run_folder.progress(folder) is not None))
+    if train.init_from is not None and not begun:
         adapt = warm_start(settings, program, envs, algos, report.line)
+    engine = env.engine  # type: ignore[attr-defined]
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        run_folder.write_config(folder, settings.plain())
-        engine = env.engine  # type: ignore[attr-defined]
-        run_folder.append_versions(folder, runner.device_name(), engine)
+        if distributed.leads():
+            folder.mkdir(parents=True, exist_ok=True)
+            run_folder.write_config(folder, settings.plain())
+            run_folder.append_versions(folder, runner.device_name(), engine)
     except OSError as error:
         raise checkpoint.CheckpointError(f"cannot write to {folder}: {error.strerror}") from error
     several = f"{len(settings.configs)} settings x " if len(settings.configs) > 1 else ""
     seeds = f"{train.num_seeds} seed{'s' if train.num_seeds > 1 else ''} x {cfg.num_envs} envs"
     where = runner.device_name() + (f" x {train.devices}" if train.devices > 1 else "")
+    if jax.process_count() > 1:
+        where += f" in {jax.process_count()} processes"
     report.line(
         f"jaxsafe {jaxsafe.__version__} | {settings.env_name} | {settings.algo_name} | "
         f"{several}{seeds} | {where}, engine {engine} | compiling rollout and update ..."
     )
     outcome = runner.train(program, train, folder, report, again, adapt)
+    distributed.leave()
     if outcome.interrupted:
         return 130
+    if not distributed.leads():
+        return 0
     finish(settings, env, envs, algos, folder, report)
     report.line(f"run folder: {folder}")
     return 0
@@ -618,14 +654,21 @@ def train_main(envs: Any, algos: Any) -> int:
         number = HydraConfig.get().job.num if HydraConfig.get().mode == RunMode.MULTIRUN else None
 
         def train() -> int:
-            settings, report = settle(plain, envs, algos), Report()  # type: ignore[arg-type]
-            folder = choose_folder(settings, envs, algos, number, report.line)
-            env, program = prepare(settings, envs, algos)
-            again = f"python scripts/train.py resume={shlex.quote(str(folder))}"
-            return run(settings, env, program, folder, envs, algos, report, again)
+            settings = settle(plain, envs, algos)  # type: ignore[arg-type]
+            options = settings.train
+            places = {name: getattr(options, name) for name in distributed.OPTIONS}
+            at = None if number is not None else distributed.position(**places, devices=options.devices)
+            with distributed.joined(at):
+                report = Report(Console(quiet=True) if at and at.index else None)
+                folder = agree_on_folder(settings, envs, algos, number, report.line)
+                env, program = prepare(settings, envs, algos)
+                again = f"python scripts/train.py resume={shlex.quote(str(folder))}"
+                again += f" in each of the {at.count} processes" if at else ""
+                return run(settings, env, program, folder, envs, algos, report, again)
 
         status = guarded(train)  # here already: Hydra prints the overrides of a job that raises
         if status:
+            distributed.tell(status)
             raise SystemExit(status)
 
     def command() -> int:

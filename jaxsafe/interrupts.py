@@ -1,11 +1,12 @@
 """Ctrl-C and SIGTERM as a request to stop, seen even while JAX compiles."""
 
-import os
 import signal
 import socket
 import threading
 from collections.abc import Callable
 from types import TracebackType
+
+from jaxsafe import distributed
 
 EXIT_STATUS = 130
 
@@ -49,7 +50,7 @@ class Interrupts:
                     continue
                 if self.requested or self.nothing_to_save:
                     self.say(self.nothing_to_save or "stopped without a last checkpoint")
-                    os._exit(EXIT_STATUS)
+                    distributed.end(EXIT_STATUS)
                 self.requested = True
                 self.say(
                     "stopping after this iteration, with a checkpoint; Ctrl-C again leaves at once"

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
-from jaxsafe import checkpoint, run_folder
+from jaxsafe import checkpoint, distributed, run_folder
 from jaxsafe.config import ConfigError
 from jaxsafe.interrupts import Interrupts
 from jaxsafe.progress import Report
@@ -41,6 +41,9 @@ class TrainConfig:
     num_seeds: int = 1  # trained at once: seed, seed + 1, ...
     seed: int = 0
     devices: int = 1  # the seeds are split over them or, for a lone one, its environments
+    coordinator: str | None = None  # host:port of process 0 where several train one run together
+    num_processes: int | None = None  # of them; under SLURM all three are known
+    process_index: int | None = None  # 0 .. num_processes - 1
     preset: str = "fast"  # the algorithm's defaults: fast, published, or one of its published settings
     run_dir: str | None = None  # null: runs/<env>-<algo>/<time>-seed<seed>
     resume: bool | str = False  # true: run_dir, or the newest unfinished run like this one; or a folder
@@ -153,7 +156,7 @@ def build(env: Env, make: Callable, configs: Sequence[Any], settings: TrainConfi
         one = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
         return Program(init, update, (keys, floats), run, one)
     mesh = jax.make_mesh(
-        (devices,), (AXIS,), devices=jax.local_devices()[:devices], axis_types=(AxisType.Auto,)
+        (devices,), (AXIS,), devices=jax.devices()[:devices], axis_types=(AxisType.Auto,)
     )
     spec = PartitionSpec(AXIS)
 
@@ -175,9 +178,14 @@ def over_rows(fn: Callable[[PyTree], PyTree], rows: int) -> Callable[[PyTree], P
 
 
 def check_devices(settings: TrainConfig) -> None:
-    if settings.devices > jax.local_device_count():
+    if jax.process_count() > 1 and settings.devices != jax.device_count():
         raise ConfigError(
-            f"devices={settings.devices}: JAX sees {jax.local_device_count()} ({jax.default_backend()})"
+            f"devices={settings.devices}: expected {jax.device_count()}, which the "
+            f"{jax.process_count()} processes have together ({jax.default_backend()})"
+        )
+    if settings.devices > jax.device_count():
+        raise ConfigError(
+            f"devices={settings.devices}: JAX sees {jax.device_count()} ({jax.default_backend()})"
             + ("; set JAX_NUM_CPU_DEVICES to split the CPU" if jax.default_backend() == "cpu" else "")
         )
 
@@ -277,7 +285,7 @@ def train(
     per_update = cfg.num_envs * cfg.horizon  # steps of one seed
     iterations = -(-settings.total_steps // per_update)
     store = folder / "checkpoints"
-    resuming = bool(checkpoint.checkpoints(store))
+    resuming = bool(distributed.first(np.array(bool(checkpoint.checkpoints(store)))))
     with report, Interrupts(report.line) as stop:
         stop.nothing_to_save = (
             f"stopped before the first update; {resume_command if resuming else 'nothing to save'}"
@@ -286,12 +294,12 @@ def train(
         iteration = 0
         if resuming:
             like = jax.eval_shape(program.init, program.start)
-            ts, manifest = checkpoint.restore(store, like, report.line)
-            ts, iteration = jax.device_put(ts, program.sharding), manifest.iteration
-            report.line(f"resuming at {manifest.steps:,} steps")
+            ts, iteration = restored(store, like, report)
+            ts = distributed.place(ts, program.sharding)
+            report.line(f"resuming at {iteration * per_update:,} steps")
         else:
-            ts = jax.jit(program.init)(jax.device_put(program.start, program.sharding))
-            ts = jax.device_put(adapt(ts), program.sharding) if adapt else ts
+            ts = jax.jit(program.init)(distributed.place(program.start, program.sharding))
+            ts = distributed.place(adapt(ts), program.sharding) if adapt else ts
         if iteration >= iterations:
             report.line("nothing left to train")
             return Outcome(ts, iteration, iteration * per_update, False)
@@ -300,31 +308,54 @@ def train(
         report.line(f"compiled in {time.perf_counter() - start:.1f} s")
         stop.nothing_to_save = ""
 
-        with Log(folder, names, program.members, iteration, per_update) as log:
+        vote = distributed.Vote(program.sharding)
+        with (
+            Log(folder, names, program.members, iteration, per_update)
+            if distributed.leads()
+            else contextlib.nullcontext()
+        ) as log:
             limits = [m.algo.cost_limit for m in program.members]
             report.start(iterations * per_update, iteration * per_update, limits)
             pending, saved_at = None, time.perf_counter()
             while iteration < iterations:
                 ts, metrics = update(ts)
-                if pending:
+                metrics = distributed.whole(metrics)
+                if log and pending:
                     log.append(*pending, report)
                 iteration, pending = iteration + 1, (iteration + 1, metrics)
                 by_count = (
                     settings.checkpoint_iterations and iteration % settings.checkpoint_iterations == 0
                 )
-                by_time = time.perf_counter() - saved_at >= settings.checkpoint_every
-                if stop.requested or by_count or by_time or iteration == iterations:
-                    log.append(*pending, report)
-                    log.sync()
-                    checkpoint.save(store, ts, iteration, iteration * per_update)
+                late = time.perf_counter() - saved_at >= settings.checkpoint_every
+                stopping, by_time = vote(stop.requested, late)
+                if stopping or by_count or by_time or iteration == iterations:
+                    state = distributed.whole(ts)
+                    if log:
+                        log.append(*pending, report)
+                        log.sync()
+                        checkpoint.save(store, state, iteration, iteration * per_update)
                     pending, saved_at = None, time.perf_counter()
-                if stop.requested:
+                if stopping:
                     break
         report.stop()
         interrupted = iteration < iterations
         if interrupted:
             report.line(f"stopped at {iteration * per_update:,} steps; continue with: {resume_command}")
     return Outcome(ts, iteration, iteration * per_update, interrupted)
+
+
+def restored(store: Path, like: PyTree, report: Report) -> tuple[PyTree, int]:
+    """The train state of the newest sound checkpoint that process 0 finds, and its iteration."""
+    if jax.process_count() == 1:
+        ts, manifest = checkpoint.restore(store, like, report.line)
+        return ts, manifest.iteration
+    arrays = {name: np.zeros(x.shape, x.dtype) for name, x in checkpoint.as_data(like).items()}
+    iteration = 0
+    if distributed.leads():
+        ts, manifest = checkpoint.restore(store, like, report.line)
+        arrays, iteration = checkpoint.to_arrays(ts), manifest.iteration
+    arrays, known = distributed.first((arrays, np.array(iteration)))
+    return checkpoint.from_arrays(like, arrays), int(known)
 
 
 class Log:

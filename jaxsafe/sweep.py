@@ -28,7 +28,7 @@ import numpy as np
 import yaml
 from hydra.core.override_parser.types import Override, ValueType
 
-from jaxsafe import checkpoint, command, on_policy, plots, run_folder, runner
+from jaxsafe import checkpoint, command, distributed, on_policy, plots, run_folder, runner
 from jaxsafe.command import Settings, compose, flat, guarded, one_line, parse, settle
 from jaxsafe.config import ConfigError, float_fields
 from jaxsafe.evaluation import Estimate
@@ -70,6 +70,8 @@ def read(texts: list[str], envs: Any, algos: Any) -> Sweep:
             own[key] = str(override.value())
         elif key == "resume":
             raise ConfigError(f"{text}: a sweep goes on when the same command is given again")
+        elif key in distributed.OPTIONS:
+            raise ConfigError(f"{text}: a sweep is one process")
         else:
             given.append(override)
     several = {o.key_or_group: choices(o) for o in given if o.is_sweep_override()}
