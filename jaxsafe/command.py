@@ -668,7 +668,7 @@ def train_main(envs: Any, algos: Any) -> int:
 
         status = guarded(train)  # here already: Hydra prints the overrides of a job that raises
         if status:
-            distributed.tell(status)
+            distributed.give_up(status)
             raise SystemExit(status)
 
     def command() -> int:

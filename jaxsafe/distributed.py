@@ -25,6 +25,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import NamedSharding, PartitionSpec, Sharding
 
+from jaxsafe import checkpoint
 from jaxsafe.config import ConfigError
 from jaxsafe.types import PyTree
 
@@ -105,7 +106,7 @@ def joined(at: Position | None) -> Iterator[None]:
     """
     if at:
         port = meet(at)
-        atexit.register(lambda: end(1) if _lifelines else None)  # a bug's traceback is printed by then
+        atexit.register(give_up, 1)  # of an error that nobody expected, its traceback printed by then
         threading.Thread(target=watch, daemon=True).start()
         jax.distributed.initialize(
             f"{at.host if ':' not in at.host else f'[{at.host}]'}:{port}",
@@ -227,6 +228,12 @@ def end(status: int) -> NoReturn:
     os._exit(status)
 
 
+def give_up(status: int) -> None:
+    """`end`, unless this process is alone. For an error, once it is reported."""
+    if _lifelines:
+        end(status)
+
+
 def tell(status: int) -> None:
     for line in _lifelines.values():
         with contextlib.suppress(OSError):
@@ -268,7 +275,7 @@ def place(tree: PyTree, sharding: Sharding) -> PyTree:
     def put(x: Any) -> jax.Array:
         if isinstance(x, jax.Array) and not x.is_fully_addressable:
             return x  # there already
-        if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
+        if checkpoint.is_key(x):
             return jax.jit(jax.random.wrap_key_data)(put(jax.random.key_data(x)))
         x = np.asarray(x)
         return jax.make_array_from_callback(x.shape, sharding, x.__getitem__)

@@ -19,7 +19,8 @@ from jaxsafe.distributed import Position
 
 ARGS = (
     "env=hall", "algo=pg", "num_envs=4", "algo.horizon=16", "algo.minibatches=1",
-    "algo.critic_epochs=1", "algo.hidden=[8]", "eval_episodes=0", "video=false", "devices=2",
+    "algo.critic_epochs=1", "algo.hidden=[8]", "algo.total_iterations=1000", "eval_episodes=0",
+    "video=false", "devices=2",
 )  # fmt: skip
 STEPS = 64  # of an update
 SCRIPT = Path(__file__).with_name("toy_train.py")
@@ -31,7 +32,12 @@ def free_port() -> int:
 
 
 def start(cwd: Path, *args: str, devices: int = 1) -> subprocess.Popen:
-    environ = {**os.environ, "JAX_PLATFORMS": "cpu", "JAX_NUM_CPU_DEVICES": str(devices)}
+    environ = {
+        **os.environ,
+        "JAX_PLATFORMS": "cpu",
+        "JAX_NUM_CPU_DEVICES": str(devices),
+        "XLA_FLAGS": "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true",
+    }
     return subprocess.Popen(
         [sys.executable, str(SCRIPT), *ARGS, *args],
         cwd=cwd, env=environ, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
@@ -103,7 +109,7 @@ def test_a_pair_and_a_lone_process_continue_it_alike_and_as_if_uninterrupted(sto
     assert lead[::2] == (0, "") and "resuming at" in lead[1] and other == (0, "", "")
     assert (tmp_path / "pair" / "curves.png").exists()
     for args in (("run_dir=lone", "resume=true"), ("run_dir=whole",)):
-        ((status, out, err),) = ends(start(tmp_path, end, *args, devices=2))
+        ((status, _, err),) = ends(start(tmp_path, end, *args, devices=2))
         assert status == 0, err
         assert_same_run(tmp_path / "pair", tmp_path / args[0].removeprefix("run_dir="))
 
@@ -116,8 +122,13 @@ def test_the_death_of_one_ends_the_other_with_a_line(tmp_path, victim):
     killed_at = time.monotonic()
     status, _, err = ends(*pair)[1 - victim]
     assert time.monotonic() - killed_at < 20
-    assert status == 1
-    assert err == f"error: process {victim} has ended, and so this one; the last checkpoint stays\n"
+    line = f"error: process {victim} has ended, and so this one; the last checkpoint stays\n"
+    if victim == 1:
+        assert (status, err) == (1, line)
+    else:  # `jax.distributed` notices the end of process 0 too, and may be the first to end this one
+        assert (status == 1 and line in err) or (
+            status == -signal.SIGABRT and "another task died" in err
+        )
 
 
 def test_what_one_cannot_do_ends_both_with_one_line(tmp_path):
