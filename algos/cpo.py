@@ -19,6 +19,9 @@ batch's noise and lowers the surrogate, but not the cost. Without a margin the c
 the limit, as in Ray, Achiam and Amodei (2019); the margin, from their code (where it is off), asks
 for more until the limit holds.
 
+Of several constraints (`cost_limits`) each has its own b, c and margin, and the step satisfies all of
+them, or else goes towards the nearest x that would.
+
 OmniSafe leaves c per episode (`per_step=False`), about a thousand times as large as b'x can be: then
 a step maximises reward while the cost is under the limit and lowers cost while it is over.
 """
@@ -34,6 +37,8 @@ from jax.flatten_util import ravel_pytree
 from jaxsafe.algos import trpo
 from jaxsafe.batch import all_finite, pmean
 from jaxsafe.config import config
+from jaxsafe.constraints import LimitsConfig, limit, named
+from jaxsafe.halfspaces import dot, furthest_point
 from jaxsafe.networks import policy
 from jaxsafe.on_policy import Algorithm, on_policy_pair
 from jaxsafe.steps import Objective, Step, mean_kl
@@ -43,7 +48,7 @@ from jaxsafe.types import Env, Metrics, PyTree
 
 
 @config
-class CPOConfig(trpo.TRPOConfig):
+class CPOConfig(LimitsConfig, trpo.TRPOConfig):
     line_search_tries: int = 20  # OmniSafe
     per_step: bool = True  # the violation c in cost per step, as b is; OmniSafe: per episode
     margin_lr: float = 0.05  # safety-starter-agents, who leave it off; 0: no margin
@@ -106,8 +111,30 @@ def dual(
     return jnp.where(recover, 0.0, lam), jnp.where(recover, per_b, nu), case
 
 
+def duals(
+    q: jax.Array, r: jax.Array, s: jax.Array, c: jax.Array, delta: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """`dual` of several constraints: r, c and nu are float [K], s_ij = b_i'H^-1 b_j is [K, K]."""
+    q, own = jnp.maximum(q, 1e-20), jnp.maximum(jnp.diag(s), 1e-20)
+    gram, rho = cosines(s), r / (jnp.sqrt(q) * jnp.sqrt(own))
+    kappa = c / (jnp.sqrt(2 * delta) * jnp.sqrt(own))
+    alpha, beta, found = furthest_point(gram, rho, kappa)
+    lam = jnp.where(found, jnp.sqrt(q) / (jnp.sqrt(2 * delta) * jnp.where(found, alpha, 1.0)), 0.0)
+    nu = jnp.where(found, lam, 1.0) * beta * jnp.sqrt(2 * delta) / jnp.sqrt(own)
+    return lam, nu, jnp.where(found, 1 + (kappa < 0).all() + (kappa <= -1).all(), RECOVER)
+
+
+def cosines(s: jax.Array) -> jax.Array:
+    """Between the vectors with these inner products [K, K]; of a zero vector 0 with all but itself."""
+    size = jnp.sqrt(jnp.maximum(jnp.diag(s), 1e-20))
+    return jnp.fill_diagonal(s / size / size[:, None], 1.0, inplace=False)
+
+
 class Problem(NamedTuple):
-    """The linearised problem, in the letters above; h_g = H^-1 g and h_b = H^-1 b are float [P]."""
+    """The linearised problem, in the letters above; h_g = H^-1 g and h_b = H^-1 b are float [P].
+
+    Of several constraints h_b is [K, P], r and c are [K], and s is [K, K].
+    """
 
     h_g: jax.Array
     h_b: jax.Array
@@ -136,20 +163,24 @@ class Direction(NamedTuple):
 
 def solution(p: Problem) -> Direction:
     """The solution of the linearised problem."""
-    lam, nu, case = dual(p.q, p.r, p.s, p.c, p.delta)
-    recover = case == RECOVER
-    step = jnp.where(recover, -nu * p.h_b, (p.h_g - nu * p.h_b) / jnp.where(recover, 1.0, lam))
+    lam, nu, case = (duals if p.c.ndim else dual)(p.q, p.r, p.s, p.c, p.delta)
+    recover, back = case == RECOVER, dot(nu, p.h_b)
+    step = jnp.where(recover, -back, (p.h_g - back) / jnp.where(recover, 1.0, lam))
     metrics = {"train/lam": lam, "train/nu": nu, "train/case": case}
     return Direction(step, case > RETURN, metrics)
 
 
 class Margin(NamedTuple):
-    margin: jax.Array  # float [], in the violation's unit, >= 0
+    margin: jax.Array  # float [] or [K], in the violation's unit, >= 0
 
 
 def step_by(rule: Rule) -> Step:
     """A trust-region step where `rule` says, shortened until it keeps what it promised."""
-    return Step(lambda actor, cfg: Margin(jnp.zeros(())), partial(update, rule))
+
+    def init(actor: PyTree, cfg: Any) -> Margin:
+        return Margin(jnp.zeros(jnp.shape(limit(cfg, named(cfg)))))
+
+    return Step(init, partial(update, rule))
 
 
 def update(
@@ -177,19 +208,22 @@ def update(
         return reward, cost, mean_kl(batch.old, policy(actor, batch.obs, cfg), axis_name)
 
     g = pmean(jax.grad(lambda params: objective_r(unravel(params), batch)[0])(start), axis_name)
-    b = pmean(jax.grad(lambda params: objective_c(unravel(params), batch)[0])(start), axis_name)
+    gradient = jax.jacrev if excess.ndim else jax.grad  # [K, P], or [P]
+    b = pmean(gradient(lambda params: objective_c(unravel(params), batch)[0])(start), axis_name)
     product = fisher_product(
         lambda params: policy(unravel(params), batch.obs, cfg), start, batch.old, cfg.damping, axis_name
     )
     solve = jax.vmap(lambda v: conjugate_gradient(product, v, cfg.cg_iterations))
-    (h_g, h_b), residual = solve(jnp.stack([g, b]))
-    step, earns, metrics = rule(Problem(h_g, h_b, g @ h_g, g @ h_b, b @ h_b, c, delta))
+    h, residual = solve(jnp.concatenate([g[None], b.reshape(-1, g.size)]))
+    h_g, h_b = h[0], h[1:].reshape(b.shape)
+    step, earns, metrics = rule(Problem(h_g, h_b, dot(g, h_g), dot(h_b, g), dot(b, h_b.T), c, delta))
     reward, cost, _ = evaluate(start)
 
     def accept(params: jax.Array) -> jax.Array:
         new_reward, new_cost, divergence = evaluate(params)
         good = (new_reward >= reward) | (~earns & jnp.isfinite(new_reward))
-        return good & (new_cost - cost <= jnp.maximum(-c, 0.0)) & (divergence <= delta)
+        safe = jnp.all(new_cost - cost <= jnp.maximum(-c, 0.0))
+        return good & safe & (divergence <= delta)
 
     params, accepted, tries = line_search(
         accept, start, step, cfg.line_search_tries, cfg.line_search_shrink
@@ -207,7 +241,7 @@ def update(
             "train/accepted": accepted,
             "train/line_search": tries,
             "train/cg_residual_r": residual[0],
-            "train/cg_residual_c": residual[1],
+            "train/cg_residual_c": residual[1:].reshape(excess.shape),
             "train/nonfinite": ~all_finite((g, b, step)),
             **metrics,
         },
@@ -218,4 +252,4 @@ cpo_step = step_by(solution)
 
 
 def make(env: Env, axis_name: str | None = None) -> Algorithm:
-    return on_policy_pair(env, plain, cpo_step, axis_name)
+    return on_policy_pair(env, plain, cpo_step, axis_name, named=named)

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 
 from jaxsafe.algos import ppo
 from jaxsafe.config import config
+from jaxsafe.constraints import each, named
 from jaxsafe.gaussian import kl
 from jaxsafe.networks import policy
 from jaxsafe.on_policy import Algorithm, Batch, TrainState, loop
@@ -46,8 +47,8 @@ def projection(
     """What the second step maximises, with `batch.old` the policy of the first."""
     dist = policy(actor, batch.obs, cfg)
     scale = (1 - cfg.cost_discount * cfg.cost_gae_lambda) / (1 - cfg.cost_discount)
-    cost, _ = plain(dist, batch, batch.adv_c, cfg)
-    return -(lam * scale * cost + jnp.mean(kl(dist, batch.old))), {}
+    cost, _ = each(lambda adv_c: plain(dist, batch, adv_c, cfg), named(cfg))(batch.adv_c)
+    return -(jnp.sum(lam * scale * cost) + jnp.mean(kl(dist, batch.old))), {}
 
 
 def make(env: Env, axis_name: str | None = None) -> Algorithm:
@@ -76,4 +77,4 @@ def make(env: Env, axis_name: str | None = None) -> Algorithm:
         metrics["train/nonfinite"] += metrics.pop("train/nonfinite_projection")
         return actor, opt_state, dual, metrics | lagrangian.metrics(dual)
 
-    return loop(env, adam_epochs.init, lagrangian.init, improve, axis_name)
+    return loop(env, adam_epochs.init, lagrangian.init, improve, axis_name, named=named)

@@ -2,7 +2,8 @@
 
     x = sqrt(2 delta / q) H^-1 g - max(0, (sqrt(2 delta / q) r + c) / s) H^-1 b
 
-g, b, H, q, r, s, c as in CPO; the projection is in the metric of H, the KL's.
+g, b, H, q, r, s, c as in CPO; the projection is in the metric of H, the KL's. Of several constraints it
+is onto what satisfies them all.
 
 Source: Yang et al. (2020), "Projection-based Constrained Policy Optimization", arXiv:2010.03152,
 equation 9.
@@ -12,10 +13,13 @@ delta (the paper has none; OmniSafe has CPO's, and x without H^-1 in the first t
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 
 from jaxsafe.algos import cpo
 from jaxsafe.config import config
+from jaxsafe.constraints import named
+from jaxsafe.halfspaces import dot, nearest_point
 from jaxsafe.on_policy import Algorithm, on_policy_pair
 from jaxsafe.surrogates import plain
 from jaxsafe.types import Env
@@ -32,9 +36,20 @@ PUBLISHED: dict[str, dict[str, Any]] = cpo.PUBLISHED
 def projection(p: cpo.Problem) -> cpo.Direction:
     """The reward's step, moved back along H^-1 b to where b'x + c = 0, if it lies beyond."""
     scale = jnp.sqrt(2 * p.delta / jnp.maximum(p.q, 1e-20))
-    back = jnp.maximum(0.0, (scale * p.r + p.c) / jnp.maximum(p.s, 1e-20))
-    return cpo.Direction(scale * p.h_g - back * p.h_b, jnp.bool_(False), {"train/nu": back})
+    back = (backs if p.c.ndim else back_to)(scale * p.r + p.c, p.s)
+    return cpo.Direction(scale * p.h_g - dot(back, p.h_b), jnp.bool_(False), {"train/nu": back})
+
+
+def back_to(excess: jax.Array, s: jax.Array) -> jax.Array:
+    return jnp.maximum(0.0, excess / jnp.maximum(s, 1e-20))
+
+
+def backs(excess: jax.Array, s: jax.Array) -> jax.Array:
+    """`back_to` of several constraints: excess [K], s [K, K]."""
+    size = jnp.sqrt(jnp.maximum(jnp.diag(s), 1e-20))
+    unit = jnp.maximum(jnp.abs(excess / size).max(), 1e-20)
+    return nearest_point(cpo.cosines(s), excess / size / unit) * unit / size
 
 
 def make(env: Env, axis_name: str | None = None) -> Algorithm:
-    return on_policy_pair(env, plain, cpo.step_by(projection), axis_name)
+    return on_policy_pair(env, plain, cpo.step_by(projection), axis_name, named=named)

@@ -16,7 +16,9 @@ def psum(tree: PyTree, axis_name: str | None) -> PyTree:
     return tree if axis_name is None else jax.lax.psum(tree, axis_name)
 
 
-def batch_mean(x: jax.Array, axis_name: str | None, axis: int | None = None) -> jax.Array:
+def batch_mean(
+    x: jax.Array, axis_name: str | None, axis: int | tuple[int, ...] | None = None
+) -> jax.Array:
     """The mean of `x` over `axis` (default: all of them) and over devices, which hold equal shares."""
     return pmean(jnp.mean(x, axis), axis_name)
 

@@ -37,6 +37,7 @@ from rich.console import Console
 import jaxsafe
 from jaxsafe import checkpoint, distributed, evaluation, plots, run_folder, runner
 from jaxsafe.config import ConfigError, float_fields, from_dict, nearest
+from jaxsafe.constraints import check_names, own_limits
 from jaxsafe.on_policy import Algorithm
 from jaxsafe.progress import Report
 from jaxsafe.types import Env, PyTree
@@ -54,6 +55,7 @@ BAD_DISK = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EROFS, errno.EACCES, 
 # Bounds of the hyperparameters that have one wherever they occur.
 BOUNDS = {
     "cost_limit": (0.0, math.inf),
+    "cost_limits": (0.0, math.inf),
     "horizon": (1, math.inf),
     "num_envs": (1, math.inf),
     "minibatches": (1, math.inf),
@@ -215,6 +217,11 @@ def check_key(
         for name in chosen[head]:
             options = [o for o in groups[head][name] if o != "name"]
             if option not in options:
+                if option == "cost_limits" and (takers := [n for n, o in groups[head].items() if option in o]):
+                    raise ConfigError(
+                        f"{text}: {name} takes one limit, algo.cost_limit; "
+                        f"several are for {', '.join(takers)}"
+                    )
                 hint = f"; choose with {head}=" if option == "name" else nearest(option, options)
                 raise ConfigError(f"unknown option {head}.{option} of {name}{hint}")
 
@@ -304,12 +311,13 @@ def settle(config: dict[str, Any], envs: Any, algos: Any) -> Settings:
             raise ConfigError(f"unknown option env.{name}{nearest(name, defaults)}")
     kind = algos.ALGOS[algo_name].config
     configs = tuple(from_dict(kind, setting, "algo.") for setting in settings_in(algo, kind))
-    for name, value in (pair for cfg in configs for pair in dataclasses.asdict(cfg).items()):
-        low, high = BOUNDS.get(name, (-math.inf, math.inf))
+    for name, value in (pair for cfg in configs for pair in flat(dataclasses.asdict(cfg)).items()):
+        field = name.partition(".")[0]
+        low, high = BOUNDS.get(field, (-math.inf, math.inf))
         if isinstance(value, int | float) and not low <= value <= high:  # NaN is in no interval
             expected = f"at least {low:g}" if high == math.inf else f"between {low:g} and {high:g}"
             raise ConfigError(
-                f"algo.{name}={value}: expected {expected if name in BOUNDS else 'a number'}"
+                f"algo.{name}={value}: expected {expected if field in BOUNDS else 'a number'}"
             )
     return Settings(env_name, to_plain({**defaults, **env}), algo_name, configs, train)
 
@@ -336,7 +344,9 @@ def settings_in(algo: dict[str, Any], kind: type) -> list[dict[str, Any]]:
 def make_env(settings: Settings, envs: Any) -> Env:
     defaults = to_plain(envs.env_defaults(settings.env_name))
     changed = {k: v for k, v in settings.env_options.items() if v != defaults[k]}
-    return envs.make(settings.env_name, **changed)
+    env = envs.make(settings.env_name, **changed)
+    check_names(own_limits(settings.algo), env)
+    return env
 
 
 def choose_folder(

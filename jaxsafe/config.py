@@ -19,21 +19,25 @@ class ConfigError(ValueError):
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
 def config(cls: type[T]) -> type[T]:
-    """Make `cls` a frozen dataclass and a pytree: float fields are leaves, all others static.
+    """Make `cls` a frozen dataclass and a pytree: floats, alone or by name, are leaves, others static.
 
     A sweep over `cost_limit` or `lr` is then a `vmap`; a new value of an int, bool or str
     field is a new program.
     """
     cls = dataclasses.dataclass(frozen=True, kw_only=True)(cls)
-    leaves = float_fields(cls)
+    leaves = fields_of(cls, float, dict[str, float] | None)
     static = [f.name for f in dataclasses.fields(cls) if f.name not in leaves]  # type: ignore[arg-type]
     jax.tree_util.register_dataclass(cls, data_fields=leaves, meta_fields=static)
     return cls
 
 
-def float_fields(cls: type) -> list[str]:
+def fields_of(cls: type, *kinds: Any) -> list[str]:
     hints = typing.get_type_hints(cls)
-    return [f.name for f in dataclasses.fields(cls) if hints[f.name] is float]  # type: ignore[arg-type]
+    return [f.name for f in dataclasses.fields(cls) if hints[f.name] in kinds]  # type: ignore[arg-type]
+
+
+def float_fields(cls: type) -> list[str]:
+    return fields_of(cls, float)
 
 
 def nearest(name: str, names: typing.Iterable[str]) -> str:
@@ -89,6 +93,8 @@ def convert(value: Any, kind: Any, name: str) -> Any:
             return tuple(
                 convert(v, a, f"{name}[{i}]") for i, (v, a) in enumerate(zip(value, args, strict=True))
             )
+    elif origin is dict and isinstance(value, dict) and value:
+        return {str(k): convert(v, args[1], f"{name}.{k}") for k, v in value.items()}
     elif origin is typing.Literal:
         for option in args:  # the listed one: 2, where 2.0 came
             if value == option:
@@ -111,6 +117,8 @@ def describe(kind: Any) -> str:
         return " or ".join("null" if a is type(None) else describe(a) for a in args)
     if origin is tuple and args[-1] is Ellipsis:
         return f"a list of {describe(args[0])}"
+    if origin is dict:
+        return f"names with {describe(args[1])} each, as in {{name: 5}}"
     if origin is tuple:
         return f"{len(args)} values ({', '.join(map(describe, args))})"
     return {int: "a whole number", float: "a number", str: "a string", bool: "true or false"}.get(

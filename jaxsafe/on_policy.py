@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from jaxsafe.augment import Augmentation, nothing
 from jaxsafe.batch import all_finite, batch_mean, centre, masked_mean, psum, select, standardise
 from jaxsafe.config import ConfigError, config
+from jaxsafe.constraints import Names, check_names, each, limit, signal, spread, unnamed
 from jaxsafe.gaussian import Gaussian, entropy, log_prob, sample
 from jaxsafe.networks import init_params, policy, value
 from jaxsafe.normalise import init_normaliser, merge, normalise
@@ -77,11 +78,11 @@ class TrainState:
     """All that an update needs. Environment steps so far: iteration * num_envs * horizon.
 
     config: the algorithm's, with its floats as arrays.
-    params: {'actor', 'critic_r', 'critic_c'}.
-    opt_state: {'actor': the step's own, 'critics': Adam's for both, stacked}.
+    params: {'actor', 'critic_r', 'critic_c'}; of several constraints critic_c is stacked, [K, ...].
+    opt_state: {'actor': the step's own, 'critics': Adam's for all critics, stacked}.
     dual: the treatment's state.
     normaliser: Normaliser, or () without `obs_normalize`.
-    signals: Normaliser of [reward, cost], or () without `reward_normalize` and `cost_normalize`.
+    signals: Normaliser of [reward, costs ...], or () without `reward_normalize` and `cost_normalize`.
     rollout: this device's environments.
     episode_length: float [], running mean length of an episode, in steps.
     """
@@ -104,7 +105,8 @@ class Batch:
 
     obs [B, O]; action [B, A]; log_prob [B] and old (Gaussian [B, A]) of the policy that acted;
     adv_r standardised, adv_c only centred, in cost units or, with `cost_normalize`, in standard
-    deviations of a step's; ret_r, ret_c: the critics' targets [B].
+    deviations of a step's; ret_r, ret_c: the critics' targets [B]. Of several constraints adv_c and
+    ret_c are [B, K].
     """
 
     obs: jax.Array
@@ -151,7 +153,7 @@ def on_policy(
         )
         return actor, opt_state, dual, metrics | treatment.metrics(dual)
 
-    return loop(env, step.init, treatment.init, improve, axis_name, augmentation)
+    return loop(env, step.init, treatment.init, improve, axis_name, augmentation, treatment.named)
 
 
 def on_policy_pair(
@@ -160,13 +162,14 @@ def on_policy_pair(
     step: Step,
     axis_name: str | None = None,
     surrogate_c: Surrogate | None = None,
+    named: Callable[[Any], Names] = unnamed,
 ) -> Algorithm:
     """Algorithms whose step weighs reward against cost itself, so that it takes two objectives:
     `surrogate` of the reward's advantage, and `surrogate_c` (or the same) of the cost's.
 
     update(actor, opt_state, objective_r, objective_c, excess, length, batch, key, cfg, axis_name),
     where excess = J_c - cost_limit, in cost per episode, and length is the mean episode's in steps:
-    objective_c is in cost per step, the unit of excess / length.
+    objective_c is in cost per step, the unit of excess / length. Both are [K] if `named(cfg)` are several.
     """
 
     def improve(ts: TrainState, batch: Batch, cost: jax.Array, length: jax.Array, key: jax.Array):
@@ -178,14 +181,18 @@ def on_policy_pair(
 
         def objective_c(actor: PyTree, batch: Batch) -> tuple[jax.Array, Metrics]:
             dist = policy(actor, batch.obs, cfg)
-            return (surrogate_c or surrogate)(dist, batch, batch.adv_c, cfg)
+
+            def of_one(adv_c: jax.Array) -> tuple[jax.Array, Metrics]:
+                return (surrogate_c or surrogate)(dist, batch, adv_c, cfg)
+
+            return each(of_one, named(cfg))(batch.adv_c)
 
         actor, opt_state, metrics = step.update(
             ts.params["actor"],
             ts.opt_state["actor"],
             objective_r,
             objective_c,
-            cost - cfg.cost_limit,
+            cost - limit(cfg, named(cfg)),
             length,
             batch,
             key,
@@ -202,7 +209,7 @@ def on_policy_pair(
             )
         return ()
 
-    return loop(env, step.init, init_dual, improve, axis_name)
+    return loop(env, step.init, init_dual, improve, axis_name, named=named)
 
 
 def loop(
@@ -212,9 +219,10 @@ def loop(
     improve: Callable[..., tuple[PyTree, PyTree, PyTree, Metrics]],
     axis_name: str | None,
     augmentation: Augmentation = nothing,
+    named: Callable[[Any], Names] = unnamed,
 ) -> Algorithm:
     """The loop around `improve(ts, batch, episode_cost, episode_length, key)`, which returns
-    (actor, opt_state, dual, metrics)."""
+    (actor, opt_state, dual, metrics). episode_cost is of `cost` or, [K], of the costs `named(cfg)`."""
 
     def init(key: jax.Array, cfg: Any) -> TrainState:
         check(cfg)
@@ -222,7 +230,13 @@ def loop(
         params_key, rollout_key, key = jax.random.split(key, 3)
         dual = init_dual(cfg)
         wrapped = augmentation.wrap(env, cfg, dual)
-        params = init_params(params_key, wrapped.obs_size, wrapped.action_size, cfg)
+        sizes = wrapped.obs_size, wrapped.action_size
+        params = init_params(params_key, *sizes, cfg)
+        if names := named(cfg):
+            check_names(names, env)
+            keys = jax.random.split(params_key, len(names))
+            critics = jax.vmap(lambda key: init_params(key, *sizes, cfg)["critic_c"])(keys)
+            params |= {"critic_c": critics}
         return TrainState(
             config=cfg,
             params=params,
@@ -232,7 +246,7 @@ def loop(
             },
             dual=dual,
             normaliser=init_normaliser(env.obs_size) if cfg.obs_normalize else (),
-            signals=init_normaliser(2) if cfg.reward_normalize or cfg.cost_normalize else (),
+            signals=init_signals(cfg, len(named(cfg)) or 1),
             rollout=init_rollout(wrapped, own(rollout_key, axis_name), cfg.num_envs, cfg.stagger),
             episode_length=jnp.float32(env.episode_length),
             key=key,
@@ -260,15 +274,18 @@ def loop(
             cfg.horizon,
             lambda episode: augmentation.stop(episode, cfg),
         )
-        reward, cost, signals = learned(ts, augmentation.reward(traj, cfg), traj.cost, axis_name)
-        batch, explained = estimate(ts, traj, reward, cost, axis_name)
+        names = named(cfg)
+        charged = signal(env, traj, names)
+        reward, cost, signals = learned(ts, augmentation.reward(traj, cfg), charged, axis_name)
+        batch, explained = estimate(ts, traj, reward, cost, names, axis_name)
         length = mean_length(ts.episode_length, traj.ended, traj.length, axis_name)
         cost_rate = batch_mean(traj.cost, axis_name)
+        episode_cost = batch_mean(charged, axis_name, (0, 1)) * length
 
-        actor, opt_actor, dual, metrics = improve(ts, batch, cost_rate * length, length, step_key)
+        actor, opt_actor, dual, metrics = improve(ts, batch, episode_cost, length, step_key)
         fit = partial(fit_critic, obs=batch.obs, key=critic_key, cfg=cfg, axis_name=axis_name)
         critics, opt_critics, errors, skipped = jax.vmap(lambda c, o, y: fit(c, o, target=y))(
-            stack_critics(ts.params), ts.opt_state["critics"], jnp.stack([batch.ret_r, batch.ret_c])
+            stack_critics(ts.params), ts.opt_state["critics"], stack(batch.ret_r, batch.ret_c.T)
         )
         seen = traj.obs[..., : env.obs_size]
         normaliser = merge(ts.normaliser, seen, axis_name) if cfg.obs_normalize else ()
@@ -279,15 +296,17 @@ def loop(
             (dual, normaliser, signals, length),
             (ts.dual, ts.normaliser, ts.signals, ts.episode_length),
         )
-        critic_r, critic_c = (jax.tree.map(operator.itemgetter(i), critics) for i in range(2))
-        metrics |= episode_metrics(env, traj, axis_name) | explained
+        critic_r = jax.tree.map(operator.itemgetter(0), critics)
+        critic_c = jax.tree.map(lambda x, c: x[1:].reshape(c.shape), critics, ts.params["critic_c"])
+        loss_c = errors[1:] if names else errors[1]
+        metrics |= explained | {"train/cost_estimate": episode_cost, "train/value_loss_c": loss_c}
+        metrics = spread(metrics, names) | episode_metrics(env, traj, axis_name)
         metrics |= {
             "train/cost_rate": cost_rate,  # per environment step
-            "train/cost_estimate": cost_rate * length,  # J_c, what the constraint saw
+            "train/cost_estimate": cost_rate * length,  # J_c, what a constraint on `cost` sees
             "train/return_estimate": batch_mean(traj.reward, axis_name) * length,  # likewise
             "train/entropy": batch_mean(entropy(policy(actor, batch.obs, cfg)), axis_name),
             "train/value_loss_r": errors[0],
-            "train/value_loss_c": errors[1],
             "train/nonfinite": metrics["train/nonfinite"] + skipped.sum() + ~finite,
         }
         ts = dataclasses.replace(
@@ -312,8 +331,13 @@ def loop(
 
 
 def stack_critics(params: dict[str, PyTree]) -> PyTree:
-    """Both critics in one tree, [2, ...], so that they train in one program."""
-    return jax.tree.map(lambda *x: jnp.stack(x), params["critic_r"], params["critic_c"])
+    """All critics in one tree, [2, ...] or [1 + K, ...], so that they train in one program."""
+    return jax.tree.map(stack, params["critic_r"], params["critic_c"])
+
+
+def stack(of_reward: jax.Array, of_cost: jax.Array) -> jax.Array:
+    """[1 + K, ...] of [...] and [K, ...]; or [2, ...] of two alike."""
+    return jnp.concatenate([of_reward[None], of_cost.reshape(-1, *of_reward.shape)])
 
 
 def own(key: jax.Array, axis_name: str | None) -> jax.Array:
@@ -329,10 +353,15 @@ def see(ts: TrainState, obs: jax.Array) -> jax.Array:
     return jnp.concatenate([normalise(ts.normaliser, obs[..., :size]), obs[..., size:]], -1)
 
 
+def init_signals(cfg: Any, costs: int) -> PyTree:
+    return init_normaliser(1 + costs) if cfg.reward_normalize or cfg.cost_normalize else ()
+
+
 def learned(
     ts: TrainState, reward: jax.Array, cost: jax.Array, axis_name: str | None
 ) -> tuple[jax.Array, jax.Array, PyTree]:
-    """Reward and cost [T, N] as the learner sees them, and `ts.signals` with them added.
+    """Reward [T, N] and cost, [T, N] or [T, N, K], as the learner sees them, and `ts.signals` with
+    them added.
 
     Unlike observations, on which the policy has acted already, a batch is normalised by statistics
     that include it, as in OmniSafe, so that the critics' first targets have the scale of all others.
@@ -340,12 +369,12 @@ def learned(
     cfg = ts.config
     if not (cfg.reward_normalize or cfg.cost_normalize):
         return reward, cost, ()
-    both = jnp.stack([reward, cost], -1)
-    signals = merge(ts.signals, both, axis_name)
-    scaled = normalise(signals, both)
+    all_of_them = jnp.concatenate([reward[..., None], cost.reshape(*reward.shape, -1)], -1)
+    signals = merge(ts.signals, all_of_them, axis_name)
+    scaled = normalise(signals, all_of_them)
     return (
         scaled[..., 0] if cfg.reward_normalize else reward,
-        scaled[..., 1] if cfg.cost_normalize else cost,
+        scaled[..., 1:].reshape(cost.shape) if cfg.cost_normalize else cost,
         signals,
     )
 
@@ -365,9 +394,15 @@ def check(cfg: Any) -> None:
 
 
 def estimate(
-    ts: TrainState, traj: Trajectory, reward: jax.Array, cost: jax.Array, axis_name: str | None
+    ts: TrainState,
+    traj: Trajectory,
+    reward: jax.Array,
+    cost: jax.Array,
+    names: Names,
+    axis_name: str | None,
 ) -> tuple[Batch, Metrics]:
-    """Advantages and targets of `reward` and `cost` [T, N], under the parameters that acted."""
+    """Advantages and targets of `reward` [T, N] and of `cost` [T, N] or, for several `names`,
+    [T, N, K], under the parameters that acted."""
     cfg = ts.config
     obs, next_obs = see(ts, traj.obs), see(ts, traj.next_obs)
     old = policy(ts.params["actor"], obs, cfg)
@@ -383,20 +418,23 @@ def estimate(
         return adv, error, error + v
 
     adv_r, error_r, ret_r = both(ts.params["critic_r"], reward, cfg.discount, cfg.gae_lambda)
-    adv_c, error_c, ret_c = both(ts.params["critic_c"], cost, cfg.cost_discount, cfg.cost_gae_lambda)
+    of_cost = jax.vmap(both, (0, -1, None, None), -1) if names else both
+    adv_c, error_c, ret_c = of_cost(ts.params["critic_c"], cost, cfg.cost_discount, cfg.cost_gae_lambda)
     batch = Batch(
         obs=obs,
         action=traj.action,
         log_prob=traj.log_prob,
         old=old,
         adv_r=standardise(adv_r, axis_name),
-        adv_c=centre(adv_c, axis_name),
+        adv_c=each(lambda x: centre(x, axis_name), names)(adv_c),
         ret_r=ret_r,
         ret_c=ret_c,
     )
     metrics = {
         "train/explained_variance_r": explained_variance(error_r, ret_r, axis_name),
-        "train/explained_variance_c": explained_variance(error_c, ret_c, axis_name),
+        "train/explained_variance_c": each(
+            lambda *x: explained_variance(*x, axis_name), names
+        )(error_c, ret_c),
     }
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch), metrics
 

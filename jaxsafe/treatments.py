@@ -8,19 +8,21 @@ import jax.numpy as jnp
 import optax
 
 from jaxsafe.config import config
+from jaxsafe.constraints import LimitsConfig, Names, limit, named, unnamed
 from jaxsafe.types import Metrics, PyTree
 
 
 class Treatment(NamedTuple):
     """init(cfg) -> dual; update(dual, episode_cost, cfg) -> dual, once an iteration, before the
     policy's step; advantage(dual, adv_r, adv_c) -> float [B], what the policy maximises;
-    metrics(dual).
+    metrics(dual); named(cfg) -> the costs it holds under limits of their own, () for `cost` alone.
     """
 
     init: Callable[[Any], PyTree]
     update: Callable[[PyTree, jax.Array, Any], PyTree]
     advantage: Callable[[PyTree, jax.Array, jax.Array], jax.Array]
     metrics: Callable[[PyTree], Metrics]
+    named: Callable[[Any], Names] = unnamed
 
 
 none = Treatment(
@@ -32,41 +34,52 @@ none = Treatment(
 
 
 @config
-class LagrangianConfig:
+class LagrangianConfig(LimitsConfig):
     lam_init: float = 0.001  # OmniSafe
     lam_max: float = float("inf")  # OmniSafe
     dual_lr: float = 0.1  # Adam's step, whatever the size of the violation; OmniSafe 0.035
 
 
 class Multiplier(NamedTuple):
-    lam: jax.Array  # float [], standard deviations of A_r per unit of cost, >= 0
+    lam: jax.Array  # float [] or [K], standard deviations of A_r per unit of cost, >= 0
     opt_state: PyTree
 
 
+def first_price(cfg: Any) -> jax.Array:
+    return jnp.full(jnp.shape(limit(cfg, named(cfg))), cfg.lam_init, jnp.float32)
+
+
 def init_multiplier(cfg: Any) -> Multiplier:
-    lam = jnp.asarray(cfg.lam_init, jnp.float32)
+    lam = first_price(cfg)
     return Multiplier(lam, optax.adam(cfg.dual_lr).init(lam))
 
 
 def adam_ascent(dual: Multiplier, episode_cost: jax.Array, cfg: Any) -> Multiplier:
     """One Adam step on the loss -lam (J_c - cost_limit), then lam in [0, lam_max]."""
-    grad = -(episode_cost - cfg.cost_limit)
+    grad = -(episode_cost - limit(cfg, named(cfg)))
     change, opt_state = optax.adam(cfg.dual_lr).update(grad, dual.opt_state)
     lam: Any = optax.apply_updates(dual.lam, change)
     return Multiplier(jnp.clip(lam, 0.0, cfg.lam_max), opt_state)
 
 
-# A = (A_r - lam A_c) / (1 + lam): Ray, Achiam and Amodei (2019), and the scale from their code
+def mixed(dual: Any, adv_r: jax.Array, adv_c: jax.Array) -> jax.Array:
+    """A = (A_r - sum_i lam_i A_ci) / (1 + sum_i lam_i), over the constraints, with A_c [B] or [B, K]."""
+    price = jnp.dot(adv_c, dual.lam, precision=jax.lax.Precision.HIGHEST)  # of one, their product
+    return (adv_r - price) / (1.0 + dual.lam.sum())
+
+
+# Ray, Achiam and Amodei (2019), and the scale from their code
 lagrangian = Treatment(
     init=init_multiplier,
     update=adam_ascent,
-    advantage=lambda dual, adv_r, adv_c: (adv_r - dual.lam * adv_c) / (1.0 + dual.lam),
+    advantage=mixed,
     metrics=lambda dual: {"train/lam": dual.lam},
+    named=named,
 )
 
 
 @config
-class PIDConfig:
+class PIDConfig(LimitsConfig):
     lam_init: float = 0.001  # OmniSafe
     pid_kp: float = 0.1  # of the smoothed error; OmniSafe
     pid_ki: float = 0.01  # of the error, each iteration; OmniSafe
@@ -76,7 +89,10 @@ class PIDConfig:
 
 
 class PID(NamedTuple):
-    """What the controller remembers: lam and integral are prices, the others costs per episode."""
+    """What the controller remembers: lam and integral are prices, the others costs per episode.
+
+    Of several constraints all have a last axis K.
+    """
 
     lam: jax.Array  # float [], standard deviations of A_r per unit of cost, >= 0
     integral: jax.Array  # float [], K_i times the sum of errors, >= 0
@@ -86,19 +102,21 @@ class PID(NamedTuple):
 
 
 def init_pid(cfg: Any) -> PID:
-    zero, lam = jnp.zeros(()), jnp.asarray(cfg.lam_init, jnp.float32)
-    return PID(lam, lam, zero, zero, jnp.zeros(cfg.pid_delay))
+    lam = first_price(cfg)
+    zero = jnp.zeros_like(lam)
+    return PID(lam, lam, zero, zero, jnp.zeros((cfg.pid_delay, *lam.shape)))
 
 
 def control(dual: PID, episode_cost: jax.Array, cfg: Any) -> PID:
     """lam = (K_p P + I + K_d D)+, from the error's smoothed value, its sum, and the cost's rise."""
-    error = episode_cost - cfg.cost_limit
+    error = episode_cost - limit(cfg, named(cfg))
     integral = jnp.maximum(0.0, dual.integral + cfg.pid_ki * error)
     smooth = cfg.pid_smoothing * dual.error + (1 - cfg.pid_smoothing) * error
     cost = cfg.pid_smoothing * dual.cost + (1 - cfg.pid_smoothing) * episode_cost
     rise = jnp.maximum(0.0, cost - dual.past[0])
     lam = jnp.maximum(0.0, cfg.pid_kp * smooth + integral + cfg.pid_kd * rise)
-    return PID(lam, integral, smooth, cost, jnp.append(dual.past[1:], cost))
+    past = jnp.concatenate([dual.past[1:], cost[None]])
+    return PID(lam, integral, smooth, cost, past)
 
 
 # Stooke, Achiam and Abbeel (2020), "Responsive Safety in Reinforcement Learning by PID Lagrangian
@@ -108,6 +126,7 @@ pid = Treatment(
     update=control,
     advantage=lagrangian.advantage,
     metrics=lambda dual: {"train/lam": dual.lam, "train/integral": dual.integral},
+    named=named,
 )
 
 
