@@ -217,7 +217,9 @@ def check_key(
         for name in chosen[head]:
             options = [o for o in groups[head][name] if o != "name"]
             if option not in options:
-                if option == "cost_limits" and (takers := [n for n, o in groups[head].items() if option in o]):
+                if option == "cost_limits" and (
+                    takers := [n for n, o in groups[head].items() if option in o]
+                ):
                     raise ConfigError(
                         f"{text}: {name} takes one limit, algo.cost_limit; "
                         f"several are for {', '.join(takers)}"
@@ -556,11 +558,20 @@ def evaluate(
     """`num` fresh episodes of each seed in each setting."""
     episodes = evaluation.run_episodes(algo, ts, num, seed)
     tables = list(run_folder.by_setting(run_folder.read_metrics(folder)).values())
+    cost_names = algo.task(jax.tree.map(lambda x: x[0], ts)).cost_names
     seeds, scores = settings.train.num_seeds, []
     for i, member in enumerate(runner.members(settings.configs, settings.train)[::seeds]):
         own = evaluation.Episodes(*(x[i * seeds : (i + 1) * seeds] for x in episodes))
         limit, metrics = float(member.algo.cost_limit), tables[i] if i < len(tables) else {}
         rows = evaluation.summary(settings.env_name, own, limit, metrics)
+        over = []
+        for name, most in own_limits(member.algo).items():
+            costs = own.costs[..., cost_names.index(name)]
+            over.append(costs > most)
+            rows[f"cost {name}"] = evaluation.estimate(costs)
+            rows[f"{name} over {most:g}"] = evaluation.estimate(over[-1])
+        if over:
+            rows["violation rate"] = evaluation.estimate(np.any(over, axis=0))
         scores.append(Scores(member.setting, limit, own.ret.size, rows))
     return scores
 
@@ -573,19 +584,21 @@ def finish(settings: Settings, env: Env, envs: Any, algos: Any, folder: Path, re
 
     def curves() -> None:
         limit = float(settings.algo.cost_limit)
-        plots.curves(run_folder.read_metrics(folder), folder / "curves.png", title, limit)
+        metrics, own = run_folder.read_metrics(folder), own_limits(settings.algo)
+        plots.curves(metrics, folder / "curves.png", title, limit, own)
 
     def scores() -> None:
         found = evaluate(settings, *policy(), train.eval_episodes, train.seed, folder)
         tables = {s.name: evaluation.as_json(s.rows) for s in found}
         text = json.dumps({"episodes": train.eval_episodes, **tables.get("", tables)}, indent=1)
         run_folder.replace_text(folder / "evaluation.json", text)
+        limits = ", ".join(f"{k} {v:g}" for k, v in own_limits(settings.algo).items())
         for name, limit, episodes, rows in found:
             ret, cost, rate = rows["return"], rows["cost"], rows["violation rate"]
             report.line(
                 f"final policy{name and ', ' + name}: return {ret.mean:.4g} [{ret.low:.4g}, "
                 f"{ret.high:.4g}], cost {cost.mean:.4g} [{cost.low:.4g}, {cost.high:.4g}] "
-                f"(limit {limit:g}), {100 * rate.mean:.0f}% of {episodes} episodes over it"
+                f"(limit {limits or f'{limit:g}'}), {100 * rate.mean:.0f}% of {episodes} episodes over it"
             )
 
     def video() -> None:
@@ -758,7 +771,7 @@ def evaluate_main(envs: Any, algos: Any) -> int:
             f"{settings.env_name} | {settings.algo_name} | "
             f"{settings.train.num_seeds} x {args.episodes} episodes, deterministic policy"
             + f" | cost limit {settings.algo.cost_limit:g}"
-            * alone,
+            * (alone and not own_limits(settings.algo)),
             flush=True,
         )
         for s in evaluate(settings, algo, ts, args.episodes, args.seed, args.run):

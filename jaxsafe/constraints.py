@@ -1,4 +1,4 @@
-"""What is constrained: `cost` under cost_limit or, with cost_limits, some named costs, each under its own.
+"""What is constrained: `cost` under cost_limit or, with cost_limits, named costs, each under its own.
 
 What belongs to the constraint (a limit, a multiplier, J_c) is then float [K] instead of float [], and
 what belongs to it at each step (A_c, the critic's targets) has a last axis K, in the order of `named`.

@@ -2,9 +2,9 @@
 
     e_i.y + kappa_i <= 0,  |e_i| = 1
 
-Vectors stay where they are: all that is asked for are cosines, gram_ij = e_i.e_j [K, K] and, with a unit
-vector e_g to go along, rho_i = e_g.e_i [K]. There are 2^K sets, each with one K x K system. The one that
-breaks the optimality conditions least is taken, so rounding cannot leave none.
+Vectors stay where they are: all that is asked for are cosines, gram_ij = e_i.e_j [K, K] and, with a
+unit vector e_g to go along, rho_i = e_g.e_i [K]. There are 2^K sets, each with one K x K system. The
+one that breaks the optimality conditions least is taken, so rounding cannot leave none.
 """
 
 import itertools

@@ -169,7 +169,7 @@ def on_policy_pair(
 
     update(actor, opt_state, objective_r, objective_c, excess, length, batch, key, cfg, axis_name),
     where excess = J_c - cost_limit, in cost per episode, and length is the mean episode's in steps:
-    objective_c is in cost per step, the unit of excess / length. Both are [K] if `named(cfg)` are several.
+    objective_c is in cost per step, the unit of excess / length. For K costs `named(cfg)` both are [K].
     """
 
     def improve(ts: TrainState, batch: Batch, cost: jax.Array, length: jax.Array, key: jax.Array):
@@ -432,9 +432,9 @@ def estimate(
     )
     metrics = {
         "train/explained_variance_r": explained_variance(error_r, ret_r, axis_name),
-        "train/explained_variance_c": each(
-            lambda *x: explained_variance(*x, axis_name), names
-        )(error_c, ret_c),
+        "train/explained_variance_c": each(lambda *x: explained_variance(*x, axis_name), names)(
+            error_c, ret_c
+        ),
     }
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch), metrics
 

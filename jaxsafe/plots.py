@@ -1,7 +1,8 @@
 """Pictures: learning curves, and what a sweep's settings earn against what they cost."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -38,19 +39,30 @@ def interval(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return values.mean(0), low, high
 
 
-def curves(metrics: dict[str, np.ndarray], path: Path, title: str, cost_limit: float) -> None:
+def curves(
+    metrics: dict[str, np.ndarray],
+    path: Path,
+    title: str,
+    cost_limit: float,
+    own_limits: Mapping[str, float] = MappingProxyType({}),
+) -> None:
     """Write the PNG: a thin line a seed, and for several seeds their mean and 95 % interval.
 
-    Settings trained side by side have a colour each, and their own limits where those differ.
+    Settings trained side by side have a colour each, and their own limits where those differ. Named
+    costs with limits of their own have panels instead of a limit on the sum.
     """
-    figure = Figure(figsize=(10, 4), layout="constrained")
+    named = {f"train/cost_{name}": limit for name, limit in own_limits.items()}
+    panels = (*PANELS, *((name, f"{name.removeprefix('train/cost_')} of an episode") for name in named))
+    figure = Figure(figsize=(5 * len(panels), 4), layout="constrained")
     FigureCanvasAgg(figure)
     settings = run_folder.by_setting(metrics)
-    for axes, (name, label) in zip(figure.subplots(1, 2), PANELS, strict=True):
+    for axes, (name, label) in zip(figure.subplots(1, len(panels)), panels, strict=True):
         for i, (setting, table) in enumerate(settings.items()):
             if name in table and len(table["steps"]):
                 draw(axes, *by_seed(table, name), f"C{i % 10}", setting)
-        if name == "train/cost":
+        if name in named:
+            axes.axhline(named[name], color="C3", ls="--", lw=1, label=f"limit {named[name]:g}")
+        if name == "train/cost" and not named:
             own = {t[LIMIT][0]: i for i, t in enumerate(settings.values()) if LIMIT in t}
             for limit, i in (own or {cost_limit: 3}).items():
                 axes.axhline(limit, color=f"C{i % 10}", ls="--", lw=1, label=f"limit {limit:g}")

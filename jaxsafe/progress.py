@@ -58,7 +58,8 @@ class Report:
         self.total = total_steps
         self.last = {"ret": math.nan, "cost": math.nan, "lam": math.nan}  # finite values seen last
         self.printed = -math.inf
-        self.limits = "-".join(map(short, sorted({min(cost_limits), max(cost_limits)})))
+        ends = sorted({min(cost_limits), max(cost_limits)}) if cost_limits else []
+        self.limits = "/" * bool(ends) + "-".join(map(short, ends))
         self.begun, self.begun_at = time.perf_counter(), steps
         if self.console.is_terminal:
             columns: list[ProgressColumn] = [
@@ -84,7 +85,7 @@ class Report:
         text = (
             f"{count(steps)}/{count(self.total)} steps  {count(rate * num_members)} steps/s  "
             f"return {short(self.last['ret'])}  "
-            f"cost {short(self.last['cost'])}/{self.limits}  "
+            f"cost {short(self.last['cost'])}{self.limits}  "
             f"lam {short(self.last['lam'])}  left {clock((self.total - steps) / max(rate, 1e-9))}"
         )
         if self.live:

@@ -21,6 +21,7 @@ from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
 from jaxsafe import checkpoint, distributed, run_folder
 from jaxsafe.config import ConfigError
+from jaxsafe.constraints import own_limits
 from jaxsafe.interrupts import Interrupts
 from jaxsafe.progress import Report
 from jaxsafe.types import Env, PyTree
@@ -314,7 +315,7 @@ def train(
             if distributed.leads()
             else contextlib.nullcontext()
         ) as log:
-            limits = [m.algo.cost_limit for m in program.members]
+            limits = [m.algo.cost_limit for m in program.members if not own_limits(m.algo)]
             report.start(iterations * per_update, iteration * per_update, limits)
             pending, saved_at = None, time.perf_counter()
             while iteration < iterations:

@@ -31,6 +31,7 @@ from hydra.core.override_parser.types import Override, ValueType
 from jaxsafe import checkpoint, command, distributed, on_policy, plots, run_folder, runner
 from jaxsafe.command import Settings, compose, flat, guarded, one_line, parse, settle
 from jaxsafe.config import ConfigError, float_fields
+from jaxsafe.constraints import own_limits
 from jaxsafe.evaluation import Estimate
 from jaxsafe.interrupts import Interrupts
 from jaxsafe.progress import Report
@@ -275,7 +276,7 @@ class Row(NamedTuple):
 
     swept: dict[str, Any]
     env: str
-    cost_limit: float
+    cost_limit: float  # NaN where named costs have limits of their own
     steps: int
     returns: np.ndarray  # [S], a mean over complete episodes; NaN where a seed had none
     costs: np.ndarray
@@ -295,7 +296,7 @@ class Row(NamedTuple):
     @property
     def held(self) -> str:
         """Whether the limit is: 'unclear' where the mean is above it and its interval is not."""
-        if np.isnan(self.cost.mean):
+        if np.isnan(self.cost.mean) or np.isnan(self.cost_limit):
             return "-"
         if self.cost.mean <= self.cost_limit:
             return "yes"
@@ -319,7 +320,8 @@ def rows_of(folder: Path, envs: Any, algos: Any) -> list[Row]:
             plain = flat(saved._replace(configs=(cfg,)).plain())
             values = {name.removesuffix(".name"): plain[name] for name in swept}
             late = (run_folder.last_tenth(table, f"train/{name}") for name in ("return", "cost"))
-            row = Row(values, saved.env_name, cfg.cost_limit, int(table["steps"].max()), *late)
+            limit = np.nan if own_limits(cfg) else cfg.cost_limit
+            row = Row(values, saved.env_name, limit, int(table["steps"].max()), *late)
             if (old := rows.get(row.name)) is not None:  # other seeds of this setting
                 row = row._replace(
                     steps=min(old.steps, row.steps),
@@ -349,7 +351,13 @@ def markdown(rows: list[Row]) -> str:
     lines = [[*names, "seeds", "steps", "return", "cost", "limit", "limit held"]]
     lines += [["---", *["---:"] * (len(lines[0]) - 2), "---"]]
     for r in rows:
-        figures = [str(len(r.costs)), f"{r.steps:,}", cell(r.ret), cell(r.cost), f"{r.cost_limit:g}"]
+        figures = [
+            str(len(r.costs)),
+            f"{r.steps:,}",
+            cell(r.ret),
+            cell(r.cost),
+            f"{r.cost_limit:g}".replace("nan", "-"),
+        ]
         values = [f"{v:.9g}" if isinstance(v, float) else str(v) for v in r.swept.values()]
         lines.append([*values, *figures, r.held])
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)

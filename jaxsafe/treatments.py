@@ -63,7 +63,7 @@ def adam_ascent(dual: Multiplier, episode_cost: jax.Array, cfg: Any) -> Multipli
 
 
 def mixed(dual: Any, adv_r: jax.Array, adv_c: jax.Array) -> jax.Array:
-    """A = (A_r - sum_i lam_i A_ci) / (1 + sum_i lam_i), over the constraints, with A_c [B] or [B, K]."""
+    """A = (A_r - sum_i lam_i A_ci) / (1 + sum_i lam_i), over the constraints; A_c is [B] or [B, K]."""
     price = jnp.dot(adv_c, dual.lam, precision=jax.lax.Precision.HIGHEST)  # of one, their product
     return (adv_r - price) / (1.0 + dual.lam.sum())
 
