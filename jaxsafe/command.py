@@ -592,13 +592,14 @@ def finish(settings: Settings, env: Env, envs: Any, algos: Any, folder: Path, re
         tables = {s.name: evaluation.as_json(s.rows) for s in found}
         text = json.dumps({"episodes": train.eval_episodes, **tables.get("", tables)}, indent=1)
         run_folder.replace_text(folder / "evaluation.json", text)
-        limits = ", ".join(f"{k} {v:g}" for k, v in own_limits(settings.algo).items())
+        several = ", ".join(f"{k} {v:g}" for k, v in own_limits(settings.algo).items())
         for name, limit, episodes, rows in found:
             ret, cost, rate = rows["return"], rows["cost"], rows["violation rate"]
             report.line(
                 f"final policy{name and ', ' + name}: return {ret.mean:.4g} [{ret.low:.4g}, "
                 f"{ret.high:.4g}], cost {cost.mean:.4g} [{cost.low:.4g}, {cost.high:.4g}] "
-                f"(limit {limits or f'{limit:g}'}), {100 * rate.mean:.0f}% of {episodes} episodes over it"
+                f"(limit {several or f'{limit:g}'}), "
+                f"{100 * rate.mean:.0f}% of {episodes} episodes over it"
             )
 
     def video() -> None:
