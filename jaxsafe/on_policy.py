@@ -432,9 +432,9 @@ def estimate(
     )
     metrics = {
         "train/explained_variance_r": explained_variance(error_r, ret_r, axis_name),
-        "train/explained_variance_c": each(lambda *x: explained_variance(*x, axis_name), names)(
-            error_c, ret_c
-        ),
+        "train/explained_variance_c": each(
+            lambda error, target: explained_variance(error, target, axis_name), names
+        )(error_c, ret_c),
     }
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch), metrics
 
