@@ -224,15 +224,11 @@ class SafetyGym:
             "box": cfg.box_size,
         }
         start = jnp.concatenate([xy[0], headings[:1]])
-        qpos = jnp.asarray(scene.model.qpos0, jnp.float32)
-        if scene.planar:
-            qpos = qpos.at[:3].set(start)
-        else:
-            qpos = qpos.at[:7].set(pose(xy[0], scene.robot_height, headings[0]))
+        root = start if scene.planar else pose(xy[0], scene.robot_height, headings[0])
+        qpos = [root, np.float32(scene.model.qpos0[len(root) : scene.robot_nq])]
         for kind in scenes.FREES:
             rows = self.place.slice(kind)
-            poses = pose(xy[rows], heights[kind], headings[rows])
-            qpos = qpos.at[scene.qpos_slice(kind)].set(poses.reshape(-1))
+            qpos.append(pose(xy[rows], heights[kind], headings[rows]).reshape(-1))
         # The weld keeps a gremlin's height above its mocap body, hence twice its size: it hovers.
         rest = {
             "gremlins": 2 * cfg.gremlins_size,
@@ -250,7 +246,8 @@ class SafetyGym:
         zero, none = jnp.zeros(()), jnp.int32(0)
         return World(
             physics=Physics(
-                qpos=qpos,
+                # no empty part, no constant to overwrite: jax 0.11 crashes on them within shard_map
+                qpos=jnp.concatenate([x for x in qpos if x.size]),
                 qvel=jnp.zeros(scene.model.nv),
                 warmstart=jnp.zeros(scene.model.nv),
                 mocap_pos=mocap[:, :3],
