@@ -162,7 +162,22 @@ def build(env: Env, make: Callable, configs: Sequence[Any], settings: TrainConfi
     spec = PartitionSpec(AXIS)
 
     def split(fn: Callable) -> Callable:
-        return jax.shard_map(fn, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
+        def parted(tree: PyTree) -> PyTree:
+            leaves, treedef = jax.tree.flatten(tree)
+
+            def own_part(full: list[jax.Array]) -> PyTree:
+                given = iter(full)
+                return fn(treedef.unflatten([next(given) if x.size else empty(x) for x in leaves]))
+
+            # arrays without elements stay outside: jax 0.11 crashes on them as inputs
+            full = [x for x in leaves if x.size]
+            fields = {"mesh": mesh, "in_specs": spec, "out_specs": spec, "check_vma": False}
+            return jax.shard_map(own_part, **fields)(full)
+
+        return parted
+
+    def empty(x: jax.Array) -> jax.Array:
+        return jnp.zeros((x.shape[0] // devices, *x.shape[1:]), x.dtype)
 
     return Program(split(init), split(update), (keys, floats), run, NamedSharding(mesh, spec))
 
