@@ -485,9 +485,10 @@ def run(
     where = runner.device_name() + (f" x {train.devices}" if train.devices > 1 else "")
     if jax.process_count() > 1:
         where += f" in {jax.process_count()} processes"
+    kernels = ", and a minute of Warp's kernels the first time" * (engine == "warp")
     report.line(
         f"jaxsafe {jaxsafe.__version__} | {settings.env_name} | {settings.algo_name} | "
-        f"{several}{seeds} | {where}, engine {engine} | compiling rollout and update ..."
+        f"{several}{seeds} | {where}, engine {engine} | compiling rollout and update{kernels} ..."
     )
     outcome = runner.train(program, train, folder, report, again, adapt)
     distributed.leave()
