@@ -66,7 +66,8 @@ def throughput(path: Path) -> None:
         for line in (HERE / file).read_text().splitlines():
             row = json.loads(line)
             if row["algo"] is None:
-                best = found.setdefault(row["env"], {})
+                what = f"{row['peer']}: {row['env']}" if "peer" in row else row["env"]
+                best = found.setdefault(what, {})
                 best[row["num_envs"]] = max(best.get(row["num_envs"], 0), row["env_steps_per_s"])
         device = "H200" if "h200" in file else "2 CPU cores"
         for env, points in sorted(found.items()):
