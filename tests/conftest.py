@@ -1,0 +1,15 @@
+from collections.abc import Iterator
+
+import jax
+import pytest
+
+
+@pytest.fixture(autouse=True, scope="module")
+def forgotten_programs(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Free the compiled programs of a file when it ends; those of environments are shared by several.
+
+    A process that keeps some thousands of them runs out of memory maps, and XLA crashes.
+    """
+    yield
+    if not request.module.__name__.startswith("test_envs"):
+        jax.clear_caches()
