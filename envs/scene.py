@@ -17,7 +17,6 @@ from jaxsafe.envs.config import SafetyGymConfig
 
 ASSETS = Path(__file__).parent / "assets"
 OBJECT = {"condim": 6, "friction": (1.0, 0.005, 0.0001)}
-FIXED = OBJECT | {"contype": 0}  # meets what moves, and not what is fixed as well
 RGBA = {
     "goal": (0, 1, 0, 0.25),
     "hazard": (0, 0, 1, 0.25),
@@ -98,7 +97,8 @@ def build(cfg: SafetyGymConfig, mjx: bool = False, drawn: bool = False) -> Scene
 
     Args:
         mjx: for MJX in JAX, which has no contact sensors, collides a capsule better than a cylinder
-            (pillars become capsules, with caps out of reach), and has room for `MJX_LIMITS` only.
+            (pillars become capsules, with caps out of reach), would let what is fixed meet what is
+            fixed, and has room for `MJX_LIMITS` only.
         drawn: add what only rendering needs (light, cameras, colours, the gremlins' guides).
     Raises:
         ConfigError: an unknown robot, sensor or body.
@@ -117,8 +117,9 @@ def build(cfg: SafetyGymConfig, mjx: bool = False, drawn: bool = False) -> Scene
 
     world = spec.worldbody
     half = max(map(abs, cfg.placements_extents)) + 0.1 if cfg.floor_display_mode else 3.5
+    fixed = OBJECT | ({"contype": 0} if mjx else {})
     floor = world.add_geom(
-        name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(half, half, 0.1), **FIXED
+        name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(half, half, 0.1), **fixed
     )
     if drawn:
         decorate(spec, floor)
@@ -144,11 +145,13 @@ def build(cfg: SafetyGymConfig, mjx: bool = False, drawn: bool = False) -> Scene
     for i in range(cfg.pillars_num):
         size = (cfg.pillars_size, cfg.pillars_height, 0)
         shape = mujoco.mjtGeom.mjGEOM_CAPSULE if mjx else mujoco.mjtGeom.mjGEOM_CYLINDER
-        add_fixed(spec, f"pillar{i}", "pillar", shape, size)
+        add_fixed(spec, f"pillar{i}", "pillar", fixed, shape, size)
     for i in range(cfg.walls_num):
-        add_fixed(spec, f"wall{i}", "wall", mujoco.mjtGeom.mjGEOM_BOX, (cfg.walls_size,) * 3)
+        add_fixed(spec, f"wall{i}", "wall", fixed, mujoco.mjtGeom.mjGEOM_BOX, (cfg.walls_size,) * 3)
     for i in range(cfg.buttons_num):
-        add_fixed(spec, f"button{i}", "button", mujoco.mjtGeom.mjGEOM_SPHERE, (cfg.buttons_size, 0, 0))
+        add_fixed(
+            spec, f"button{i}", "button", fixed, mujoco.mjtGeom.mjGEOM_SPHERE, (cfg.buttons_size, 0, 0)
+        )
 
     kept = needed_sensors(cfg)
     for sensor in list(spec.sensors):
@@ -272,9 +275,11 @@ def add_gremlin_guide(spec: mujoco.MjSpec, i: int, drawn_size: float | None) -> 
     )
 
 
-def add_fixed(spec: mujoco.MjSpec, name: str, kind: str, shape: mujoco.mjtGeom, size: tuple) -> None:
+def add_fixed(
+    spec: mujoco.MjSpec, name: str, kind: str, options: dict, shape: mujoco.mjtGeom, size: tuple
+) -> None:
     body = spec.worldbody.add_body(name=name, mocap=True)
-    body.add_geom(name=name, type=shape, size=size, **FIXED, **look(kind))
+    body.add_geom(name=name, type=shape, size=size, **options, **look(kind))
 
 
 def decorate(spec: mujoco.MjSpec, floor: mujoco.MjsGeom) -> None:

@@ -166,7 +166,8 @@ TESTED_ALONE = {
     "terminate_resample_failure",
     "_seed",
     "contact_room",
-}  # the third and fourth with layouts, the last with engine warp
+    "awake",
+}  # the third and fourth with layouts, the fifth with engine warp, the last with sleepers
 
 
 def facts(env: SafetyGym) -> tuple:
