@@ -45,13 +45,7 @@ def gae(
     """
     chex.assert_equal_shape([reward, value, next_value, terminated, done])
     delta = td_error(reward, value, next_value, terminated, discount)
-
-    def backward(advantage: jax.Array, x: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        delta, done = x
-        advantage = delta + discount * decay * jnp.where(done, 0.0, advantage)
-        return advantage, advantage
-
-    return jax.lax.scan(backward, jnp.zeros_like(value[0]), (delta, done), reverse=True)[1]
+    return backward_sums(delta, done, discount * decay, jnp.ones_like(delta))
 
 
 def td_error(
@@ -62,6 +56,19 @@ def td_error(
     discount: jax.Array | float,
 ) -> jax.Array:
     return reward + discount * jnp.where(terminated, 0.0, next_value) - value
+
+
+def backward_sums(
+    delta: jax.Array, done: jax.Array, factor: jax.Array | float, rho: jax.Array
+) -> jax.Array:
+    """A_t = rho_t (delta_t + factor (1 - done_t) A_{t+1}), float [T, N]."""
+
+    def backward(later: jax.Array, x: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
+        delta, done, rho = x
+        now = rho * (delta + factor * jnp.where(done, 0.0, later))
+        return now, now
+
+    return jax.lax.scan(backward, jnp.zeros_like(delta[0]), (delta, done, rho), reverse=True)[1]
 
 
 def vtrace(
@@ -91,14 +98,7 @@ def vtrace(
     """
     chex.assert_equal_shape([reward, value, next_value, terminated, done, ratio])
     delta = td_error(reward, value, next_value, terminated, discount)
-
-    def backward(advantage: jax.Array, x: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
-        delta, done, rho = x
-        advantage = rho * (delta + discount * jnp.where(done, 0.0, advantage))
-        return advantage, advantage
-
-    rho = jnp.minimum(1.0, ratio)
-    return jax.lax.scan(backward, jnp.zeros_like(value[0]), (delta, done, rho), reverse=True)[1]
+    return backward_sums(delta, done, discount, jnp.minimum(1.0, ratio))
 
 
 def advantages(

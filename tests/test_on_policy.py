@@ -178,8 +178,9 @@ def test_seeds_and_cost_limits_side_by_side_are_the_lone_ones(name):
     together = jax.vmap(init)(keys, limits)
     lone = [init(*pair) for pair in zip(keys, limits, strict=True)]
     vmapped = jax.jit(jax.vmap(algo.update), compiler_options=FAST)
-    # sums are ordered differently, and unfinished conjugate gradients amplify that some hundredfold
-    for tolerance in (1e-6, 3e-4):
+    # sums are ordered differently, and unfinished conjugate gradients amplify that some hundredfold;
+    # z has a scale of its own, so trpo_saute's are the worst conditioned
+    for tolerance in (1e-6, 3e-4 if name == "trpo_saute" else 1e-4):
         together, metrics = vmapped(together)
         for i in range(3):
             lone[i], alone = update(lone[i])
