@@ -1,0 +1,142 @@
+"""Time every kernel of engine `warp`: python scripts/profile_warp.py point_goal2 --num-envs 16384
+
+Needs an NVIDIA GPU. The worlds are those of 60 steps of random actions. Prints the constraint rows and
+solver iterations, the slowest kernels of a physics pass, launched one by one, and the speed of ten
+substeps and a forward pass in one CUDA graph, as it is and with less work or less room.
+"""
+# MuJoCo's bindings come without types:
+# pyright: reportAttributeAccessIssue=false
+
+import argparse
+import collections
+import dataclasses
+import statistics
+import sys
+import time
+from typing import Any
+
+import jax
+import mujoco
+import numpy as np
+
+from jaxsafe import envs
+from jaxsafe.config import ConfigError
+from jaxsafe.envs import scene as scenes
+from jaxsafe.envs import sleeping
+from jaxsafe.envs.physics import contact_budget
+
+VARIANTS = {  # name -> options of the model, factors on the room for contacts and for rows
+    "as it is": ({}, 1.0, 1.0),
+    "10 iterations": ({"iterations": 10}, 1.0, 1.0),
+    "5 iterations": ({"iterations": 5}, 1.0, 1.0),
+    "3 iterations": ({"iterations": 3}, 1.0, 1.0),
+    "10 line searches": ({"ls_iterations": 10}, 1.0, 1.0),
+    "room for rows x 0.6": ({}, 1.0, 0.6),
+    "room for contacts x 0.6": ({}, 0.6, 1.0),
+}
+
+
+def states(env: envs.SafetyGym, small: scenes.Scene, worlds: int) -> dict[str, np.ndarray]:
+    """What `small` simulates of `worlds` after 60 random steps, by field of MuJoCo's data."""
+
+    def step(state, key):
+        action = jax.random.uniform(key, (worlds, env.action_size), minval=-1)
+        return jax.vmap(env.step)(state, action), None
+
+    def awake(p):
+        chosen = {k: sleeping.nearest(p, env.scene, small, k) for k in sleeping.SLEEPERS}
+        at = sleeping.places(env.scene, chosen)
+        velocity, warmstart = p.qvel[at.qvel], p.warmstart[at.qvel]
+        return p.qpos[at.qpos], velocity, warmstart, p.mocap_pos[at.mocap], p.mocap_quat[at.mocap]
+
+    begin = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), worlds))
+    keys = jax.random.split(jax.random.key(1), 60)
+    end = jax.jit(lambda state: jax.lax.scan(step, state, keys)[0])(begin)
+    names = ("qpos", "qvel", "qacc_warmstart", "mocap_pos", "mocap_quat")
+    arrays = jax.device_get(jax.jit(jax.vmap(awake))(end.physics.physics))
+    return {name: x for name, x in zip(names, arrays, strict=True) if x.size}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("env", metavar="ENV")
+    parser.add_argument("--num-envs", type=int, default=16384)
+    parser.add_argument("--top", type=int, default=22, help="kernels to list")
+    args = parser.parse_args()
+    try:
+        env = envs.make(args.env, engine="warp")
+    except ConfigError as error:
+        print(error, file=sys.stderr)
+        return 2
+    if jax.default_backend() == "cpu":
+        print("profile_warp: needs an NVIDIA GPU", file=sys.stderr)
+        return 2
+    import warp as wp
+    from mujoco.mjx.third_party import mujoco_warp
+
+    worlds = args.num_envs
+    small = scenes.build(sleeping.small_config(env.config, sleeping.awake(env.config, "warp")))
+    start = states(env, small, worlds)
+    contacts, rows = contact_budget(small)
+    sensors_off = mujoco.mjtDisableBit.mjDSBL_SENSOR.value
+
+    def build(options: dict, less_contacts: float, less_rows: float):
+        model = mujoco_warp.put_model(small.model)
+        model.opt.warn_overflow = 0
+        for name, value in options.items():
+            setattr(model.opt, name, value)
+        flags = model.opt.disableflags | sensors_off
+        blind = dataclasses.replace(model, opt=dataclasses.replace(model.opt, disableflags=flags))
+        room = {
+            "naconmax": int(contacts * less_contacts) * worlds + 128,
+            "njmax": int(rows * less_rows),
+        }
+        return model, blind, mujoco_warp.make_data(small.model, nworld=worlds, **room)
+
+    def load(data) -> None:
+        for name, x in start.items():
+            wp.copy(getattr(data, name), wp.array(x, dtype=getattr(data, name).dtype))
+
+    with wp.ScopedDevice("cuda:0"):
+        for name, variant in VARIANTS.items():
+            model, blind, data = build(*variant)
+            load(data)
+            mujoco_warp.step(blind, data)  # compiles
+            with wp.ScopedCapture() as capture:
+                for _ in range(10):
+                    mujoco_warp.step(blind, data)
+                mujoco_warp.forward(model, data)
+            graph: Any = capture.graph
+            seconds = []
+            for _ in range(7):
+                load(data)
+                wp.synchronize()
+                begin = time.perf_counter()
+                wp.capture_launch(graph)
+                wp.synchronize()
+                seconds.append(time.perf_counter() - begin)
+            median = statistics.median(seconds[2:])
+            print(f"{name:26}{1e3 * median:8.2f} ms {worlds / median:14,.0f} steps/s", flush=True)
+
+        _, blind, data = build({}, 1.0, 1.0)
+        load(data)
+        for _ in range(3):
+            mujoco_warp.step(blind, data)
+        for name, x in (("rows", data.nefc), ("solver iterations", data.solver_niter)):
+            x = x.numpy()
+            print(f"{name}: mean {x.mean():.1f}, 99.9% {np.quantile(x, 0.999):.0f}, most {x.max()}")
+        steps, spent = 3, collections.defaultdict(list)
+        wp.timing_begin(cuda_filter=wp.TIMING_ALL)
+        for _ in range(steps):
+            mujoco_warp.step(blind, data)
+        for kernel in wp.timing_end():
+            spent[kernel.name].append(kernel.elapsed)
+        total = sum(map(sum, spent.values())) / steps
+        print(f"{sum(map(len, spent.values())) / steps:.0f} kernels a pass, {total:.2f} ms")
+        for name, times in sorted(spent.items(), key=lambda item: -sum(item[1]))[: args.top]:
+            print(f"  {sum(times) / steps:8.3f} ms {len(times) / steps:6.1f}  {name[:80]}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
