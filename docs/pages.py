@@ -11,6 +11,7 @@ import re
 import sys
 from pathlib import Path
 
+from jaxsafe import run_folder
 from jaxsafe.algos import ALGOS, Entry
 
 HERE = Path(__file__).parent
@@ -59,10 +60,10 @@ def measured(name: str) -> str:
         env, algo, *preset = folder.name.split("-")
         if algo != name:
             continue
-        metrics = results.read(folder / "metrics.csv.xz")
+        metrics = run_folder.read_metrics(folder)
         ret, cost = (results.last_tenth(metrics, f"train/{k}") for k in ("return", "cost"))
         how = f"`{env}`, preset {preset[0] if preset else 'fast'}, {len(set(metrics['seed']))} seeds"
-        rows.append(f"| {how} | {ret} | {cost} | {results.PUBLISHED.get(folder.name, 'none')} |")
+        rows.append(f"| {how} | {ret} | {cost} | {results.published(env, algo)} |")
     if not rows:
         return "Not run at length yet; it learns the small exact problem of tests/test_on_policy.py."
     head = "| 1e7 steps a seed, limit 25 | return, last 10% | cost | published |\n|---|---|---|---|\n"

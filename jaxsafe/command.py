@@ -35,7 +35,7 @@ from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 
 import jaxsafe
-from jaxsafe import checkpoint, distributed, evaluation, plots, run_folder, runner
+from jaxsafe import checkpoint, distributed, evaluation, plots, run_folder, runner, stats
 from jaxsafe.config import ConfigError, float_fields, from_dict, nearest
 from jaxsafe.constraints import check_names, own_limits
 from jaxsafe.on_policy import Algorithm
@@ -550,7 +550,7 @@ class Scores(NamedTuple):
     name: str  # '' where there is but one
     cost_limit: float
     episodes: int  # of all its seeds
-    rows: dict[str, evaluation.Estimate]
+    rows: dict[str, stats.Estimate]
 
 
 def evaluate(
@@ -564,12 +564,12 @@ def evaluate(
     for i, member in enumerate(runner.members(settings.configs, settings.train)[::seeds]):
         own = evaluation.Episodes(*(x[i * seeds : (i + 1) * seeds] for x in episodes))
         limit, metrics = float(member.algo.cost_limit), tables[i] if i < len(tables) else {}
-        rows = evaluation.summary(settings.env_name, own, limit, metrics)
+        rows = evaluation.summary(settings.env_name, own, cost_names, limit, metrics)
         over = []
         for name, most in own_limits(member.algo).items():
             costs = own.costs[..., cost_names.index(name)]
             over.append(costs > most)
-            rows[f"cost {name}"] = evaluation.estimate(costs)
+            rows.setdefault(f"cost {name}", evaluation.estimate(costs))
             rows[f"{name} over {most:g}"] = evaluation.estimate(over[-1])
         if over:
             rows["violation rate"] = evaluation.estimate(np.any(over, axis=0))

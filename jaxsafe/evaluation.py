@@ -1,43 +1,49 @@
 """Fresh episodes of a trained policy, and what Safety Gym reports about them."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsafe import scores
+from jaxsafe import scores, stats
 from jaxsafe.on_policy import Algorithm
+from jaxsafe.stats import Estimate
 from jaxsafe.types import Env, PyTree
 
 
 class Episodes(NamedTuple):
-    """Sums over episodes: `ret`, `cost` and `length` are [S, N], `costs` is [S, N, K]."""
+    """Sums over episodes: `costs` is [S, N, K], the others are [S, N]."""
 
     ret: np.ndarray
     cost: np.ndarray
     costs: np.ndarray
     length: np.ndarray
+    discounted_ret: np.ndarray
+    discounted_cost: np.ndarray
 
 
-class Estimate(NamedTuple):
-    """A mean with its 95 % bootstrap interval."""
+def episode(
+    env: Env,
+    act: Callable[[jax.Array, jax.Array], jax.Array],
+    key: jax.Array,
+    discount: jax.Array | float = 1.0,
+    cost_discount: jax.Array | float = 1.0,
+) -> Episodes:
+    """One whole episode, pure: rewards and costs count until termination or the time limit.
 
-    mean: float
-    low: float
-    high: float
-
-
-def episode(env: Env, act: Callable[[jax.Array, jax.Array], jax.Array], key: jax.Array) -> Episodes:
-    """One whole episode, pure: rewards and costs count until termination or the time limit."""
+    The discounted sums, sum_t discount^t r_t and likewise of costs, begin with the first step.
+    """
     reset_key, act_key = jax.random.split(key)
 
     def step(carry, t):
         state, alive = carry
         state = env.step(state, act(state.obs, jax.random.fold_in(act_key, t)))
-        sums = Episodes(alive * state.reward, alive * state.cost, alive * state.costs, alive)
+        reward, cost = alive * state.reward, alive * state.cost
+        later = discount**t * reward, cost_discount**t * cost
+        sums = Episodes(reward, cost, alive * state.costs, alive, *later)
         return (state, alive * (1.0 - state.terminated)), sums
 
     _, sums = jax.lax.scan(step, (env.reset(reset_key), jnp.float32(1)), jnp.arange(env.episode_length))
@@ -53,8 +59,10 @@ def run_episodes(algo: Algorithm, ts: PyTree, num_episodes: int, seed: int) -> E
     keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), 0x6576616C), num_episodes)
 
     def one_seed(ts: PyTree) -> Episodes:
-        task = algo.task(ts)
-        return jax.vmap(lambda key: episode(task, lambda obs, _: algo.act(ts, obs, None), key))(keys)
+        task, discounts = algo.task(ts), (ts.config.discount, ts.config.cost_discount)
+        return jax.vmap(
+            lambda key: episode(task, lambda obs, _: algo.act(ts, obs, None), key, *discounts)
+        )(keys)
 
     return jax.tree.map(np.asarray, jax.jit(jax.vmap(one_seed))(ts))
 
@@ -88,18 +96,28 @@ def cost_rate(metrics: dict[str, np.ndarray]) -> np.ndarray | None:
 
 
 def summary(
-    env_name: str, episodes: Episodes, cost_limit: float, metrics: dict[str, np.ndarray]
+    env_name: str,
+    episodes: Episodes,
+    cost_names: Sequence[str],
+    cost_limit: float,
+    metrics: dict[str, np.ndarray],
 ) -> dict[str, Estimate]:
-    """The rows of the table: return, cost, violation rate, cost rate and normalised scores."""
+    """The rows of the table: return, cost (each of several too), violation rate, discounted return and
+    cost, cost rate and normalised scores."""
     rows = {
         "return": estimate(episodes.ret),
         "cost": estimate(episodes.cost),
         "violation rate": estimate(episodes.cost > cost_limit),
         "episode length": estimate(episodes.length),
+        "discounted return": estimate(episodes.discounted_ret),
+        "discounted cost": estimate(episodes.discounted_cost),
     }
+    if len(cost_names) > 1:
+        for k, name in enumerate(cost_names):
+            rows[f"cost {name}"] = estimate(episodes.costs[..., k])
     rate = cost_rate(metrics)
     if rate is not None:
-        rows["cost rate (training)"] = estimate(rate[:, None])
+        rows["cost rate (training)"] = stats.estimate(rate)
     if env_name in scores.CHARACTERISTIC:
 
         def scaled(score: Callable, of: Estimate, *args: float) -> Estimate:

@@ -1,17 +1,21 @@
-"""Pictures: learning curves, and what a sweep's settings earn against what they cost."""
+"""Pictures: the learning curves of a run; the curves, trade-off, scores and profiles of several."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
 
-from jaxsafe import run_folder
+from jaxsafe import run_folder, stats
 
+FORMATS = ("png", "svg")
+MARKERS = {"-": "o", "--": "s", ":": "^", "-.": "v"}  # by the kind of line that goes with it
 LIMIT = "algo.cost_limit"  # a column of metrics.csv where the settings differ in it
 PANELS = (("train/return", "return of an episode"), ("train/cost", "cost of an episode"))
 
@@ -23,20 +27,9 @@ def by_seed(metrics: dict[str, np.ndarray], name: str) -> tuple[np.ndarray, np.n
     values[np.searchsorted(seeds, metrics["seed"]), np.searchsorted(steps, metrics["steps"])] = metrics[
         name
     ]
-    for row in values:  # carry the last finite value over iterations in which no episode ended
-        finite = np.flatnonzero(np.isfinite(row))
-        if len(finite):
-            last = finite[np.maximum(np.searchsorted(finite, np.arange(len(row)), side="right") - 1, 0)]
-            row[finite[0] :] = row[last[finite[0] :]]
+    for row in values:
+        carry(row)  # over iterations in which no episode ended
     return steps, values
-
-
-def interval(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean over seeds and its 95 % bootstrap interval, each [T], of values [S, T]."""
-    picks = np.random.default_rng(0).integers(len(values), size=(1000, len(values)))
-    counts = np.apply_along_axis(np.bincount, 1, picks, minlength=len(values))
-    low, high = np.percentile(counts @ values / len(values), [2.5, 97.5], axis=0)
-    return values.mean(0), low, high
 
 
 def curves(
@@ -78,42 +71,228 @@ def draw(axes: Axes, steps: np.ndarray, values: np.ndarray, color: str, setting:
     alone = len(values) == 1
     lines = axes.plot(steps, values.T, color=color, lw=1.2 if alone else 0.6, alpha=1 if alone else 0.4)
     if not alone:
-        mean, low, high = interval(values)
-        axes.plot(steps, mean, color=color, lw=2, label=setting or f"mean of {len(values)} seeds")
-        band = None if setting else "95 % interval"
-        axes.fill_between(steps, low, high, color=color, alpha=0.2, lw=0, label=band)
+        band(axes, steps, values, setting or f"mean of {len(values)} seeds", color=color)
+        axes.collections[-1].set_label(None if setting else "95 % interval")
     elif setting:
         lines[0].set_label(setting)
 
 
-def trade_off(rows: Sequence[Any], path: Path, title: str) -> None:
-    """Write the PNG: return against cost of each row of a sweep's table, an environment a panel.
+def band(axes: Axes, steps: np.ndarray, values: np.ndarray, label: str, **style: Any) -> None:
+    """Mean over seeds and its 95 % interval, of `values` [S, T]."""
+    e = stats.estimate(values, draws=1000)
+    (line,) = axes.plot(steps, e.mean, lw=2, label=label, **style)
+    axes.fill_between(steps, e.low, e.high, color=line.get_color(), alpha=0.2, lw=0)
+
+
+def trade_off(
+    rows: Sequence[Any], title: str, published: Mapping[tuple[str, str], Any] = MappingProxyType({})
+) -> Figure:
+    """Return against cost of each row of a comparison, an environment a panel.
 
     A point is the mean over seeds with its 95 % interval, each limit a dashed line: grey, or in the
-    colour of the one setting it belongs to.
+    colour of the one setting it belongs to. The grey steps are the Pareto front of the means. A hollow
+    diamond is what was published, with its spread, by environment and name.
     """
-    envs = list(dict.fromkeys(row.env for row in rows))
-    figure = Figure(figsize=(6.5 * max(1, len(envs)), 4.5), layout="constrained")
-    FigureCanvasAgg(figure)
-    for axes, env in zip(figure.subplots(1, max(1, len(envs)), squeeze=False)[0], envs, strict=False):
+    envs = sorted({row.env for row in rows})
+    figure, panels = grid(len(envs), size=(4.6, 4))
+    looks = styles(rows)
+    for axes, env in zip(panels, envs, strict=True):
         shown = [row for row in rows if row.env == env]
         limits = [row.cost_limit for row in shown]
         for i, row in enumerate(shown):
-            color = f"C{i % 10}"
+            color, marker = looks[row.name]["color"], MARKERS[looks[row.name]["ls"]]
             axes.plot(row.costs, row.returns, ".", color=color, ms=4, alpha=0.5)
+            ret, cost = row.ret, row.cost
             axes.errorbar(
-                row.cost.mean,
-                row.ret.mean,
-                xerr=[[row.cost.mean - row.cost.low], [row.cost.high - row.cost.mean]],
-                yerr=[[row.ret.mean - row.ret.low], [row.ret.high - row.ret.mean]],
-                fmt="o",
+                cost.mean,
+                ret.mean,
+                xerr=[[cost.mean - cost.low], [cost.high - cost.mean]],
+                yerr=[[ret.mean - ret.low], [ret.high - ret.mean]],
+                fmt=marker,
                 color=color,
                 label=row.name,
             )
+            if (known := published.get((env, row.name))) is not None:
+                (x, dx), (y, dy) = known.cost, known.ret
+                hollow = {"fmt": "D", "mfc": "none", "ms": 7, "lw": 0.7, "alpha": 0.7}
+                axes.errorbar(x, y, xerr=[[min(dx, x)], [dx]], yerr=dy, color=color, **hollow)
             if row.cost_limit not in limits[:i]:
                 line = color if limits.count(row.cost_limit) == 1 and len(set(limits)) > 1 else "0.5"
                 axes.axvline(row.cost_limit, color=line, ls="--", lw=1)
+        axes.plot(*front([(r.cost.mean, r.ret.mean) for r in shown]), color="0.6", lw=1, zorder=0)
         axes.set(title=env, xlabel=PANELS[1][1], ylabel=PANELS[0][1])
-        axes.legend(frameon=False, fontsize="small")
-    figure.suptitle(title)
-    figure.savefig(path, dpi=120)
+    legend(figure, panels)
+    figure.suptitle(title + ("; hollow: published" if any(published.values()) else ""))
+    return figure
+
+
+def front(points: Sequence[tuple[float, float]]) -> tuple[list[float], list[float]]:
+    """The corners of the steps under which no point costs less and returns more."""
+    xs: list[float] = []
+    ys: list[float] = []
+    for cost, ret in sorted(p for p in points if np.isfinite(p).all()):
+        if not ys or ret > ys[-1]:
+            xs += [cost, cost] if ys else [cost]
+            ys += [ys[-1], ret] if ys else [ret]
+    return xs, ys
+
+
+def learning(groups: Sequence[Any]) -> Figure:
+    """Return, cost and cost rate so far over environment steps: a row a task, a line a setting.
+
+    A point is the mean over one of at most 50 equal stretches of training; the band is the 95 %
+    interval over seeds. A line ends where the first of its seeds does.
+    """
+    envs = sorted({g.env for g in groups})
+    figure = Figure(figsize=(13, 3.4 * len(envs)), layout="constrained")
+    FigureCanvasAgg(figure)
+    looks = styles(groups)
+    rows = figure.subplots(len(envs), 3, squeeze=False)
+    for env, (ret, cost, rate) in zip(envs, rows, strict=True):
+        shown = [g for g in groups if g.env == env]
+        runs = [run for g in shown for run in g.runs]
+        count = min(50, *(len(np.unique(run.table["steps"])) for run in runs))
+        edges = np.linspace(0, max(run.steps for run in runs), count + 1)
+        for g in shown:
+            for axes, name in ((ret, "train/return"), (cost, "train/cost"), (rate, "train/cost_rate")):
+                if all(name in run.table for run in g.runs):
+                    values = np.concatenate([stretches(run.table, name, edges) for run in g.runs])
+                    band(axes, edges[1:], values, g.name, **looks[g.name])
+        limits = [g.cost_limit for g in shown]
+        for g in shown:
+            own = limits.count(g.cost_limit) == 1 and len(set(limits)) > 1
+            if own or g is shown[limits.index(g.cost_limit)]:
+                color = looks[g.name]["color"] if own else "0.4"
+                cost.axhline(g.cost_limit, color=color, ls="--", lw=1)
+        for axes, label in zip((ret, cost, rate), ("return", "cost", "cost rate so far"), strict=True):
+            axes.set(title=f"{env}, {label}")
+            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    for axes in rows[-1]:
+        axes.set_xlabel("environment steps")
+    legend(figure, rows.ravel())
+    return figure
+
+
+def stretches(table: Mapping[str, np.ndarray], name: str, edges: np.ndarray) -> np.ndarray:
+    """The mean of a metric of each seed over each stretch of steps (edges[i], edges[i + 1]], [S, T].
+
+    A stretch without value has the one before it, NaN before the first and after the last row of the
+    seed. Cost rates are averaged from the start, so that the last one is that of all training.
+    """
+    seeds = np.unique(table["seed"])
+    found = np.full((len(seeds), len(edges) - 1), np.nan)
+    for row, seed in zip(found, seeds, strict=True):
+        own = table["seed"] == seed
+        values, steps = table[name][own], table["steps"][own]
+        if name == "train/cost_rate":
+            values = np.cumsum(values) / np.arange(1, len(values) + 1)
+        known = np.isfinite(values)
+        which = np.searchsorted(edges, steps, side="left") - 1
+        count = np.bincount(which[known], minlength=len(row))
+        total = np.bincount(which[known], values[known], minlength=len(row))
+        end = which.max() + 1
+        row[count > 0] = total[count > 0] / count[count > 0]
+        carry(row[:end])
+    return found
+
+
+def carry(row: np.ndarray) -> None:
+    """Fill NaN with the last finite value before it, in place."""
+    finite = np.flatnonzero(np.isfinite(row))
+    if len(finite):
+        last = finite[np.maximum(np.searchsorted(finite, np.arange(len(row)), side="right") - 1, 0)]
+        row[finite[0] :] = row[last[finite[0] :]]
+
+
+def normalised(
+    names: Sequence[str], metrics: Sequence[str], found: Mapping[tuple[str, str, str], Any]
+) -> Figure:
+    """Mean and IQM of each score with their intervals, a row a setting."""
+    figure = Figure(figsize=(4 * len(metrics) + 1, 1.2 + 0.4 * len(names)), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(1, len(metrics), sharey=True, squeeze=False)[0]
+    for axes, metric in zip(panels, metrics, strict=True):
+        for kind, color, shift in (("IQM", "C0", -0.12), ("mean", "0.5", 0.12)):
+            es = [found[name, metric, kind] for name in names]
+            error = [[e.mean - e.low for e in es], [e.high - e.mean for e in es]]
+            ys = np.arange(len(names)) + shift
+            axes.errorbar([e.mean for e in es], ys, xerr=error, fmt="o", ms=5, color=color, label=kind)
+        axes.set(title=metric, yticks=range(len(names)), yticklabels=names)
+        axes.grid(axis="x", alpha=0.3)
+    panels[0].set_ylim(len(names) - 0.5, -0.5)
+    legend(figure, panels)
+    return figure
+
+
+def profiles(suite: Any) -> Figure:
+    """The share of seeds above each normalised return, and above each cost in limits."""
+    figure, panels = grid(2, size=(5, 3.8))
+    looks = styles([gs[0] for gs in suite.groups.values()])
+    labels = ("normalised return", "cost / limit")
+    for axes, label in zip(panels, labels, strict=True):
+        samples = {
+            name: [
+                g.values(label) if label == labels[0] else g.costs / (g.cost_limit or np.nan)
+                for g in gs
+            ]
+            for name, gs in suite.groups.items()
+        }
+        values = np.concatenate([x for xs in samples.values() for x in xs])
+        values = values[np.isfinite(values)]
+        if len(values):
+            thresholds = np.linspace(min(0, values.min()), max(1.2, values.max()) * 1.02, 201)
+            for name, xs in samples.items():
+                if all(np.isfinite(x).all() for x in xs):
+                    e = stats.profile(xs, thresholds)
+                    axes.plot(thresholds, e.mean, label=name, **looks[name])
+                    axes.fill_between(
+                        thresholds, e.low, e.high, color=looks[name]["color"], alpha=0.15, lw=0
+                    )
+        axes.axvline(1, color="0.5", ls="--", lw=1)
+        axes.set(xlabel=label, ylabel="share of seeds above", ylim=(-0.02, 1.02))
+    legend(figure, panels)
+    figure.suptitle(", ".join(suite.tasks) if len(suite.tasks) < 4 else f"{len(suite.tasks)} tasks")
+    return figure
+
+
+# ---- what the figures share ------------------------------------------------------------------
+
+
+def styles(rows: Sequence[Any]) -> dict[str, dict[str, Any]]:
+    """Colour and line of each name: ten colours, then the next kind of line."""
+    names = dict.fromkeys(row.name for row in rows)
+    lines = list(MARKERS)
+    return {
+        name: {"color": f"C{i % 10}", "ls": lines[i // 10 % len(lines)]} for i, name in enumerate(names)
+    }
+
+
+def grid(count: int, size: tuple[float, float]) -> tuple[Figure, list[Axes]]:
+    """A figure of `count` panels, at most four beside each other."""
+    columns = min(4, max(1, count))
+    rows = -(-max(1, count) // columns)
+    figure = Figure(figsize=(size[0] * columns, size[1] * rows), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axes in panels[count:]:
+        axes.set_axis_off()
+    return figure, list(panels[:count])
+
+
+def legend(figure: Figure, panels: Iterable[Axes]) -> None:
+    """One for all panels, on the right."""
+    entries = {}
+    for axes in panels:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            entries.setdefault(label, handle)
+    if entries:
+        figure.legend(entries.values(), entries.keys(), loc="outside right upper", frameon=False)
+
+
+def save(figure: Figure, path: Path, formats: Sequence[str] = FORMATS) -> None:
+    """Write `path` with each suffix; the same figure is the same file."""
+    for suffix in formats:
+        with matplotlib.rc_context({"svg.hashsalt": "jaxsafe"}):
+            about = {"Date": None} if suffix == "svg" else None
+            figure.savefig(path.with_suffix(f".{suffix}"), dpi=120, metadata=about)
+        figure.set_layout_engine("none")  # is laid out, and the next file is like it

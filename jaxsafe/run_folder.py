@@ -2,7 +2,8 @@
 
 config.yaml     every setting, resolved
 versions.json   package versions, commit, device and command of each start
-metrics.csv     one row an iteration and seed; an empty cell where there was no value. Where settings
+metrics.csv     one row an iteration and seed; an empty cell where there was no value (read packed
+                as metrics.csv.xz too). Where settings
                 train side by side, a row for each with each seed, and a column a float they differ in
 tensorboard/    the same for TensorBoard, one folder a seed (and setting)
 checkpoints/    see jaxsafe.checkpoint
@@ -13,6 +14,7 @@ import csv
 import datetime
 import importlib.metadata
 import json
+import lzma
 import math
 import os
 import platform
@@ -83,6 +85,15 @@ def append_versions(folder: Path, device: str, engine: str) -> None:
         **{name: installed(name) for name in PACKAGES},
     }
     replace_text(path, json.dumps([*starts, now], indent=1))
+
+
+def trained_by(folder: Path) -> str:
+    """The version of jaxsafe that a run was last started with, and its commit."""
+    try:
+        last = json.loads((folder / "versions.json").read_text())[-1]
+        return f"{last['jaxsafe']} ({last['commit']})"
+    except (OSError, ValueError, LookupError, TypeError):
+        return "of an unknown version"
 
 
 def installed(package: str) -> str | None:
@@ -191,20 +202,41 @@ class Board:
         self.writer.close()
 
 
+def metrics_file(folder: Path) -> Path:
+    """metrics.csv, or metrics.csv.xz as long as there is only that."""
+    path = folder / "metrics.csv"
+    packed = path.with_name("metrics.csv.xz")
+    return packed if packed.is_file() and not path.is_file() else path
+
+
 def read_metrics(folder: Path) -> dict[str, np.ndarray]:
     """metrics.csv as float columns by name (NaN where a cell is empty); empty if there is none."""
-    path = folder / "metrics.csv"
-    if not path.is_file():
-        return {}
-    with path.open(newline="") as file:
-        rows = csv.reader(file)
-        header = next(rows, [])
-        body = [r for r in rows if len(r) == len(header)]
+    path = metrics_file(folder)
+    return read_table(path) if path.is_file() else {}
+
+
+def read_table(path: Path) -> dict[str, np.ndarray]:
+    """A .csv or .csv.xz as `read_metrics` gives it. A torn line is left out.
+
+    Raises:
+        ConfigError: a cell is no number, or the file cannot be read.
+    """
     try:
-        table = np.array([[float(c) if c else np.nan for c in row] for row in body], float)
-    except ValueError as error:
-        raise ConfigError(f"{path} cannot be read: {error}") from error
-    return dict(zip(header, table.reshape(-1, len(header)).T, strict=True))
+        x = path.read_bytes()
+        text = (lzma.decompress(x) if path.suffix == ".xz" else x).decode()
+        header, *lines = text.splitlines() or [""]
+        names = header.split(",")
+        body = "".join(f"{line}\n" for line in lines if line.count(",") == len(names) - 1)
+        body = body.replace(",,", ",nan,").replace(",,", ",nan,").replace(",\n", ",nan\n")
+        rows = body.split()
+        table = (
+            np.loadtxt(rows, delimiter=",", comments=None, ndmin=2)
+            if rows
+            else np.empty((0, len(names)))
+        )
+    except (ValueError, OSError, EOFError, lzma.LZMAError) as error:
+        raise ConfigError(f"{path} cannot be read: {' '.join(str(error).split())}") from error
+    return dict(zip(names, table.T, strict=True))
 
 
 def by_setting(metrics: dict[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:

@@ -24,17 +24,26 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import yaml
 from hydra.core.override_parser.types import Override, ValueType
 
-from jaxsafe import checkpoint, command, distributed, on_policy, plots, run_folder, runner
-from jaxsafe.command import Settings, compose, flat, guarded, one_line, parse, settle
+from jaxsafe import (
+    checkpoint,
+    command,
+    compare,
+    distributed,
+    on_policy,
+    plots,
+    run_folder,
+    runner,
+    tables,
+)
+from jaxsafe.command import Settings, compose, flat, guarded, one_line, parse
+from jaxsafe.compare import Group
 from jaxsafe.config import ConfigError, float_fields
-from jaxsafe.constraints import own_limits
-from jaxsafe.evaluation import Estimate
 from jaxsafe.interrupts import Interrupts
 from jaxsafe.progress import Report
+from jaxsafe.tables import Table
 
 EPILOG = """\
 Options are those of train.py (python scripts/train.py --help), and
@@ -271,65 +280,12 @@ def finished(settings: Settings, folder: Path) -> bool:
 # ---- the summary -----------------------------------------------------------------------------
 
 
-class Row(NamedTuple):
-    """A setting: the last 10 % of its training so far, over its seeds."""
-
-    swept: dict[str, Any]
-    env: str
-    cost_limit: float  # NaN where named costs have limits of their own
-    steps: int
-    returns: np.ndarray  # [S], a mean over complete episodes; NaN where a seed had none
-    costs: np.ndarray
-
-    @property
-    def name(self) -> str:
-        return run_folder.setting_name(self.swept)
-
-    @property
-    def ret(self) -> Estimate:
-        return over_seeds(self.returns)
-
-    @property
-    def cost(self) -> Estimate:
-        return over_seeds(self.costs)
-
-    @property
-    def held(self) -> str:
-        """Whether the limit is: 'unclear' where the mean is above it and its interval is not."""
-        if np.isnan(self.cost.mean) or np.isnan(self.cost_limit):
-            return "-"
-        if self.cost.mean <= self.cost_limit:
-            return "yes"
-        return "unclear" if self.cost.low <= self.cost_limit else "no"
-
-
-def over_seeds(values: np.ndarray) -> Estimate:
-    mean, low, high = plots.interval(values[:, None])
-    return Estimate(mean.item(), low.item(), high.item())
-
-
-def rows_of(folder: Path, envs: Any, algos: Any) -> list[Row]:
+def rows_of(folder: Path, envs: Any, algos: Any) -> list[Group]:
     """A row for each setting that has begun."""
-    swept, rows = read_folder(folder)["swept"], {}
-    for path in sorted(folder.glob("*/config.yaml")):
-        saved = settle(run_folder.read_config(path.parent), envs, algos)
-        tables = run_folder.by_setting(run_folder.read_metrics(path.parent)).values()
-        for cfg, table in zip(saved.configs, tables, strict=False):
-            if not len(table.get("steps", ())):
-                continue
-            plain = flat(saved._replace(configs=(cfg,)).plain())
-            values = {name.removesuffix(".name"): plain[name] for name in swept}
-            late = (run_folder.last_tenth(table, f"train/{name}") for name in ("return", "cost"))
-            limit = np.nan if own_limits(cfg) else cfg.cost_limit
-            row = Row(values, saved.env_name, limit, int(table["steps"].max()), *late)
-            if (old := rows.get(row.name)) is not None:  # other seeds of this setting
-                row = row._replace(
-                    steps=min(old.steps, row.steps),
-                    returns=np.append(old.returns, row.returns),
-                    costs=np.append(old.costs, row.costs),
-                )
-            rows[row.name] = row
-    return list(rows.values())
+    swept = read_folder(folder)["swept"]
+    paths = sorted(folder.glob("*/config.yaml"))
+    runs = [run for path in paths for run in compare.read_one(path.parent, envs, algos)]
+    return compare.group(runs, swept) if runs else []
 
 
 def summarise(folder: Path, envs: Any, algos: Any) -> str:
@@ -338,39 +294,35 @@ def summarise(folder: Path, envs: Any, algos: Any) -> str:
     text = markdown(rows)
     run_folder.replace_text(folder / "summary.md", text)
     run_folder.replace_text(folder / "summary.csv", as_csv(rows))
-    plots.trade_off(rows, folder / "summary.png", "last 10 % of training, mean and 95 % interval")
+    title = "last 10 % of training, mean and 95 % interval"
+    plots.save(plots.trade_off(rows, title), folder / "summary", ["png"])
     return text
 
 
-def markdown(rows: list[Row]) -> str:
-    def cell(e: Estimate) -> str:
-        interval = "" if e.low == e.high or np.isnan(e.mean) else f" [{e.low:.4g}, {e.high:.4g}]"
-        return f"{e.mean:.4g}{interval}".replace("nan", "-")
+def columns(rows: list[Group]) -> list[str]:
+    return [name.removesuffix(".name") for name in rows[0].by] if rows else []
 
-    names = list(rows[0].swept) if rows else []
-    lines = [[*names, "seeds", "steps", "return", "cost", "limit", "limit held"]]
-    lines += [["---", *["---:"] * (len(lines[0]) - 2), "---"]]
-    for r in rows:
-        figures = [
-            str(len(r.costs)),
-            f"{r.steps:,}",
-            cell(r.ret),
-            cell(r.cost),
-            f"{r.cost_limit:g}".replace("nan", "-"),
+
+def markdown(rows: list[Group]) -> str:
+    header = [*columns(rows), "seeds", "steps", "return", "cost", "limit", "limit held"]
+    lines = [
+        [
+            *(tables.number(v) if isinstance(v, float) else str(v) for v in r.by.values()),
+            str(len(r.costs)), f"{r.steps:,}", tables.cell(r.ret), tables.cell(r.cost),
+            tables.number(r.cost_limit), r.held,
         ]
-        values = [f"{v:.9g}" if isinstance(v, float) else str(v) for v in r.swept.values()]
-        lines.append([*values, *figures, r.held])
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+        for r in rows
+    ]  # fmt: skip
+    return tables.markdown(Table("", header, lines))
 
 
-def as_csv(rows: list[Row]) -> str:
+def as_csv(rows: list[Group]) -> str:
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     bounds = [f"{name}{end}" for name in ("return", "cost") for end in ("", "_low", "_high")]
-    names = list(rows[0].swept) if rows else []
-    writer.writerow([*names, "seeds", "steps", *bounds, "cost_limit", "held"])
+    writer.writerow([*columns(rows), "seeds", "steps", *bounds, "cost_limit", "held"])
     for r in rows:
-        head = [*r.swept.values(), len(r.costs), r.steps]
+        head = [*r.by.values(), len(r.costs), r.steps]
         writer.writerow([*head, *r.ret, *r.cost, r.cost_limit, r.held])
     return out.getvalue()
 

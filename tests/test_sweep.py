@@ -163,7 +163,7 @@ def test_parts_give_what_all_at_once_give(finished, tmp_path):
     assert_close(tables(tmp_path / "sweep"), tables(finished))
     rows, expected = (sweep.rows_of(f, TOYS, algos) for f in (tmp_path / "sweep", finished))
     for a, b in zip(rows, expected, strict=True):
-        assert (a.swept, a.cost_limit, a.steps) == (b.swept, b.cost_limit, b.steps)
+        assert (a.by, a.cost_limit, a.steps) == (b.by, b.cost_limit, b.steps)
         np.testing.assert_allclose([a.costs, a.returns], [b.costs, b.returns], rtol=1e-3, atol=1e-4)
 
 
@@ -272,7 +272,7 @@ def test_the_summary_is_the_last_tenth_of_training_over_the_seeds_of_each_settin
         write(tmp_path / f"{name}.part{seed + 1}", alone, [(seed, None, 1.0, np.nan)])
     assert sweep.summarise(tmp_path, TOYS, algos) == (
         "| algo.cost_limit | seeds | steps | return | cost | limit | limit held |\n"
-        "| --- | ---: | ---: | ---: | ---: | ---: | --- |\n"
+        "| --- | ---: | ---: | ---: | ---: | ---: | ---: |\n"
         "| 2 | 2 | 200 | 2 [1, 3] | 2 [1, 3] | 2 | yes |\n"
         "| 4 | 2 | 200 | 5 | 5 [3, 7] | 4 | unclear |\n"
         "| 8 | 2 | 200 | 0 | 9.5 [9, 10] | 8 | no |\n"

@@ -1,45 +1,27 @@
 """Draw the curves and print the numbers of these runs: python docs/results/make.py
 
-Each folder holds the metrics of one command (versions.json has it), compressed.
+Each folder holds the metrics of one command (versions.json has it), compressed. The runs compared, in
+tables and figures: python scripts/plot.py docs/results --published docs/results/published.csv
 """
 
-import csv
-import io
 import json
-import lzma
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
 
-from jaxsafe import plots, run_folder
-from jaxsafe.evaluation import estimate
+from jaxsafe import compare, plots, run_folder, scores, stats, tables
 
 HERE = Path(__file__).parent
 LIMIT = 25.0
-# Return and cost, mean and spread. OmniSafe: benchmarks/on-policy, Table 2, 1e7 steps, evaluated
-# policies. Safety Gym: unconstrained PPO, 1e7 steps; we know of no constrained table.
-PUBLISHED = {
-    "point_goal1-ppo_lag": "OmniSafe 12.96 ± 6.95, cost 25.80 ± 34.99",
-    "point_goal1-cpo": "OmniSafe 20.46 ± 1.38, cost 28.84 ± 7.76",
-    "point_goal1-ppo_lag-published": "OmniSafe 12.96 ± 6.95, cost 25.80 ± 34.99",
-    "point_goal1-cpo-published": "OmniSafe 20.46 ± 1.38, cost 28.84 ± 7.76",
-    "car_push1-ppo_lag": "none (unconstrained PPO: 3.085, cost 61.94)",
-    "car_push1-cpo": "none (unconstrained PPO: 3.085, cost 61.94)",
-}
+# OmniSafe: evaluated policies. We know of no constrained table of Push.
+PUBLISHED = compare.read_published(HERE / "published.csv")
 # Where a run's evaluation.json was not kept: what its command printed.
 PRINTED = {
     "point_goal1-ppo_lag": "19.21 [15.68, 21.97], cost 22.91 [18.99, 27.05]",
     "point_goal1-cpo": "20.34 [18.71, 21.86], cost 19.24 [14.78, 23.79]",
     "point_goal1-cpo-published": "22.64 and 21.11, cost 26.75 and 38.90",  # a command a seed
 }
-
-
-def read(path: Path) -> dict[str, np.ndarray]:
-    """The columns of a metrics.csv.xz."""
-    with lzma.open(path) as file:
-        rows = list(csv.DictReader(io.TextIOWrapper(file)))
-    return {k: np.array([float(r[k] or "nan") for r in rows]) for k in rows[0]}
 
 
 def final_policy(name: str) -> str:
@@ -54,8 +36,23 @@ def final_policy(name: str) -> str:
 
 def last_tenth(metrics: dict[str, np.ndarray], name: str) -> str:
     """Mean over the last 10% of training, and its 95% interval over seeds."""
-    e = estimate(run_folder.last_tenth(metrics, name)[:, None])
-    return f"{e.mean:.2f} [{e.low:.2f}, {e.high:.2f}]"
+    return tables.cell(stats.estimate(run_folder.last_tenth(metrics, name)), ".2f")
+
+
+def published(env: str, algo: str) -> str:
+    """What others report, and where that is nothing constrained, unconstrained PPO."""
+    if known := PUBLISHED.get((env, algo)):
+        (ret, ret_std), (cost, cost_std) = known.ret, known.cost
+        return f"{known.source} {ret:.2f} ± {ret_std:.2f}, cost {cost:.2f} ± {cost_std:.2f}"
+    if ppo := scores.CHARACTERISTIC.get(env):
+        return f"none (unconstrained PPO: {ppo.ret:.4g}, cost {ppo.cost:.4g})"
+    return "none"
+
+
+def row(name: str, metrics: dict[str, np.ndarray], *more: str) -> str:
+    figures = (last_tenth(metrics, f"train/{what}") for what in ("return", "cost"))
+    minutes = f"{metrics['seconds'].max() / 60:.1f}"
+    return f"| {' | '.join([name, str(len(np.unique(metrics['seed']))), *figures, *more, minutes])} |"
 
 
 def throughput(path: Path) -> None:
@@ -84,21 +81,13 @@ def main() -> None:
     throughput(HERE / "throughput.png")
     print("| run | seeds | return | cost (limit 25) | final policy | published | minutes |")
     print("|---|---:|---:|---:|---|---|---:|")
-    for name in PUBLISHED:
-        metrics = read(HERE / name / "metrics.csv.xz")
+    for path in sorted(HERE.glob("*/config.yaml")):
+        name, metrics = path.parent.name, run_folder.read_metrics(path.parent)
         plots.curves(metrics, HERE / f"{name}.png", name.replace("-", ", "), LIMIT)
-        print(
-            f"| {name} | {len(np.unique(metrics['seed']))} | {last_tenth(metrics, 'train/return')} | "
-            f"{last_tenth(metrics, 'train/cost')} | {final_policy(name)} | {PUBLISHED[name]} | "
-            f"{metrics['seconds'].max() / 60:.1f} |"
-        )
+        env, algo, *_ = name.split("-")
+        print(row(name, metrics, final_policy(name), published(env, algo)))
     for path in sorted((HERE / "ablations").glob("*.csv.xz")):
-        metrics = read(path)
-        print(
-            f"| {path.name.removesuffix('.csv.xz')} | {len(np.unique(metrics['seed']))} | "
-            f"{last_tenth(metrics, 'train/return')} | {last_tenth(metrics, 'train/cost')} | - | - | "
-            f"{metrics['seconds'].max() / 60:.1f} |"
-        )
+        print(row(path.name.removesuffix(".csv.xz"), run_folder.read_table(path), "-", "-"))
 
 
 if __name__ == "__main__":
