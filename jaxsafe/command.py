@@ -551,6 +551,7 @@ class Scores(NamedTuple):
     cost_limit: float
     episodes: int  # of all its seeds
     rows: dict[str, stats.Estimate]
+    seeds: dict[str, list[float]]  # the mean over the episodes of each
 
 
 def evaluate(
@@ -564,16 +565,10 @@ def evaluate(
     for i, member in enumerate(runner.members(settings.configs, settings.train)[::seeds]):
         own = evaluation.Episodes(*(x[i * seeds : (i + 1) * seeds] for x in episodes))
         limit, metrics = float(member.algo.cost_limit), tables[i] if i < len(tables) else {}
-        rows = evaluation.summary(settings.env_name, own, cost_names, limit, metrics)
-        over = []
-        for name, most in own_limits(member.algo).items():
-            costs = own.costs[..., cost_names.index(name)]
-            over.append(costs > most)
-            rows.setdefault(f"cost {name}", evaluation.estimate(costs))
-            rows[f"{name} over {most:g}"] = evaluation.estimate(over[-1])
-        if over:
-            rows["violation rate"] = evaluation.estimate(np.any(over, axis=0))
-        scores.append(Scores(member.setting, limit, own.ret.size, rows))
+        found = evaluation.measures(own, cost_names, own_limits(member.algo) or {"": limit})
+        rows = evaluation.summary(settings.env_name, found, limit, metrics)
+        by_seed = {name: values.mean(1).tolist() for name, values in found.items()}
+        scores.append(Scores(member.setting, limit, own.ret.size, rows, by_seed))
     return scores
 
 
@@ -590,11 +585,11 @@ def finish(settings: Settings, env: Env, envs: Any, algos: Any, folder: Path, re
 
     def scores() -> None:
         found = evaluate(settings, *policy(), train.eval_episodes, train.seed, folder)
-        tables = {s.name: evaluation.as_json(s.rows) for s in found}
+        tables = {s.name: evaluation.as_json(s.rows) | {"seeds": s.seeds} for s in found}
         text = json.dumps({"episodes": train.eval_episodes, **tables.get("", tables)}, indent=1)
         run_folder.replace_text(folder / "evaluation.json", text)
         several = ", ".join(f"{k} {v:g}" for k, v in own_limits(settings.algo).items())
-        for name, limit, episodes, rows in found:
+        for name, limit, episodes, rows, _ in found:
             ret, cost, rate = rows["return"], rows["cost"], rows["violation rate"]
             report.line(
                 f"final policy{name and ', ' + name}: return {ret.mean:.4g} [{ret.low:.4g}, "

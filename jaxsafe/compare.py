@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import jaxsafe
-from jaxsafe import command, evaluation, plots, run_folder, scores, stats, tables
+from jaxsafe import command, evaluation, plots, run_folder, runner, scores, stats, tables
 from jaxsafe.config import ConfigError, nearest
 from jaxsafe.constraints import own_limits
 from jaxsafe.stats import Estimate
@@ -37,6 +37,10 @@ from jaxsafe.tables import Table
 NOT_A_SETTING = {"seed", "num_seeds", "num_envs", "devices", *command.NOT_COMPARED} - {"total_steps"}
 NEEDED = ("iteration", "steps", "seed", "train/return", "train/cost")  # columns
 PUBLISHED = ("task", "algo", "source", "return", "return_std", "cost", "cost_std", "cost_limit")
+FINAL = (
+    "final return", "final cost", "final violation rate", "final discounted return",
+    "final discounted cost",
+)  # fmt: skip
 SCORES = ("normalised return", "normalised violation", "normalised cost rate")
 
 
@@ -192,12 +196,19 @@ def read_one(folder: Path, envs: Any, algos: Any) -> list[Run]:
             raise ConfigError(f"{run_folder.metrics_file(folder)} has no column {name}")
     runs = []
     parts = run_folder.by_setting(metrics).values()
-    for cfg, table in zip(saved.configs, parts, strict=False):
+    names = [m.setting for m in runner.members(saved.configs, saved.train)[:: saved.train.num_seeds]]
+    for cfg, name, table in zip(saved.configs, names, parts, strict=False):
         own = own_limits(cfg)
         limit = np.nan if own else float(cfg.cost_limit)
         fields = command.flat(saved._replace(configs=(cfg,)).plain()) | {"run_dir": str(folder)}
-        values = measured(saved.env_name, table, own or {"": limit})
-        runs.append(Run(folder, saved.env_name, fields, limit, table, np.unique(table["seed"]), values))
+        values, seeds = measured(saved.env_name, table, own or {"": limit}), np.unique(table["seed"])
+        for what, final in run_folder.read_evaluation(folder, name).items():
+            if len(final) != len(seeds):
+                raise ConfigError(
+                    f"{folder}: evaluation.json is of {len(final)} seeds, metrics.csv of {len(seeds)}"
+                )
+            values[f"final {what}"] = final
+        runs.append(Run(folder, saved.env_name, fields, limit, table, seeds, values))
     return runs
 
 
@@ -428,14 +439,26 @@ def details(groups: Sequence[Group]) -> list[Table]:
         ]
         caption = "Safety Gym's normalised scores: 1 is unconstrained PPO, a violation of 0 the limit."
         out.append(Table(caption, ["task", "setting", *(m.split(" ", 1)[1] for m in SCORES)], rows, 2))
-    costs = list(dict.fromkeys(m for g in groups for m in g.runs[0].values if m.startswith("cost ")))
-    costs = [m for m in costs if m != "cost rate"]
+    every = dict.fromkeys(m for g in groups for run in g.runs for m in run.values)
+    costs = [m for m in every if m.startswith("cost ") and m != "cost rate"]
     if len(costs) > 1:
         rows = [
             [f"`{g.env}`", f"`{g.name}`", *(tables.cell(g.estimate(m)) for m in costs)] for g in groups
         ]
         caption = "Each cost of an episode, last 10% of training."
         out.append(Table(caption, ["task", "setting", *(m.split(" ", 1)[1] for m in costs)], rows, 2))
+    evaluated = [g for g in groups if known_of(g, "final return")]
+    if evaluated:
+        header = ["task", "setting", *(m.removeprefix("final ") for m in FINAL)]
+        rows = [
+            [f"`{g.env}`", f"`{g.name}`", *(tables.cell(g.estimate(m)) for m in FINAL)]
+            for g in evaluated
+        ]
+        caption = (
+            "The final policy: the mean action, over fresh episodes of each seed. Violation rate: the "
+            "share of episodes whose cost is over the limit. Discounted: by the learner's factors."
+        )
+        out.append(Table(caption, header, rows, 2))
     return out
 
 
@@ -552,7 +575,7 @@ def write(
     found = aggregates(scored) if scored.tasks else {}
     pairs = improvements(both) if both.tasks else {}
     main = [results(groups, metric, published) for metric in ("return", "cost")]
-    rest = [*details(groups), *(across(scored, found, {}) if found else [])]
+    rest = [*details(groups), *(across(scored, found, {}) if len(scored.tasks) > 1 else [])]
     rest += across(both, {}, pairs) if pairs else []
     remarks = notes(groups)
     parts = [f"{t.caption}\n\n{tables.markdown(t)}" for t in (*main, *rest)]
@@ -599,7 +622,7 @@ def main(envs: Any, algos: Any) -> int:
         runs = read(args.runs, envs, algos)
         by = [name for name in args.by if name != "env.name"] or telling(runs)
         groups = ordered(group(runs, by))
-        print(f"{len(runs)} runs by {', '.join(by)}", file=sys.stderr)
+        print(f"{len(runs)} run{'s' * (len(runs) > 1)} by {', '.join(by)}", file=sys.stderr)
         print(write(groups, args.out, published) + f"written: {args.out}")
         return 0
 

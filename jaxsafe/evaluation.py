@@ -1,7 +1,7 @@
 """Fresh episodes of a trained policy, and what Safety Gym reports about them."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import jax
@@ -67,21 +67,12 @@ def run_episodes(algo: Algorithm, ts: PyTree, num_episodes: int, seed: int) -> E
     return jax.tree.map(np.asarray, jax.jit(jax.vmap(one_seed))(ts))
 
 
-def estimate(values: np.ndarray, draws: int = 10_000) -> Estimate:
-    """Mean of `values` [S, N] and its interval: seeds are resampled, then episodes within each.
+def estimate(values: np.ndarray) -> Estimate:
+    """Mean of `values` [S, N] and its interval over seeds, whose means hold the spread of episodes too.
 
     With one seed the interval covers the episodes alone, not what another seed would give.
     """
-    rng = np.random.default_rng(0)
-    values = np.asarray(values, float)
-    num_seeds, num_episodes = values.shape
-    means = np.empty(draws)
-    for i in range(draws):
-        rows = rng.integers(num_seeds, size=num_seeds) if num_seeds > 1 else np.zeros(1, int)
-        columns = rng.integers(num_episodes, size=(num_seeds, num_episodes))
-        means[i] = values[rows[:, None], columns].mean()
-    low, high = np.percentile(means, [2.5, 97.5])
-    return Estimate(float(values.mean()), float(low), float(high))
+    return stats.estimate(values.mean(1) if len(values) > 1 else values[0])
 
 
 def cost_rate(metrics: dict[str, np.ndarray]) -> np.ndarray | None:
@@ -95,26 +86,39 @@ def cost_rate(metrics: dict[str, np.ndarray]) -> np.ndarray | None:
     return np.array([np.nanmean(rates[metrics["seed"] == seed]) for seed in np.unique(metrics["seed"])])
 
 
+def measures(
+    episodes: Episodes, cost_names: Sequence[str], limits: Mapping[str, float]
+) -> dict[str, np.ndarray]:
+    """What is reported of each episode, float or bool [S, N] by name.
+
+    Args:
+        episodes: their sums.
+        cost_names: of the environment, the last axis of `episodes.costs`.
+        limits: what is held under them; '' is the cost, other names are those of `cost_names`.
+    """
+    costs = {name: episodes.costs[..., k] for k, name in enumerate(cost_names)}
+    over = {name: (costs[name] if name else episodes.cost) > most for name, most in limits.items()}
+    named = costs if len(costs) > 1 else {}
+    return {
+        "return": episodes.ret,
+        "cost": episodes.cost,
+        "violation rate": np.any([*over.values()], axis=0),
+        **{f"cost {name}": x for name, x in named.items()},
+        **{f"{name} over {limits[name]:g}": x for name, x in over.items() if name},
+        "discounted return": episodes.discounted_ret,
+        "discounted cost": episodes.discounted_cost,
+        "episode length": episodes.length,
+    }
+
+
 def summary(
     env_name: str,
-    episodes: Episodes,
-    cost_names: Sequence[str],
+    found: Mapping[str, np.ndarray],
     cost_limit: float,
     metrics: dict[str, np.ndarray],
 ) -> dict[str, Estimate]:
-    """The rows of the table: return, cost (each of several too), violation rate, discounted return and
-    cost, cost rate and normalised scores."""
-    rows = {
-        "return": estimate(episodes.ret),
-        "cost": estimate(episodes.cost),
-        "violation rate": estimate(episodes.cost > cost_limit),
-        "episode length": estimate(episodes.length),
-        "discounted return": estimate(episodes.discounted_ret),
-        "discounted cost": estimate(episodes.discounted_cost),
-    }
-    if len(cost_names) > 1:
-        for k, name in enumerate(cost_names):
-            rows[f"cost {name}"] = estimate(episodes.costs[..., k])
+    """The rows of the table: `measures`, then the cost rate of training and normalised scores."""
+    rows = {name: estimate(values) for name, values in found.items()}
     rate = cost_rate(metrics)
     if rate is not None:
         rows["cost rate (training)"] = stats.estimate(rate)

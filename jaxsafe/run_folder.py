@@ -239,6 +239,25 @@ def read_table(path: Path) -> dict[str, np.ndarray]:
     return dict(zip(names, table.T, strict=True))
 
 
+def read_evaluation(folder: Path, setting: str) -> dict[str, np.ndarray]:
+    """What evaluation found of each seed in a setting ('' where there is one), [S] by name.
+
+    Empty without evaluation.json, or with one that does not hold the seeds apart.
+
+    Raises:
+        ConfigError: the file cannot be read.
+    """
+    path = folder / "evaluation.json"
+    if not path.is_file():
+        return {}
+    try:
+        found = json.loads(path.read_text())
+        found = found[setting] if setting else found
+        return {name: np.array(values, float) for name, values in found.get("seeds", {}).items()}
+    except (ValueError, KeyError, TypeError, AttributeError, OSError) as error:
+        raise ConfigError(f"{path} cannot be read: {' '.join(str(error).split())}") from error
+
+
 def by_setting(metrics: dict[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
     """The tables of settings trained side by side, by name; {'': metrics} if there is but one."""
     names = [name for name in metrics if name.startswith("algo.")]

@@ -11,6 +11,8 @@ Learning", and the table of characteristic scores in their code (safety_gym, ben
 
 from typing import NamedTuple
 
+import numpy as np
+
 
 class Characteristic(NamedTuple):
     """What unconstrained PPO reaches: episode return, episode cost, cost a training step."""
@@ -57,8 +59,7 @@ def normalized_return(env: str, ret):
 
 def normalized_violation(env: str, cost, cost_limit: float = 25.0):
     """0 within the limit, 1 where unconstrained PPO is; `cost` a float or an array."""
-    excess = cost - cost_limit
-    return (excess > 0) * excess / max(1e-6, CHARACTERISTIC[env].cost - cost_limit)
+    return np.maximum(cost - cost_limit, 0.0) / max(1e-6, CHARACTERISTIC[env].cost - cost_limit)
 
 
 def normalized_cost_rate(env: str, cost_rate):
