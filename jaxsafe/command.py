@@ -716,7 +716,7 @@ def guarded(command: Callable[[], int]) -> int:
         if error.errno not in BAD_DISK:
             raise
         where = f" ({error.filename})" if error.filename else ""
-        return complain(f"{error.strerror}{where}; the last checkpoint stays", 1)
+        return complain(f"{error.strerror}{where}; what was saved stays", 1)
     except jax.errors.JaxRuntimeError as error:
         if "RESOURCE_EXHAUSTED" not in str(error):
             raise

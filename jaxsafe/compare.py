@@ -376,7 +376,8 @@ def results(
     """Return or cost: a row a setting, with what was published below it, and a column a task."""
     envs = tasks_of(groups)
     at = {(g.name, g.env): g for g in groups}
-    safe = [g for g in groups if g.held == "yes" and not np.isnan(g.ret.mean)]
+    limits = {g.cost_limit for g in groups}
+    safe = [g for g in groups if g.held == "yes" and not np.isnan(g.ret.mean) and len(limits) == 1]
     best = {env: max((g.ret.mean for g in safe if g.env == env), default=None) for env in envs}
     rows = []
     for name in dict.fromkeys(g.name for g in groups):
@@ -400,9 +401,8 @@ def results(
             rows.append([source, *theirs])
     what = "Return" if metric == "return" else "Cost"
     caption = f"{what} of an episode, last 10% of training: mean and 95% interval over seeds."
-    limits = {g.cost_limit for g in groups if not np.isnan(g.cost_limit)}
-    if len(limits) == 1:
-        caption += f" Cost limit {limits.pop():g}."
+    if len(limits) == 1 and not np.isnan(limit := next(iter(limits))):
+        caption += f" Cost limit {limit:g}."
     if metric == "return" and safe:
         caption += " Bold: the highest return of a task whose mean cost is within the limit."
     if published:
@@ -617,11 +617,13 @@ def main(envs: Any, algos: Any) -> int:
         parser.add_argument("--out", type=Path, default=Path("comparison"), metavar="DIR")
         args = parser.parse_args()
         published = read_published(args.published) if args.published else {}
-        if args.out.exists() and not args.out.is_dir():
-            raise ConfigError(f"--out {args.out} is not a folder")
         runs = read(args.runs, envs, algos)
         by = [name for name in args.by if name != "env.name"] or telling(runs)
         groups = ordered(group(runs, by))
+        try:
+            args.out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ConfigError(f"--out {args.out}: {error.strerror}") from error
         print(f"{len(runs)} run{'s' * (len(runs) > 1)} by {', '.join(by)}", file=sys.stderr)
         print(write(groups, args.out, published) + f"written: {args.out}")
         return 0

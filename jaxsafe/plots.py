@@ -91,7 +91,7 @@ def trade_off(
 
     A point is the mean over seeds with its 95 % interval, each limit a dashed line: grey, or in the
     colour of the one setting it belongs to. The grey steps are the Pareto front of the means. A hollow
-    diamond is what was published, with its spread, by environment and name.
+    diamond is the mean that was published, by environment and name.
     """
     envs = sorted({row.env for row in rows})
     figure, panels = grid(len(envs), size=(4.6, 4))
@@ -113,15 +113,13 @@ def trade_off(
                 label=row.name,
             )
             if (known := published.get((env, row.name))) is not None:
-                (x, dx), (y, dy) = known.cost, known.ret
-                hollow = {"fmt": "D", "mfc": "none", "ms": 7, "lw": 0.7, "alpha": 0.7}
-                axes.errorbar(x, y, xerr=[[min(dx, x)], [dx]], yerr=dy, color=color, **hollow)
+                axes.plot(known.cost[0], known.ret[0], "D", mfc="none", ms=7, color=color)
             if row.cost_limit not in limits[:i]:
                 line = color if limits.count(row.cost_limit) == 1 and len(set(limits)) > 1 else "0.5"
                 axes.axvline(row.cost_limit, color=line, ls="--", lw=1)
         axes.plot(*front([(r.cost.mean, r.ret.mean) for r in shown]), color="0.6", lw=1, zorder=0)
         axes.set(title=env, xlabel=PANELS[1][1], ylabel=PANELS[0][1])
-    legend(figure, panels)
+    legend(figure, panels, looks)
     figure.suptitle(title + ("; hollow: published" if any(published.values()) else ""))
     return figure
 
@@ -169,7 +167,7 @@ def learning(groups: Sequence[Any]) -> Figure:
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     for axes in rows[-1]:
         axes.set_xlabel("environment steps")
-    legend(figure, rows.ravel())
+    legend(figure, rows.ravel(), looks)
     return figure
 
 
@@ -250,7 +248,7 @@ def profiles(suite: Any) -> Figure:
                     )
         axes.axvline(1, color="0.5", ls="--", lw=1)
         axes.set(xlabel=label, ylabel="share of seeds above", ylim=(-0.02, 1.02))
-    legend(figure, panels)
+    legend(figure, panels, looks)
     figure.suptitle(", ".join(suite.tasks) if len(suite.tasks) < 4 else f"{len(suite.tasks)} tasks")
     return figure
 
@@ -279,14 +277,17 @@ def grid(count: int, size: tuple[float, float]) -> tuple[Figure, list[Axes]]:
     return figure, list(panels[:count])
 
 
-def legend(figure: Figure, panels: Iterable[Axes]) -> None:
-    """One for all panels, on the right."""
-    entries = {}
+def legend(figure: Figure, panels: Iterable[Axes], names: Iterable[str] = ()) -> None:
+    """One for all panels, on the right: `names` first."""
+    entries: dict[str, Any] = dict.fromkeys(names)
     for axes in panels:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
-            entries.setdefault(label, handle)
+            entries[label] = entries.get(label) or handle
+    entries = {label: handle for label, handle in entries.items() if handle}
     if entries:
-        figure.legend(entries.values(), entries.keys(), loc="outside right upper", frameon=False)
+        columns = -(-len(entries) // int(4 * figure.get_figheight()))
+        place = {"loc": "outside right upper", "ncols": columns, "frameon": False}
+        figure.legend(entries.values(), entries.keys(), **place)
 
 
 def save(figure: Figure, path: Path, formats: Sequence[str] = FORMATS) -> None:

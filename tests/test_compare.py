@@ -134,6 +134,7 @@ def test_settings_of_an_algorithm_are_told_apart_by_what_differs(tmp_path):
     groups = compared(tmp_path)
     assert [g.name for g in groups] == [f"ppo_lag, algo.cost_limit={x}" for x in (5, 20, 100)]
     assert [g.held for g in groups] == ["no", "unclear", "yes"]
+    assert "**" not in str(compare.results(groups, "return", {}).rows)  # of other limits, none is best
 
 
 def test_settings_side_by_side_in_one_run_are_groups_of_their_own(tmp_path):
@@ -153,16 +154,17 @@ def test_averaging_over_a_field_is_asked_for_and_said(tmp_path):
 
 
 def test_tasks_stand_apart_and_only_those_of_every_setting_are_compared(tmp_path):
-    write(tmp_path / "1", "point_goal1", "cpo", returns=(10.0, 20.0))
+    write(tmp_path / "1", "point_goal1", "cpo", returns=(10.0, 20.0), costs=(10.0, 11.0))
     write(tmp_path / "2", "car_goal1", "cpo", returns=(4.0, 8.0))
-    write(tmp_path / "3", "point_goal1", "ppo_lag", returns=(0.0, 15.0))
+    write(tmp_path / "3", "point_goal1", "ppo_lag", returns=(0.0, 15.0), costs=(12.0, 20.0))
     write(tmp_path / "4", "point_run", "cpo", total_steps=400)
     groups = compared(tmp_path)
     assert len(groups) == 4
     s = compare.suite(groups)
     assert s.tasks == ["point_goal1"]
-    (pair,) = {compare.improvements(s)[key].mean for key in compare.improvements(s) if "return" in key}
-    assert pair == 3 / 4  # 10 beats 0, 20 beats both
+    pairs = compare.improvements(s)
+    assert pairs["cpo", "ppo_lag", "return"].mean == 3 / 4  # 10 beats 0, 20 beats both
+    assert pairs["cpo", "ppo_lag", "cost"].mean == 1
     assert compare.notes(groups) == [
         f"unfinished: {tmp_path / '4'}, at 200 of 400 steps",
         "not in comparisons across tasks, as a setting lacks them: car_goal1, point_run",
@@ -264,7 +266,8 @@ BAD = {
     "runs --published none.csv": "none.csv cannot be read",
     "runs --published bad.csv": "bad.csv has no column algo; expected task, algo, source",
     "runs --published words.csv": "words.csv cannot be read: could not convert string to float: 'many'",
-    "runs --out runs/a/config.yaml": "is not a folder",
+    "runs --out runs/a/config.yaml": "--out runs/a/config.yaml: File exists",
+    "runs --out /proc/here": "--out /proc/here: No such file or directory",
     "runs copy": "runs/a and copy are the same run of seed 0",
     "other": "trained by jaxsafe 9.0 (abc), does not fit jaxsafe 0.1.0: unknown option algo.magic",
     "columns": "columns/metrics.csv has no column train/return",

@@ -27,8 +27,8 @@ def test_estimates_over_tasks_are_those_of_rliable():
     found = {
         "mean": stats.estimate(*X.T),
         "iqm": stats.estimate(*X.T, statistic=stats.iqm),
-        "probability of improvement": stats.probability_of_improvement(X.T, Y.T),
-        "profile": stats.profile(X.T, np.array([-1.0, 0.0, 0.5])),
+        "probability of improvement": stats.probability_of_improvement([*X.T], [*Y.T]),
+        "profile": stats.profile([*X.T], np.array([-1.0, 0.0, 0.5])),
     }
     for name, expected in RLIABLE.items():
         np.testing.assert_allclose(found[name].mean, expected[0], rtol=1e-6, err_msg=name)
@@ -74,4 +74,4 @@ def test_probability_of_improvement_counts_pairs_and_halves_of_equal_ones():
 def test_a_profile_is_the_share_of_seeds_above_each_threshold():
     e = stats.profile([np.array([0.0, 1.0]), np.array([2.0, 2.0])], np.array([-1.0, 0.0, 1.0, 2.0]))
     np.testing.assert_array_equal(e.mean, [1, 0.75, 0.5, 0])
-    assert (e.low <= e.mean).all() and (e.mean <= e.high).all()
+    assert np.all(e.low <= e.mean) and np.all(e.mean <= e.high)
