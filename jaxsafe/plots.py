@@ -266,10 +266,10 @@ def styles(rows: Sequence[Any]) -> dict[str, dict[str, Any]]:
 
 
 def grid(count: int, size: tuple[float, float]) -> tuple[Figure, list[Axes]]:
-    """A figure of `count` panels, at most four beside each other."""
+    """A figure of `count` panels, at most four beside each other, with room for a legend."""
     columns = min(4, max(1, count))
     rows = -(-max(1, count) // columns)
-    figure = Figure(figsize=(size[0] * columns, size[1] * rows), layout="constrained")
+    figure = Figure(figsize=(size[0] * columns + 2, size[1] * rows), layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     for axes in panels[count:]:
