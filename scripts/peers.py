@@ -53,7 +53,7 @@ def crax(num_envs: int) -> Iterator[Row]:
 def crax_training(num_envs: int) -> list[float]:
     """Steps/s of its PPO-Lagrangian, by its own clock, with the defaults of `crax-train`."""
     from crax import envs
-    from crax.training.agents.ppo_lag import train as ppo_lag
+    from crax.training.agents.ppo_lag import train
 
     rates: list[float] = []
 
@@ -62,7 +62,7 @@ def crax_training(num_envs: int) -> list[float]:
             rates.append(float(metrics["training/sps"]))
 
     batch = 1024 * 32 * 8  # steps of an update: minibatch, minibatches, unroll
-    ppo_lag.train(
+    train(
         environment=envs.get_environment("safe_goal_point", level=1),
         num_timesteps=40 * batch,
         episode_length=1000,

@@ -86,15 +86,19 @@ def separated(model: mujoco.MjModel, data: mujoco.MjData, wanted: float) -> np.n
     return np.append(distance, np.sign(distance) * line / np.linalg.norm(line))
 
 
-@pytest.mark.parametrize("cylinder", [(0.2, 0.5), (0.05, 0.025), (0.075, 0.1)])
-def test_a_cylinder_and_a_box_are_as_far_apart_as_mujoco_says(cylinder):
-    """Pillar, wheel and torso, against a vase that stands anyhow."""
+@pytest.mark.parametrize(
+    "rod", ["cylinder 0.2 0.5", "cylinder 0.05 0.025", "cylinder 0.075 0.1", "capsule 0.04 0.1"]
+)
+def test_a_rod_and_a_box_are_as_far_apart_as_mujoco_says(rod):
+    """Pillar, wheel, torso and leg, against a vase that lies anyhow, or beside one that stands."""
     from jaxsafe.envs import physics_jax
 
     spec = mujoco.MjSpec()
     body = spec.worldbody.add_body()
     body.add_freejoint()
-    body.add_geom(type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=(*cylinder, 0), condim=6)
+    shape, *size = rod.split()
+    kind = getattr(mujoco.mjtGeom, f"mjGEOM_{shape.upper()}")
+    body.add_geom(type=kind, size=(*map(float, size), 0), condim=6)
     other = spec.worldbody.add_body()
     other.add_freejoint()
     other.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=(0.1,) * 3, condim=6)
@@ -102,9 +106,11 @@ def test_a_cylinder_and_a_box_are_as_far_apart_as_mujoco_says(cylinder):
     data, rng = mujoco.MjData(model), np.random.default_rng(0)
     mjx_model = mjx.put_model(model, impl="jax")
     truth, poses = [], []
-    for _ in range(200):
+    for i in range(200):
         data.qpos[:] = rng.standard_normal(14)
         data.qpos[7:10] = 0
+        if i % 2:  # both stand upright
+            data.qpos[[4, 5, 11, 12]] = 0
         truth.append(separated(model, data, rng.uniform(-0.005, 0.01)))
         poses.append(data.qpos.copy())
     qpos = jnp.asarray(np.array(poses), jnp.float32)
@@ -113,7 +119,8 @@ def test_a_cylinder_and_a_box_are_as_far_apart_as_mujoco_says(cylinder):
     @jax.vmap
     def contacts(qpos):
         moved = mjx.kinematics(mjx_model, mjx.make_data(mjx_model).replace(qpos=qpos))
-        return physics_jax.cylinder_box(mjx_model, moved, None, jnp.array([[0, 1]]))
+        collide = getattr(physics_jax, f"{shape}_box")
+        return collide(mjx_model, moved, None, jnp.array([[0, 1]]))
 
     dist, _, frame = contacts(qpos)
     truth = np.array(truth)
