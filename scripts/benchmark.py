@@ -1,7 +1,7 @@
 """Measure environments and fused training: python scripts/benchmark.py point_goal1 --num-envs 1024
 
-Each row is one program, compiled apart from its runs: the median of `--repeats` runs after a first
-one that allocates. With `--algo` a row is the algorithm's whole update, else random actions, resets
+Each row is one program, compiled apart from its runs: the median of `--repeats` runs, after as many
+as make `--warmup` steps of each environment: fresh layouts, where nothing touches yet, are faster. With `--algo` a row is the algorithm's whole update, else random actions, resets
 included. A physics step is one substep; the forward pass at the end of a step is not counted.
 """
 
@@ -26,17 +26,17 @@ from jaxsafe.rollout import collect, init_rollout
 from jaxsafe.runner import device_name, use_compilation_cache
 
 
-def timed(fn, *args, repeats: int) -> tuple[float, list[float]]:
-    """Compile time, then the run times of `state = fn(state)`, in seconds."""
+def timed(fn, *args, before: int, repeats: int) -> tuple[float, list[float]]:
+    """Compile time, then the run times of `state = fn(state)` after some `before`, in seconds."""
     start = time.perf_counter()
     compiled = jax.jit(fn, donate_argnums=0).lower(*args).compile()
     compile_time, runs = time.perf_counter() - start, []
     state = args[0]
-    for _ in range(repeats + 1):
+    for _ in range(before + repeats):
         start = time.perf_counter()
         state = jax.block_until_ready(compiled(state))
         runs.append(time.perf_counter() - start)
-    return compile_time, runs[1:]
+    return compile_time, runs[before:]
 
 
 def stepping(env, num_envs: int, seeds: int, horizon: int):
@@ -93,7 +93,8 @@ def measure(name: str, num_envs: int, args: argparse.Namespace) -> dict:
     else:
         horizon = args.horizon or 100
         state, fn = stepping(env, num_envs, args.seeds, horizon)
-    compile_time, runs = timed(fn, state, repeats=args.repeats)
+    before = max(1, -(-args.warmup // horizon))
+    compile_time, runs = timed(fn, state, before=before, repeats=args.repeats)
     seconds = statistics.median(runs)
     rate = num_envs * horizon * args.seeds / seconds
     return {
@@ -105,6 +106,7 @@ def measure(name: str, num_envs: int, args: argparse.Namespace) -> dict:
         "num_seeds": args.seeds,
         "devices": args.devices if args.algo else 1,
         "horizon": horizon,
+        "warmup": before * horizon,
         "env_steps_per_s": rate,
         "physics_steps_per_s": rate * env.config.frameskip_binom_n,
         "simulated_s_per_s": rate * env.step_seconds,
@@ -166,6 +168,7 @@ def main() -> int:
     parser.add_argument("--awake", type=int, metavar="K", help="vases, and gremlins, simulated at once")
     parser.add_argument("--algo", help="measure its update instead of random actions")
     parser.add_argument("--horizon", type=int, help="steps of each environment in a run")
+    parser.add_argument("--warmup", type=int, default=200, help="steps of each environment before")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument(
         "--peer", nargs="*", default=[], metavar="NAME=PYTHON", help="also measure crax, ... (peers.py)"
