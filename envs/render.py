@@ -54,7 +54,7 @@ class Renderer:
         camera: 'fixedfar', 'fixednear', 'track' (beside the robot), 'vision' (on it), or an MjvCamera.
     Raises:
         NoDisplay: this machine has neither EGL nor OSMesa nor a display.
-        ConfigError: an unknown camera.
+        ConfigError: an unknown camera, or no environment of Safety Gym.
     """
 
     def __init__(
@@ -64,6 +64,10 @@ class Renderer:
         height: int = 480,
         camera: str | mujoco.MjvCamera = "fixedfar",
     ):
+        if not isinstance(env, SafetyGym):
+            raise ConfigError(
+                f"only Safety Gym's environments can be drawn, not a {type(env).__name__}"
+            )
         self.env = env
         self.scene = scenes.build(env.config, drawn=True)
         self._model = model = self.scene.model

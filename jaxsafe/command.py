@@ -2,7 +2,7 @@
 
 Hydra composes the settings; the overrides are checked before it sees them, because its own errors
 are long. `envs` and `algos` are the two registries, handed in as modules: `envs` has `ENVS`,
-`canonical`, `env_defaults`, `make` and a submodule `render`; `algos` has `ALGOS`.
+`canonical`, `load`, `env_defaults`, `make` and a submodule `render`; `algos` has `ALGOS`.
 """
 
 import argparse
@@ -84,6 +84,11 @@ class Settings(NamedTuple):
     train: runner.TrainConfig
 
     @property
+    def label(self) -> str:
+        """What folders of such runs are called."""
+        return f"{self.env_name}-{self.algo_name}".replace(":", ".")
+
+    @property
     def algo(self) -> Any:
         """The first setting, for what all have in common."""
         return self.configs[0]
@@ -135,6 +140,8 @@ def read_arguments(argv: list[str], envs: Any, algos: Any) -> Request:
         flags.remove(text)
     overrides = [parse(text) for text in args.overrides]
     given = {o.key_or_group: o for o in overrides}
+    for name in values(given["env"]) if "env" in given else ():
+        load_own(str(name), envs)
     base = dataclasses.asdict(runner.TrainConfig())
     if args.multirun and given.keys() & {*distributed.OPTIONS}:
         raise ConfigError(f"{', '.join(distributed.OPTIONS)} are for one run, without --multirun")
@@ -192,6 +199,13 @@ def parse(text: str) -> Override:
 
 def values(override: Override) -> list[Any]:
     return list(override.sweep_iterator()) if override.is_sweep_override() else [override.value()]
+
+
+def load_own(name: str, envs: Any) -> None:
+    """Import the environment `name` if it is 'module:name'. Only for a name that the user gave: what a
+    run folder names is never imported."""
+    if ":" in name:
+        envs.load(name)
 
 
 def check_key(
@@ -364,7 +378,7 @@ def choose_folder(
         folder = Path(train.resume).expanduser()
         compare(settings, folder, envs, algos)
         return folder
-    home = Path("runs") / f"{settings.env_name}-{settings.algo_name}"
+    home = Path("runs") / settings.label
     if train.run_dir is None:
         if train.resume:
             for folder in sorted((p.parent for p in home.glob("*/config.yaml")), reverse=True):
@@ -472,7 +486,7 @@ def run(
     begun = distributed.first(np.array(run_folder.progress(folder) is not None))
     if train.init_from is not None and not begun:
         adapt = warm_start(settings, program, envs, algos, report.line)
-    engine = env.engine  # type: ignore[attr-defined]
+    engine = getattr(env, "engine", None)  # Safety Gym's environments have one
     try:
         if distributed.leads():
             folder.mkdir(parents=True, exist_ok=True)
@@ -485,10 +499,11 @@ def run(
     where = runner.device_name() + (f" x {train.devices}" if train.devices > 1 else "")
     if jax.process_count() > 1:
         where += f" in {jax.process_count()} processes"
+    where += f", engine {engine}" if engine else ""
     kernels = ", and a minute of Warp's kernels the first time" * (engine == "warp")
     report.line(
         f"jaxsafe {jaxsafe.__version__} | {settings.env_name} | {settings.algo_name} | "
-        f"{several}{seeds} | {where}, engine {engine} | compiling rollout and update{kernels} ..."
+        f"{several}{seeds} | {where} | compiling rollout and update{kernels} ..."
     )
     outcome = runner.train(program, train, folder, report, again, adapt)
     distributed.leave()
@@ -683,6 +698,7 @@ def train_main(envs: Any, algos: Any) -> int:
                 folder = agree_on_folder(settings, envs, algos, number, report.line)
                 env, program = prepare(settings, envs, algos)
                 again = f"python scripts/train.py resume={shlex.quote(str(folder))}"
+                again += f" env={settings.env_name}" if ":" in settings.env_name else ""
                 again += f" in each of the {at.count} processes" if at else ""
                 return run(settings, env, program, folder, envs, algos, report, again)
 
@@ -739,13 +755,28 @@ def run_parser(description: str) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=description)
     parser.error = fail  # type: ignore[method-assign]
     parser.add_argument("run", type=Path, metavar="RUN", help="a run folder")
+    parser.add_argument(
+        "env", nargs="?", metavar="env=MODULE:NAME", help="where the run's environment is code of yours"
+    )
     parser.add_argument("--seed", type=int, default=1, help="of the fresh episodes (default 1)")
     return parser
 
 
-def open_run(folder: Path, envs: Any, algos: Any) -> tuple[Settings, Env, Algorithm, PyTree]:
-    """Settings, environment, algorithm and train states of a run folder. Executes nothing from it."""
-    settings = settle(run_folder.read_config(folder), envs, algos)
+def open_run(
+    folder: Path, again: str | None, envs: Any, algos: Any
+) -> tuple[Settings, Env, Algorithm, PyTree]:
+    """Settings, environment, algorithm and train states of a run folder. Executes nothing from it.
+
+    Args:
+        again: None, or 'env=module:name', the run's environment, which is then imported.
+    """
+    saved = run_folder.read_config(folder)
+    if again is not None:
+        name = again.removeprefix("env=")
+        if name != saved["env"]["name"]:
+            raise ConfigError(f"{again}: {folder} was trained with env={saved['env']['name']}")
+        load_own(name, envs)
+    settings = settle(saved, envs, algos)
     if not checkpoint.checkpoints(folder / "checkpoints"):
         raise ConfigError(f"{folder} holds no checkpoint")
     env = make_env(settings, envs)
@@ -762,7 +793,7 @@ def evaluate_main(envs: Any, algos: Any) -> int:
         if args.episodes < 1 or args.seed < 0:
             raise ConfigError("--episodes must be at least 1 and --seed at least 0")
         runner.use_compilation_cache()
-        settings, _, algo, ts = open_run(args.run, envs, algos)
+        settings, _, algo, ts = open_run(args.run, args.env, envs, algos)
         alone = len(settings.configs) == 1
         print(
             f"{settings.env_name} | {settings.algo_name} | "
@@ -793,7 +824,7 @@ def render_main(envs: Any, algos: Any) -> int:
         out = args.out or args.run / "video.mp4"
         if out.suffix not in (".mp4", ".gif"):
             raise ConfigError(f"--out {out}: expected a name that ends in .mp4 or .gif")
-        settings, env, algo, states = open_run(args.run, envs, algos)
+        settings, env, algo, states = open_run(args.run, args.env, envs, algos)
         if not 0 <= args.index < (rows := len(settings.configs) * settings.train.num_seeds):
             raise ConfigError(f"--index {args.index}: the run has {rows} policies")
         ts = jax.tree.map(lambda x: x[args.index], states)

@@ -66,7 +66,7 @@ def read_config(folder: Path) -> dict[str, Any]:
     return config
 
 
-def append_versions(folder: Path, device: str, engine: str) -> None:
+def append_versions(folder: Path, device: str, engine: str | None) -> None:
     """Add this start of the run to versions.json."""
     path = folder / "versions.json"
     try:

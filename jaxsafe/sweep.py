@@ -106,7 +106,7 @@ def read(texts: list[str], envs: Any, algos: Any) -> Sweep:
         command.make_env(settings, envs)
         on_policy.check(settings.algo)
         rest = [t for t in texts if not t.startswith(("env=", "algo="))]
-        name = "-".join([f"{i:03d}", settings.env_name, settings.algo_name, *rest])
+        name = "-".join([f"{i:03d}", settings.label, *rest])
         groups[re.sub(r"[^\w.=+-]+", "_", name)[:100]] = settings
     parallel = own.get("max_parallel")
     if parallel is not None and not (parallel.isdigit() and int(parallel)):
@@ -137,7 +137,7 @@ def default_folder(groups: dict[str, Settings]) -> Path:
     first = next(iter(groups.values()))
     text = json.dumps([identity(s) for s in groups.values()], sort_keys=True)
     digest = hashlib.sha256(text.encode()).hexdigest()[:8]
-    return Path("runs") / f"sweep-{first.env_name}-{first.algo_name}-{digest}"
+    return Path("runs") / f"sweep-{first.label}-{digest}"
 
 
 # ---- the folder ------------------------------------------------------------------------------
@@ -341,6 +341,8 @@ def main(envs: Any, algos: Any) -> int:
         parser.add_argument("--summary", type=Path, metavar="SWEEP", help="only rewrite its summary")
         args = parser.parse_args()
         if args.summary:
+            for text in args.options:
+                command.load_own(text.removeprefix("env="), envs)
             print(summarise(args.summary, envs, algos), end="")
             return 0
         asked, report = read(args.options, envs, algos), Report()
