@@ -1,8 +1,9 @@
 """Measure environments and fused training: python scripts/benchmark.py point_goal1 --num-envs 1024
 
 Each row is one program, compiled apart from its runs: the median of `--repeats` runs, after as many
-as make `--warmup` steps of each environment: fresh layouts, where nothing touches yet, are faster. With `--algo` a row is the algorithm's whole update, else random actions, resets
-included. A physics step is one substep; the forward pass at the end of a step is not counted.
+as make `--warmup` steps of each environment: fresh layouts, where nothing touches yet, are faster.
+With `--algo` a row is the algorithm's whole update, else random actions, resets included. A physics
+step is one substep; the forward pass at the end of a step is not counted.
 """
 
 import argparse

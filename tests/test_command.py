@@ -292,7 +292,7 @@ def test_a_full_disk_ends_training_in_one_line(tmp_path):
     assert checkpoint.load(tmp_path / "run" / "checkpoints")[1].iteration > 0
 
 
-@pytest.mark.parametrize("num_seeds", [1, 2])
+@pytest.mark.parametrize("num_seeds", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_two_devices_share_seeds_or_the_environments_of_one(finished, tmp_path, monkeypatch, num_seeds):
     monkeypatch.setenv("JAX_NUM_CPU_DEVICES", "2")
     args = (*SMALL, "run_dir=run", "devices=2", f"num_seeds={num_seeds}")
