@@ -53,7 +53,7 @@ def capsule_box(capsule: Any, box: Any) -> Collision:
 
 
 def rod_box(rod: Any, box: Any, cap: float) -> Collision:
-    """The contact of a rod and a box, or two where the rod's side lies flat.
+    """The contact of a rod and a box, or two where the rod lies along a face or an edge.
 
     The rod is a cylinder (cap 0), or a capsule (cap 1): a segment with a ball around each point.
     Along a unit vector n from rod to box they are s(n) apart, the gap between the box's nearest
@@ -72,19 +72,18 @@ def rod_box(rod: Any, box: Any, cap: float) -> Collision:
         across *= jnp.minimum(1.0, radius / jnp.maximum(jnp.linalg.norm(across), 1e-9))
         return centre + axis * jnp.clip(along.dot(axis), -half, half) + across
 
-    def between(radius: jax.Array, half: jax.Array) -> jax.Array:
-        """The line from a thinner rod's closest point to the box's; 0 where they overlap."""
+    def closest(inset: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """The closest points of a rod thinner by `inset` (a cylinder also shorter) and of the box."""
+        thin, short = radius - jnp.maximum(inset, cap * radius), half - (1 - cap) * inset
         point = centre
         for _ in range(PROJECTIONS):
-            point = project(jnp.clip(point, -extent, extent), radius, half)
-        return jnp.clip(point, -extent, extent) - point
+            point = project(jnp.clip(point, -extent, extent), thin, short)
+        return point, jnp.clip(point, -extent, extent)
 
-    inset = (1 - cap) * jnp.minimum(radius, half)
-    thinner = [(1 - cap) * radius - x * inset for x in (1.0, 0.5, 0.1)], [1.0, 0.5, 0.1]
+    pairs = [closest(share * jnp.minimum(radius, half)) for share in (1.0, 0.5, 0.1)]
     lines = jnp.stack([*jnp.eye(3), axis, *jnp.cross(jnp.eye(3), axis)])
     lines = jnp.where((lines @ centre > 0)[:, None], -lines, lines)
-    closest = [between(r, half - x * inset) for r, x in zip(*thinner, strict=True)]
-    lines = jnp.concatenate([lines, jnp.stack(closest)])
+    lines = jnp.concatenate([lines, jnp.stack([on_box - on_rod for on_rod, on_box in pairs])])
     lengths = jnp.linalg.norm(lines, axis=1)
     lines /= jnp.maximum(lengths, 1e-9)[:, None]
     cosine = lines @ axis
@@ -94,23 +93,37 @@ def rod_box(rod: Any, box: Any, cap: float) -> Collision:
     best = jnp.argmax(jnp.where(lengths > 1e-6, apart, -jnp.inf))
     n, dist = lines[best], apart[best]
 
-    # the rod's farthest point along n; where its side lies flat, both ends of the line of contact
+    # Where on the axis they touch: at one point, or from end to end of what lies on a face or edge,
+    # which the box's axes span that n does not see.
+    lean = n.dot(axis)
+    outward = axis - lean * n
+    free = jnp.abs(n) < FLAT
+    lies = jnp.linalg.norm(jnp.where(free, 0.0, outward)) < FLAT
+    slope = jnp.where(jnp.abs(axis) < 1e-6, 1e-6, axis)
+    bounds = jnp.sort(jnp.stack([-extent - centre, extent - centre]) / slope, axis=0)
+    low = jnp.max(jnp.where(free, bounds[0], -half), initial=-half)
+    high = jnp.min(jnp.where(free, bounds[1], half), initial=half)
+    point = jnp.clip((pairs[0][1] - centre).dot(axis), -half, half)
+    point = jnp.where(jnp.abs(lean) > FLAT, jnp.sign(lean) * half, point)
+    ends = jnp.where(lies & (low < high), jnp.stack([low, high]), point)
+    rise = jnp.max(ends * lean) - ends * lean  # of the rod's side over the box, from the deepest end
+    second = lies & (low < high)
+
+    # from the axis to the rod's farthest point along n
+    across = n - lean * axis
+    steep = jnp.linalg.norm(across)
     towards = jnp.clip(centre, -extent, extent) - centre
-    lean, outward = n.dot(axis), n - axis * n.dot(axis)
-    width, middle = jnp.abs(axis) @ extent, -centre.dot(axis)  # of the box, seen along the axis
-    line = jnp.clip(jnp.stack([middle - width, middle + width]), -half, half)
-    flat = jnp.abs(lean) < FLAT
-    ends = jnp.where(flat, line, jnp.sign(lean) * half)
     inner = towards - axis * towards.dot(axis)
     inner *= jnp.minimum(1.0, radius / jnp.maximum(jnp.linalg.norm(inner), 1e-9))
-    slope = jnp.linalg.norm(outward)
-    side = jnp.where(slope > FLAT, radius * outward / jnp.maximum(slope, 1e-9), inner)
+    side = jnp.where(steep > FLAT, radius * across / jnp.maximum(steep, 1e-9), inner)
     side = jnp.where(cap > 0, radius * n, side)
-    pos = centre + side + 0.5 * dist * n + ends[:, None] * axis
+
+    dists = dist + rise
+    pos = centre + side + 0.5 * dists[:, None] * n + ends[:, None] * axis
     frame = math.make_frame(box.mat @ n)
     none = 1.0  # m, a contact that is not there
     return (
-        jnp.stack([dist, jnp.where(flat, dist, none)]),
+        jnp.where(jnp.stack([True, second]), dists, none),
         box.pos + pos @ box.mat.T,
         jnp.stack([frame, frame]),
     )
