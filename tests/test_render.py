@@ -90,14 +90,15 @@ def test_bodies_hazards_and_the_robot_are_drawn_where_the_state_has_them(display
     assert red > max(green, blue) + 60
 
 
-def test_the_active_button_alone_is_marked(display):
+def test_the_active_button_alone_is_marked_in_orange(display):
     env, state = reset("point_button0", render_lidar_markers=False)
     renderer = render.Renderer(env, WIDTH, HEIGHT, from_above())
     for active in range(2):
         world = state.physics.replace(goal_button=jnp.int32(active))
-        green = greenness(renderer.frame(state.replace(physics=world)))
+        red, _, blue = np.moveaxis(renderer.frame(state.replace(physics=world)).astype(int), -1, 0)
         beside = env.positions(world, "buttons") + jnp.array([0.15, 0.0])
-        assert [bool(green[pixel(xy)] > 30) for xy in beside[:2]] == [active == 0, active == 1]
+        marked = [bool((red - blue)[pixel(xy)] > 30) for xy in beside[:2]]
+        assert marked == [active == 0, active == 1]
 
 
 def test_a_cost_turns_on_the_red_light(display):
@@ -126,6 +127,60 @@ def test_the_halo_shows_the_lidars_of_the_observation(display, flat):
     plain = render.Renderer(reset("point_goal1", render_lidar_markers=False)[0], WIDTH, HEIGHT)
     plain.frame(state)
     assert with_halo - plain._geoms.ngeom == 3 * env.config.lidar_num_bins  # goal, hazards, vases
+
+
+def marks(env, state) -> list[Any]:
+    """The geoms over a scene without bodies."""
+    stage, geoms = render.Stage(env), mujoco.MjvScene(mujoco.MjModel.from_xml_string("<mujoco/>"), 500)  # type: ignore[attr-defined]
+    stage.move(state.physics)
+    stage.mark(geoms, state)
+    return list(geoms.geoms[: geoms.ngeom])
+
+
+def test_halo_and_cost_light_have_the_places_and_colours_of_the_original():
+    options: Any = {"robot_locations": ((0.0, 0.0),), "robot_keepout": 0.0, "robot_rot": 0.0}
+    env, state = reset("point_goal0", observe_goal_comp=True, **options)
+    parts = {name: np.zeros(shape) for name, shape in env.observation_spec.items()}
+    parts["goal_compass"][1] = 1.0  # it points left
+    parts["goal_lidar"][:2] = 0.5, 0.95
+    obs = np.concatenate([*parts.values()])
+    goal, *halo, compass, light = marks(env, state.replace(obs=obs, cost=jnp.float32(1)))
+    assert goal.size[0] == np.float32(env.config.goal_size) and len(halo) == 16
+    np.testing.assert_allclose(halo[0].pos, [0.15 * np.cos(np.pi / 16), 0.15 * np.sin(np.pi / 16), 0.6])
+    np.testing.assert_allclose(halo[0].rgba, [0, 0.6, 0, 0.6])  # COLOR_GOAL * (value + 0.1)
+    np.testing.assert_allclose(halo[1].rgba, [0, 1, 0, 1])
+    np.testing.assert_allclose(halo[2].rgba, [0, 0.1, 0, 0.1])
+    np.testing.assert_allclose(compass.pos, [0, 0.15, 0.6], atol=1e-7)
+    np.testing.assert_allclose((compass.size[0], light.size[0]), (0.05, 0.25))
+    np.testing.assert_allclose(light.rgba, [0.5, 0, 0, 0.5])
+    np.testing.assert_allclose(light.pos, [0, 0, 0.1], atol=1e-7)
+
+
+def test_panels_stand_side_by_side_and_a_short_film_waits_at_its_end():
+    long = [np.full((4, 6, 3), i, np.uint8) for i in range(3)]
+    short = [np.full((4, 6, 3), 100 + i, np.uint8) for i in range(2)]
+    frames = render.side_by_side([long, short])
+    assert [frame.shape for frame in frames] == 3 * [(4, 12 + render.GAP, 3)]
+    assert [(frame[0, 0, 0], frame[0, -1, 0]) for frame in frames] == [(0, 100), (1, 101), (2, 101)]
+    np.testing.assert_array_equal(render.side_by_side([long]), long)
+
+
+def test_a_caption_says_what_an_episode_has_earned_and_cost(display, monkeypatch):
+    said = []
+    monkeypatch.setattr(render, "captioned", lambda frame, text: said.append(text) or frame)
+    env, _ = reset("point_goal0", num_steps=4)
+    act = lambda obs, key: jnp.array([1.0, 0.0])  # noqa: E731
+    states = render.run_episode(env, act, jax.random.key(3), 4)
+    monkeypatch.setattr(render, "run_episode", lambda *args: states)
+    render.render_episode(env, act, jax.random.key(3), every=2, label="cpo", width=64, height=48)
+    returns = np.cumsum(states.reward)
+    assert said == [f"cpo   return {returns[t]:.1f}   cost 0" for t in (0, 2, 4)]
+    frame = np.zeros((48, 200, 3), np.uint8)
+    monkeypatch.undo()
+    drawn = render.captioned(frame, "cpo")
+    assert drawn.shape == (48 + render.CAPTION, 200, 3) and (drawn[render.CAPTION :] == 0).all()
+    line = drawn[: render.CAPTION]  # black on white
+    assert 20 < (line < 128).sum() < line.size / 4
 
 
 def test_what_an_algorithm_appends_to_an_observation_is_not_drawn():
