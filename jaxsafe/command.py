@@ -2,7 +2,8 @@
 
 Hydra composes the settings; the overrides are checked before it sees them, because its own errors
 are long. `envs` and `algos` are the two registries, handed in as modules: `envs` has `ENVS`,
-`canonical`, `load`, `env_defaults`, `make` and a submodule `render`; `algos` has `ALGOS`.
+`canonical`, `load`, `env_defaults`, `make` and the submodules
+`render` and `watch`; `algos` has `ALGOS`.
 """
 
 import argparse
@@ -616,7 +617,7 @@ def finish(settings: Settings, env: Env, envs: Any, algos: Any, folder: Path, re
     def video() -> None:
         algo, ts = policy()
         first = jax.tree.map(lambda x: x[0], ts)
-        film(envs, env, algo, first, folder / "video.mp4", train.seed)
+        film(envs, [Actor(settings, env, algo, first)], folder / "video.mp4", train.seed)
 
     wanted = {
         "curves": (curves, True),
@@ -631,8 +632,23 @@ def finish(settings: Settings, env: Env, envs: Any, algos: Any, folder: Path, re
             report.line(f"no {name}: {one_line(error)}")
 
 
-def film(envs: Any, env: Env, algo: Algorithm, ts: PyTree, path: Path, seed: int) -> None:
-    """Write one episode of the deterministic policy as a video.
+class Actor(NamedTuple):
+    """One policy of a run, ready to act. `ts` is the train state of that member alone."""
+
+    settings: Settings
+    env: Env
+    algo: Algorithm
+    ts: PyTree
+
+    def act(self, obs: jax.Array, key: jax.Array | None = None) -> jax.Array:
+        """The deterministic action [A]; what a film calls."""
+        return self.algo.act(self.ts, obs, None)
+
+
+def film(
+    envs: Any, actors: list[Actor], path: Path, seed: int, labels: list[str] | None = None
+) -> None:
+    """Write one episode of each deterministic policy as a video, side by side in labelled panels.
 
     The renderer is imported late: it looks for a display.
 
@@ -640,16 +656,15 @@ def film(envs: Any, env: Env, algo: Algorithm, ts: PyTree, path: Path, seed: int
         NoVideo: this machine has neither EGL nor OSMesa.
     """
     render = importlib.import_module(f"{envs.__name__}.render")
+    key = jax.random.fold_in(jax.random.key(seed), 0x66696C6D)
     try:
-        frames = render.render_episode(
-            env,
-            lambda obs, _: algo.act(ts, obs, None),
-            jax.random.fold_in(jax.random.key(seed), 0x66696C6D),
-            task=algo.task(ts),
-        )
+        films = [
+            render.render_episode(a.env, a.act, key, task=a.algo.task(a.ts), label=label)
+            for a, label in zip(actors, labels or [None] * len(actors), strict=True)
+        ]
     except render.NoDisplay as error:
         raise NoVideo(one_line(error)) from error
-    render.write_video(frames, path, fps=30)
+    render.write_video(render.side_by_side(films), path, fps=30)
 
 
 def policy_of(settings: Settings, env: Env, algos: Any, folder: Path) -> tuple[Algorithm, PyTree]:
@@ -806,30 +821,6 @@ def evaluate_main(envs: Any, algos: Any) -> int:
             if not alone:
                 print(f"\n{s.name} | cost limit {s.cost_limit:g}")
             print(evaluation.table(s.rows))
-        return 0
-
-    return guarded(command)
-
-
-def render_main(envs: Any, algos: Any) -> int:
-    """scripts/render.py."""
-
-    def command() -> int:
-        parser = run_parser("Film one episode of the policy of a run.")
-        parser.add_argument("--out", type=Path, help="an .mp4 or .gif (default RUN/video.mp4)")
-        parser.add_argument(
-            "--index", type=int, default=0, help="which of the run's policies (default 0)"
-        )
-        args = parser.parse_args()
-        out = args.out or args.run / "video.mp4"
-        if out.suffix not in (".mp4", ".gif"):
-            raise ConfigError(f"--out {out}: expected a name that ends in .mp4 or .gif")
-        settings, env, algo, states = open_run(args.run, args.env, envs, algos)
-        if not 0 <= args.index < (rows := len(settings.configs) * settings.train.num_seeds):
-            raise ConfigError(f"--index {args.index}: the run has {rows} policies")
-        ts = jax.tree.map(lambda x: x[args.index], states)
-        film(envs, env, algo, ts, out, args.seed)
-        print(out)
         return 0
 
     return guarded(command)

@@ -18,7 +18,7 @@ import pytest
 import yaml
 from tasks import FAST
 
-from jaxsafe import algos, checkpoint, command, envs, run_folder, runner
+from jaxsafe import algos, checkpoint, command, envs, run_folder, runner, viewing
 from jaxsafe.config import ConfigError
 
 SCRIPTS = Path(__file__).parent.parent / "scripts"
@@ -272,8 +272,8 @@ def test_the_policy_of_a_run_is_read_whatever_its_minibatches_divide(tmp_path, n
     assert all((x == 1).all() for x in jax.tree.leaves((ts.params, ts.normaliser, ts.dual)))
 
 
-def test_evaluate_and_render_refuse_a_bad_folder_in_one_line(tmp_path, monkeypatch, capsys):
-    for main in (command.evaluate_main, command.render_main):
+def test_evaluate_render_and_watch_refuse_a_bad_folder_in_one_line(tmp_path, monkeypatch, capsys):
+    for main in (command.evaluate_main, viewing.render_main, viewing.watch_main):
         monkeypatch.setattr(sys, "argv", ["script", str(tmp_path)])
         assert main(envs, algos) == 2
         assert (
