@@ -89,6 +89,8 @@ def canonical(name: str) -> str:
             f"{name} is code, which is not imported because a file names it; if you trust it, add "
             f"env={name}"
         )
+    if ours := suite.safety_gymnasium(name):
+        raise ConfigError(f"{name} is env={ours} env.rules=safety_gymnasium")
     raise ConfigError(f"unknown environment {name!r}{nearest(name, [*ENVS, *ALIASES])}")
 
 

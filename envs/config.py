@@ -6,6 +6,7 @@ Learning", and the Engine of the authors' package `safety_gym`.
 
 import dataclasses
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 from jaxsafe.config import ConfigError, from_dict, nearest
@@ -16,6 +17,10 @@ Rectangles = tuple[Rectangle, ...]
 Points = tuple[Point2, ...]
 
 TASKS = ("goal", "button", "push", "x", "z", "circle", "none")
+# Observations that Safety-Gymnasium does not have.
+OURS_ALONE = tuple(
+    f"observe_{part}" for part in ["goal_dist", "remaining", "qpos", "qvel", "ctrl", "freejoint", "com"]
+)
 KINDS = ("hazards", "vases", "pillars", "buttons", "gremlins", "walls")
 
 
@@ -27,6 +32,7 @@ class SafetyGymConfig:
     positions of the first objects of a kind, `*_keepout` the radius that stays free around each.
     """
 
+    rules: Literal["safety_gym", "safety_gymnasium"] = "safety_gym"  # ours: whose, where they differ
     # Episode
     num_steps: int = 1000  # time limit
     action_noise: float = 0.0  # standard deviation, added after the action is clipped
@@ -198,8 +204,25 @@ def defaults(**overrides: Any) -> dict[str, Any]:
     return dataclasses.asdict(SafetyGymConfig()) | overrides
 
 
+def check_rules(cfg: SafetyGymConfig) -> None:
+    """Raise `ConfigError` for what Safety-Gymnasium has not, or has another way than we do."""
+    unlike = [
+        ("robot_base", Path(cfg.robot_base).stem == "doggo", "its Doggo is another, half as long"),
+        ("task", cfg.task not in ("goal", "button", "push"), "we follow its goal, button and push"),
+        ("lidar_type", cfg.lidar_type == "natural", "its natural lidar does not see the goal"),
+        ("walls_num", cfg.walls_num > 0, "its tasks have no such walls"),
+        *((name, getattr(cfg, name), "it has no such observation") for name in OURS_ALONE),
+    ]
+    for name, found, reason in unlike:
+        if found:
+            value = getattr(cfg, name)
+            raise ConfigError(f"env.{name}={value} with env.rules=safety_gymnasium: {reason}")
+
+
 def check(cfg: SafetyGymConfig) -> None:
     """Raise `ConfigError` for a config that no episode could be drawn from."""
+    if cfg.rules == "safety_gymnasium":
+        check_rules(cfg)
     if cfg.observe_vision:
         raise ConfigError("env.observe_vision=true: vision is not available yet; use the lidars")
     if cfg.task not in TASKS:

@@ -12,12 +12,26 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsafe.config import ConfigError
-from jaxsafe.envs.config import Rectangle, SafetyGymConfig
+from jaxsafe.envs.config import KINDS, Rectangle, SafetyGymConfig
 
 DRAWS_PER_OBJECT = 100
 LAYOUTS = 10_000
 LAYOUT_BATCH = 100  # layouts examined at once before training
 GOAL_DRAWS = 10_000
+ORDER = {  # of placing
+    "safety_gym": [
+        "robot",
+        "walls",
+        "goal",
+        "box",
+        "buttons",
+        "hazards",
+        "vases",
+        "pillars",
+        "gremlins",
+    ],
+    "safety_gymnasium": ["robot", "buttons", "goal", "hazards", "pillars", "vases", "box", "gremlins"],
+}
 GOAL_BATCH = 16  # draws of a new goal examined at once
 
 
@@ -49,10 +63,14 @@ def placement(cfg: SafetyGymConfig) -> Placement:
     Raises:
         ConfigError: an object whose rectangles vanish when shrunk by its keepout.
     """
-    kinds = ["robot", *["walls"] * cfg.walls_num]
-    kinds += ["goal"] * (cfg.task in ("goal", "push")) + ["box"] * (cfg.task == "push")
-    for kind in ("buttons", "hazards", "vases", "pillars", "gremlins"):
-        kinds += [kind] * getattr(cfg, f"{kind}_num")
+    theirs = cfg.rules == "safety_gymnasium"  # there a mark of the goal lies among the buttons, too
+    counts = {kind: getattr(cfg, f"{kind}_num") for kind in KINDS}
+    counts |= {
+        "robot": 1,
+        "goal": cfg.task in ("goal", "push") or (theirs and cfg.task == "button"),
+        "box": cfg.task == "push",
+    }
+    kinds = [kind for kind in ORDER[cfg.rules] for _ in range(counts[kind])]
     names, rectangles = [], []
     for i, kind in enumerate(kinds):
         number = i - kinds.index(kind)

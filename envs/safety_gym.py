@@ -10,6 +10,7 @@ good state; neither a goal nor a layout that finds no room raises while stepping
 ends, the layout is used as the last of its 10,000 tries left it (`make` refuses hopeless ones).
 """
 
+from collections.abc import Iterable
 from functools import cached_property
 
 import flax.struct
@@ -28,6 +29,12 @@ from jaxsafe.envs.physics import Physics, Readings
 from jaxsafe.types import State
 
 MAX_VALUE = 1e10  # MuJoCo's mjMAXVAL: beyond it a state is bad
+JOINT_SENSORS = (  # in the order in which Safety-Gymnasium observes them
+    mujoco.mjtSensor.mjSENS_JOINTVEL,
+    mujoco.mjtSensor.mjSENS_BALLANGVEL,
+    mujoco.mjtSensor.mjSENS_JOINTPOS,
+    mujoco.mjtSensor.mjSENS_BALLQUAT,
+)
 COSTS = (
     "vases_contact",
     "pillars",
@@ -64,8 +71,9 @@ class World:
 class SafetyGym:
     """One task. Pure functions `reset(key)` and `step(state, action)`; callers `vmap`.
 
-    Observation float [obs_size]: the components of `observation_spec` in the order of their names
-    (a dict of them if `observation_flatten` is False). Action float [action_size] in [-1, 1], clipped.
+    Observation float [obs_size]: the components of `observation_spec` in its order, which is that of
+    their names (a dict of them if `observation_flatten` is False) unless `rules` says otherwise.
+    Action float [action_size] in [-1, 1], clipped.
     `observation_spec` has the shape of each component, in their order. `cost` is what Safety Gym
     calls `cost`; `costs` are its parts, `cost_names` their names.
 
@@ -100,7 +108,9 @@ class SafetyGym:
         with jax.ensure_compile_time_eval():
             world, readings, ctrl = jax.eval_shape(self._begin, jax.random.key(0))
             parts = jax.eval_shape(self._components, world, readings, ctrl)
-        self.observation_spec: dict[str, tuple[int, ...]] = {k: v.shape for k, v in parts.items()}
+        self.observation_spec: dict[str, tuple[int, ...]] = {
+            name: parts[name].shape for name in self._in_order(parts)
+        }
         self.obs_size = sum(int(np.prod(shape)) for shape in self.observation_spec.values())
 
     # What learners ask -----------------------------------------------------------------------------
@@ -207,7 +217,9 @@ class SafetyGym:
         world = self.world_at(xy, headings, key)
         if self._goal_kind:  # the first goal is discarded, a quirk of the original
             world, _ = self._next_goal(world, goal_key, jnp.bool_(True))
-            world = world.replace(buttons_timer=jnp.int32(0))
+            theirs = cfg.rules == "safety_gymnasium"
+            delay = cfg.buttons_resampling_delay if theirs else 0
+            world = world.replace(buttons_timer=jnp.int32(delay))
         ctrl = jnp.zeros(self.action_size)
         physics, readings = self._engine.forward(world.physics, ctrl, jnp.int32(0))
         world = world.replace(physics=physics)
@@ -436,7 +448,7 @@ class SafetyGym:
         return jnp.concatenate([parts[name].reshape(-1) for name in parts])
 
     def _components(self, world: World, readings: Readings, ctrl: jax.Array) -> dict[str, jax.Array]:
-        """Every observed component by name, sorted."""
+        """Every observed component by name, in order."""
         cfg = self.config
         position, rotation = self.robot_pose(world)
         goal = self.goal_position(world)
@@ -464,7 +476,18 @@ class SafetyGym:
             parts["freejoint"] = world.physics.qpos[:7]
         if cfg.observe_com:
             parts["com"] = self._sensor(readings, "subtreecom")
-        return dict(sorted(parts.items()))
+        return {name: parts[name] for name in self._in_order(parts)}
+
+    def _in_order(self, names: Iterable[str]) -> list[str]:
+        """By name; in Safety-Gymnasium sensors, velocities and angles of joints, then kind by kind."""
+        if self.config.rules == "safety_gym":
+            return sorted(names)
+        order = list(self.config.sensors_obs)
+        for kind in JOINT_SENSORS:
+            order += [name for name, (_, found) in self._sensors.items() if found == kind]
+        for kind in layouts.ORDER[self.config.rules]:
+            order += [f"{kind}_lidar", f"{kind}_compass"]
+        return sorted(names, key=order.index)
 
     def _sensor_parts(self, readings: Readings) -> dict[str, jax.Array]:
         model, angles = self.scene.model, self.config.sensors_angle_components

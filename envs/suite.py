@@ -3,6 +3,7 @@
 Source: the authors' package `safety_gym`, `envs/suite.py`. `car_push1` is `Safexp-CarPush1-v0`.
 """
 
+import re
 from typing import Any
 
 Options = dict[str, Any]
@@ -157,3 +158,9 @@ def alias(name: str) -> str:
     head = "Testing" if task.startswith("grid") else "Safexp"
     task = task.replace("gridwall", "GridWall").capitalize() if task != "gridwall" else "GridWall"
     return f"{head}-{robot.capitalize()}{task}-v0"
+
+
+def safety_gymnasium(name: str) -> str | None:
+    """Our name of Safety-Gymnasium's id, where `rules="safety_gymnasium"` makes our task that one."""
+    found = re.fullmatch(r"Safety(Point|Car)((?:Goal|Button|Push)[012])(?:Gymnasium)?-v0", name)
+    return f"{found[1]}_{found[2]}".lower() if found else None

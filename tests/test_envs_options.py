@@ -52,6 +52,7 @@ BASES: dict[str, tuple[str, dict[str, Any]]] = {
 }
 RECTANGLE = ((-0.9, -0.9, 0.9, 0.8),)
 READ: dict[str, tuple[str, Any]] = {  # option: base, and a value other than the base's
+    "rules": ("button", "safety_gymnasium"),
     "num_steps": ("plain", 7),
     "action_noise": ("plain", 5.0),
     "placements_extents": ("plain", (-2.0, -1.0, 1.0, 1.0)),

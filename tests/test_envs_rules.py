@@ -1,0 +1,114 @@
+"""`rules=safety_gymnasium`: each difference from Safety Gym, worked out by hand."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tasks import HERE, change, task
+
+from jaxsafe import envs
+from jaxsafe.config import ConfigError
+
+THEIRS: dict[str, Any] = {"rules": "safety_gymnasium"}
+TOUCHED: dict[str, Any] = {  # Point at the origin, which touches button 0
+    **HERE,
+    "constrain_buttons": True,
+    "buttons_num": 2,
+    "buttons_keepout": 0.0,
+    "goal_keepout": 0.0,
+    "buttons_locations": ((0.19, 0.0), (-0.9, 0.9)),
+}
+
+
+def test_the_buttons_of_a_new_episode_are_not_seen_and_cost_nothing_for_ten_steps():
+    """Observations 0 to 9 and the costs of steps 1 to 10, as after a success; in Safety Gym none."""
+    for rules, delay in ((THEIRS, 10), ({}, 0)):
+        t = task("point_button0", **TOUCHED, **rules)
+        state = t.begin()
+        state = change(state, goal_button=jnp.ones(4, jnp.int32))
+        touching = {k: getattr(state.physics.physics, k) for k in ("qpos", "qvel", "warmstart")}
+        seen, costs = [], []
+        for _ in range(12):
+            seen.append(bool(t.part(state, "buttons_lidar").any()))
+            state = t.idle(change(state, touching))
+            costs.append(float(state.cost[0]))
+        assert seen == [i >= delay for i in range(12)]
+        assert costs == [float(i >= delay) for i in range(12)]
+
+
+def test_a_mark_of_the_goal_lies_among_the_buttons_and_keeps_its_distance():
+    """Keepouts: 0.4 m, like the robot's and the gremlins'; a button's 0.2 m, a hazard's 0.18 m."""
+    theirs = task("point_button1", **THEIRS)
+    assert theirs.env.place.names == (
+        "robot",
+        *(f"button{i}" for i in range(4)),
+        "goal",
+        *(f"hazard{i}" for i in range(4)),
+        *(f"gremlin{i}" for i in range(4)),
+    )
+    layout = np.asarray(theirs.begin().physics.layout)
+    distance = np.linalg.norm(layout - layout[:, 5:6], axis=-1)
+    nearest = np.array([0.8, *[0.6] * 4, 0.0, *[0.58] * 4, *[0.8] * 4])
+    assert (distance >= nearest - 1e-6).all()
+    assert "goal" not in task("point_button1").env.place.names
+
+
+def test_the_goal_seen_is_the_button_to_press_and_not_the_mark():
+    t = task("point_button1", **THEIRS)
+    world = jax.tree.map(lambda x: x[0], t.begin().physics)
+    button = world.layout[t.env.place.slice("buttons")][world.goal_button]
+    np.testing.assert_allclose(t.env.goal_position(world)[:2], button)
+
+
+def test_the_box_is_placed_last():
+    names = envs.make("point_push2", engine="c", **THEIRS).place.kinds
+    assert names == ("robot", "goal", *["hazards"] * 4, *["pillars"] * 4, "box")
+    names = envs.make("point_push2", engine="c").place.kinds
+    assert names == ("robot", "goal", "box", *["hazards"] * 4, *["pillars"] * 4)
+
+
+@pytest.mark.parametrize(
+    "name, parts",
+    [
+        ("car_goal2", "ballangvel_rear ballquat_rear goal_lidar hazards_lidar vases_lidar"),
+        ("point_button2", "buttons_lidar goal_lidar hazards_lidar gremlins_lidar"),
+        ("point_push1", "goal_lidar hazards_lidar pillars_lidar box_lidar"),
+    ],
+)
+def test_observations_are_in_the_order_of_adding(name, parts):
+    env = envs.make(name, engine="c", **THEIRS)
+    order = ["accelerometer", "velocimeter", "gyro", "magnetometer", *parts.split()]
+    assert list(env.observation_spec) == order
+    assert env.obs_size == envs.make(name, engine="c").obs_size
+
+
+def test_the_flat_observation_has_the_components_in_that_order():
+    t, plain = task("point_button0", **TOUCHED, **THEIRS), task("point_button0", **TOUCHED)
+    state, ours = t.idle(t.begin()), plain.idle(plain.begin())
+    for name in ("accelerometer", "velocimeter", "gyro", "magnetometer"):
+        np.testing.assert_allclose(t.part(state, name), plain.part(ours, name), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "name, options",
+    [
+        ("doggo_goal1", {}),
+        ("point_circle", {}),
+        ("point_run", {}),
+        ("point_goal1", {"lidar_type": "natural"}),
+        ("point_goal1", {"walls_num": 1}),
+        ("point_goal1", {"observe_remaining": True}),
+    ],
+)
+def test_what_is_not_theirs_or_not_followed_is_refused(name, options):
+    with pytest.raises(ConfigError, match=r"env\.\w+=.* with env.rules=safety_gymnasium: "):
+        envs.make(name, engine="c", **THEIRS, **options)
+
+
+def test_their_ids_lead_to_the_rules():
+    with pytest.raises(ConfigError, match=r"is env=car_push2 env.rules=safety_gymnasium$"):
+        envs.make("SafetyCarPush2-v0")
+    with pytest.raises(ConfigError, match="did you mean 'Safexp-DoggoGoal1-v0'"):
+        envs.make("SafetyDoggoGoal1-v0")
