@@ -1,14 +1,15 @@
-"""Write the README's tables from the registries: python docs/tables.py
+"""Write the tables of the README and of the docs from the code: python docs/tables.py
 
-Each table stands between <!-- table: NAME --> and <!-- end -->; a test holds README.md to them.
+Each table stands between <!-- table: NAME --> and <!-- end -->; a test holds the files to them.
 """
 
 from pathlib import Path
 
 from jaxsafe.algos import ALGOS
 from jaxsafe.envs import ENVS, make
+from jaxsafe.migrate import ALGORITHMS, OMNISAFE
 
-README = Path(__file__).parent.parent / "README.md"
+HERE = Path(__file__).parent
 ROBOTS = ("point", "car", "doggo")
 
 
@@ -27,14 +28,39 @@ def algorithms() -> str:
     return "\n".join(lines + [f"| `{name}` | {entry.summary} |" for name, entry in ALGOS.items()])
 
 
-def filled(text: str) -> str:
-    """`text` with its tables made anew."""
-    for name, table in (("environments", environments()), ("algorithms", algorithms())):
+def omnisafe_algorithms() -> str:
+    lines = ["| OmniSafe | here |", "|---|---|"]
+    return "\n".join(lines + [f"| `{theirs}` | `{ours}` |" for theirs, ours in ALGORITHMS.items()])
+
+
+def omnisafe_keys() -> str:
+    """What jaxsafe/migrate.py makes of each key of OmniSafe's configs."""
+    lines = ["| OmniSafe | here | |", "|---|---|---|"]
+    for key, rule in OMNISAFE.items():
+        ours = ", ".join(f"`{option}`" for option in rule.ours.split()) or "no option"
+        lines.append(f"| `{key}` | {ours} | {rule.note} |")
+    return "\n".join(lines)
+
+
+TABLES = {
+    HERE.parent / "README.md": {"environments": environments, "algorithms": algorithms},
+    HERE / "howto" / "migrate.md": {
+        "omnisafe algorithms": omnisafe_algorithms,
+        "omnisafe keys": omnisafe_keys,
+    },
+}
+
+
+def filled(path: Path) -> str:
+    """The file's text with its tables made anew."""
+    text = path.read_text()
+    for name, table in TABLES[path].items():
         begin, end = f"<!-- table: {name} -->\n", "\n<!-- end -->"
         before, _, rest = text.partition(begin)
-        text = before + begin + table + end + rest.partition(end)[2]
+        text = before + begin + table() + end + rest.partition(end)[2]
     return text
 
 
 if __name__ == "__main__":
-    README.write_text(filled(README.read_text()))
+    for path in TABLES:
+        path.write_text(filled(path))

@@ -1,0 +1,9 @@
+"""A config of OmniSafe or Safety Gym as a command: python scripts/migrate.py omnisafe CONFIG.json"""
+
+import sys
+
+from jaxsafe import algos, envs
+from jaxsafe.migrate import main
+
+if __name__ == "__main__":
+    sys.exit(main(envs, algos))
