@@ -1,22 +1,50 @@
-"""Write a page for each algorithm, docs/algorithms/NAME.md, from the code: python docs/pages.py
+"""Write a page for each algorithm and each task from the code: python docs/pages.py
 
-Equations, source and departures are the module's docstring; settings and their origin are the lines of
-its config; results are those of docs/results. A test holds the pages to the code.
+Of an algorithm, docs/algorithms/NAME.md: equations, source and departures are the module's docstring;
+settings and their origin are the lines of its config; results are those of docs/results. Of a task,
+docs/environments/NAME.md: objects, observations and costs are the environment's, how close it is to the
+original is the tables of docs/fidelity.md. A test holds the pages to the code.
 """
 
 import dataclasses
 import importlib
 import inspect
+import math
 import re
 import sys
 from pathlib import Path
+from typing import Any
 
 from jaxsafe import run_folder
 from jaxsafe.algos import ALGOS, Entry
+from jaxsafe.envs import ENVS
 
 HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE / "results"))
-results = importlib.import_module("make")
+sys.path[:0] = [str(HERE), str(HERE / "results")]
+results, tables = importlib.import_module("make"), importlib.import_module("tables")
+TASKS = {  # what a robot is paid for
+    "goal": "Reach the goal (green), again and again: after each success it is elsewhere.",
+    "button": "Press the button that is lit (green), again and again: each success draws another.",
+    "push": "Push the box (yellow) to the goal (green), again and again.",
+    "run": "Run along x, as far as possible.",
+    "circle": "Run along a circle of 1.5 m around the origin.",
+    "grid": "Go to a goal straight ahead, once, between hazards at given places.",
+}
+ENVIRONMENTS = """# Environments
+
+`point_TASK`, `car_TASK` and `doggo_TASK`, as in `point_goal1`; Safety Gym's ids, as in
+`Safexp-PointGoal1-v0`, work too. Every option of Safety Gym's Engine but vision is `env.OPTION`, and
+[`env.rules`](../howto/safety_gymnasium.md) takes Safety-Gymnasium's rules where they differ.
+
+"""
+COSTS = {
+    "hazards": "inside a hazard (blue disc)",
+    "vases_contact": "touching a vase (light blue cube)",
+    "vases_velocity": "a vase moves, touched or not",
+    "pillars": "touching a pillar (blue column)",
+    "buttons": "pressing another button than the goal's",
+    "gremlins": "touching a gremlin (purple cube, on a circle of its own)",
+}
 
 
 def prose(docstring: str) -> tuple[str, str]:
@@ -96,11 +124,117 @@ The code: [algos/{module}.py](../../algos/{module}.py).
 """
 
 
+def fidelity(name: str) -> list[str]:
+    """The rows of docs/fidelity.md on an environment, with the engine before them."""
+    rows, engine = [], ""
+    for line in (HERE / "fidelity.md").read_text().splitlines():
+        if line.startswith("## "):
+            engine = line[3:].removeprefix("Engine ")
+        elif line.startswith(f"| {name} |") and engine.startswith("`"):
+            cells = [cell.strip() for cell in line.strip("|").split("|")]
+            rows.append(f"| {' | '.join([f'`{name}`', engine, *cells[1:5], cells[8], cells[9]])} |")
+    return rows
+
+
+def objects(env: Any) -> str:
+    cfg = env.config
+    rows = ["| | number | size, m | free around it, m | costs |", "|---|---:|---:|---:|---|"]
+    for kind in dict.fromkeys(env.place.kinds):
+        size = getattr(cfg, f"{kind}_size", None)
+        number, keepout = env.place.kinds.count(kind), getattr(cfg, f"{kind}_keepout")
+        paid = any(name.startswith(kind) for name in env.cost_names)
+        cells = [kind, number, "" if size is None else size, keepout, "yes" if paid else "no"]
+        rows.append(f"| {' | '.join(map(str, cells))} |")
+    return "\n".join(rows)
+
+
+def observed(env: Any) -> dict[str, int]:
+    """Sizes of the components; those of a robot's joints and feet together."""
+    found: dict[str, int] = {}
+    for name, shape in env.observation_spec.items():
+        kind = name.partition("_")[0]
+        name = f"{kind}_*" if kind in ("jointpos", "jointvel", "touch") else name
+        found[name] = found.get(name, 0) + math.prod(shape)
+    return found
+
+
+def task_page(task: str) -> str:
+    made = tables.robots(task)
+    kind = next(kind for kind in TASKS if task.startswith(kind))
+    env = made[f"point_{task}"]
+    parts = [observed(other) for other in made.values()]
+
+    def row(head: str, cells: list[Any]) -> str:
+        return f"| {head} | " + " | ".join(map(str, cells)) + " |"
+
+    head = row("", [f"`{name}`" for name in made]) + "\n|---|" + "---:|" * len(made)
+    sizes = [row("action", [e.action_size for e in made.values()])]
+    sizes += [row("observation", [e.obs_size for e in made.values()])]
+    for part in sorted({name for found in parts for name in found}):
+        sizes.append(row(part, [found.get(part, "") for found in parts]))
+    sizes.append(row("seconds of a step", [f"{e.step_seconds:g}" for e in made.values()]))
+    drawn = (HERE / "images" / "environments" / f"point_{task}.jpg").exists()
+    images = [f"![{name}](../images/environments/{name}.jpg)" for name in made]
+    names = [f"`{name}`" for name in made]
+    pictures = "\n".join(
+        ["| " + " | ".join(names) + " |", "|---|---|---|", "| " + " | ".join(images) + " |"]
+    )
+    costs = "\n".join(f"| `{name}` | {COSTS[name]} |" for name in env.cost_names)
+    if costs:
+        costs = f"A step costs 1 if any of these is so:\n\n| | |\n|---|---|\n{costs}"
+    found = [line for name in made for line in fidelity(name)]
+    report = "It is not among the recordings of the original."
+    if found:
+        columns = "| | engine | steps | strict | pose | velocity | events that differ | result |"
+        report = "\n".join([columns, "|---|---|---:|---:|---:|---:|---:|---|", *found])
+        report += "\n\nWhat the columns mean: [fidelity](../fidelity.md)."
+    xmin, ymin, xmax, ymax = env.config.placements_extents
+    area = f"x {xmin:g} to {xmax:g} and y {ymin:g} to {ymax:g} m"
+    return f"""# {task}
+
+{TASKS[kind]}
+
+    python scripts/train.py env=point_{task} algo=ppo_lag
+
+{pictures if drawn else ""}
+
+## Objects
+
+{objects(env)}
+
+They lie in {area}, unless options place them. Sizes are radii, and half sides
+of boxes, vases and gremlins; those of Point's task. An episode has {env.episode_length:,} steps.
+
+## Sizes
+
+{head}
+{chr(10).join(sizes)}
+
+## Costs
+
+{costs or "None."}
+
+## Fidelity
+
+{report}
+""".replace("\n\n\n", "\n\n")
+
+
 def pages() -> dict[Path, str]:
+    """Every page that is made, by its path."""
     found = {HERE / "algorithms" / f"{name}.md": page(name) for name in ALGOS}
     lines = [f"| [`{name}`]({name}.md) | {entry.summary} |" for name, entry in ALGOS.items()]
     index = "# Algorithms\n\n| | |\n|---|---|\n" + "\n".join(lines) + "\n"
-    return found | {HERE / "algorithms" / "README.md": index}
+    found[HERE / "algorithms" / "README.md"] = index
+    tasks = list(dict.fromkeys(name.split("_")[1] for name in ENVS))
+    found |= {HERE / "environments" / f"{task}.md": task_page(task) for task in tasks}
+    lines = ["| task | | costs |", "|---|---|---|"]
+    for task in tasks:
+        about = TASKS[next(kind for kind in TASKS if task.startswith(kind))]
+        costs = ", ".join(tables.robots(task)[f"point_{task}"].cost_names) or "none"
+        lines.append(f"| [`{task}`]({task}.md) | {about} | {costs} |")
+    text = ENVIRONMENTS + "\n".join(lines) + "\n"
+    return found | {HERE / "environments" / "README.md": text}
 
 
 if __name__ == "__main__":

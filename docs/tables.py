@@ -3,21 +3,28 @@
 Each table stands between <!-- table: NAME --> and <!-- end -->; a test holds the files to them.
 """
 
+import functools
 from pathlib import Path
 
 from jaxsafe.algos import ALGOS
-from jaxsafe.envs import ENVS, make
+from jaxsafe.envs import ENVS, SafetyGym, make
 from jaxsafe.migrate import ALGORITHMS, OMNISAFE
 
 HERE = Path(__file__).parent
 ROBOTS = ("point", "car", "doggo")
 
 
+@functools.cache
+def robots(task: str) -> dict[str, SafetyGym]:
+    """The environments of a task by name."""
+    return {name: make(name, engine="c") for name in (f"{robot}_{task}" for robot in ROBOTS)}
+
+
 def environments() -> str:
     """A row a task: the size of each robot's observation, and its costs."""
     lines = ["| task | point | car | doggo | costs |", "|---|---:|---:|---:|---|"]
     for task in dict.fromkeys(name.split("_")[1] for name in ENVS):
-        made = [make(f"{robot}_{task}", engine="c") for robot in ROBOTS]
+        made = list(robots(task).values())
         sizes = " | ".join(str(env.obs_size) for env in made)
         lines.append(f"| `{task}` | {sizes} | {', '.join(made[0].cost_names) or 'none'} |")
     return "\n".join(lines)

@@ -1,23 +1,25 @@
-import importlib.util
+import importlib
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).parent.parent
 
 
+sys.path.insert(0, str(ROOT / "docs"))
+
+
 def script(name: str) -> Any:
     """A script of docs/, as a module."""
-    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / f"{name}.py")
-    assert spec and spec.loader
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return importlib.import_module(name)
 
 
-def test_the_pages_of_the_algorithms_are_those_of_the_code():
+def test_the_pages_of_algorithms_and_environments_are_those_of_the_code():
     pages = script("pages").pages()
-    assert {path.name for path in (ROOT / "docs" / "algorithms").iterdir()} == {p.name for p in pages}
+    for folder in ("algorithms", "environments"):
+        there = {*(ROOT / "docs" / folder).iterdir()}
+        assert there == {path for path in pages if path.parent.name == folder}
     for path, text in pages.items():
         assert path.read_text() == text, f"{path.name}: run python docs/pages.py"
 

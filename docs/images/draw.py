@@ -5,9 +5,11 @@ from pathlib import Path
 import imageio
 import jax
 import mujoco
+import numpy as np
 
 from jaxsafe import envs
 from jaxsafe.envs import render
+from jaxsafe.envs.suite import ROBOTS, TASKS
 
 HERE = Path(__file__).parent
 SCENES = {  # name: seed, steps into the episode, where the camera looks (m), its distance (m)
@@ -15,6 +17,14 @@ SCENES = {  # name: seed, steps into the episode, where the camera looks (m), it
     "car_push2": (5, 60, (-0.3, -0.4, 0.1), 3.6),
     "doggo_button2": (5, 30, (-0.1, -0.35, 0.1), 3.4),
 }
+SMALL = [f"{robot}_{task}" for robot in ROBOTS for task in TASKS if task not in ("run", "circle")]
+
+
+def camera(lookat: tuple[float, float, float], distance: float) -> mujoco.MjvCamera:
+    made = mujoco.MjvCamera()
+    made.lookat[:] = lookat
+    made.distance, made.azimuth, made.elevation = distance, 90, -36
+    return made
 
 
 def draw(name: str) -> None:
@@ -26,13 +36,28 @@ def draw(name: str) -> None:
         return jax.random.uniform(key, (env.action_size,), minval=-1.0)
 
     states = render.run_episode(env, policy, jax.random.key(seed), steps)
-    camera = mujoco.MjvCamera()
-    camera.lookat[:] = lookat
-    camera.distance, camera.azimuth, camera.elevation = distance, 90, -36
-    frame = render.Renderer(env, 640, 400, camera).frame(jax.tree.map(lambda x: x[-1], states))
+    view = camera(lookat, distance)
+    frame = render.Renderer(env, 640, 400, view).frame(jax.tree.map(lambda x: x[-1], states))
     imageio.imwrite(HERE / f"{name}.png", frame)
+
+
+def draw_small(name: str) -> None:
+    """The first frame of an episode whose robot stands in front, all of the layout, at 240 x 160."""
+    env = envs.make(name, engine="c", floor_display_mode=True)
+    half = env.config.placements_extents[2]
+    states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 16))
+    front = np.asarray(states.physics.layout[:, 0, 1]).argmin()
+    state = jax.tree.map(lambda x: x[front], states)
+    view = camera((0.0, -0.05 * half, 0.1), 1.0 + 1.7 * half)
+    frame = render.Renderer(env, 480, 320, view).frame(state).astype(np.float32)
+    smooth = frame.reshape(160, 2, 240, 2, 3).mean((1, 3))  # four pixels make one
+    path = HERE / "environments" / f"{name}.jpg"
+    path.parent.mkdir(exist_ok=True)
+    imageio.imwrite(path, smooth.round().astype(np.uint8), quality=88)
 
 
 if __name__ == "__main__":
     for name in SCENES:
         draw(name)
+    for name in SMALL:
+        draw_small(name)
