@@ -64,6 +64,8 @@ def throughput(path: Path) -> None:
             row = json.loads(line)
             if row["algo"] is None:
                 what = f"{row['peer']}: {row['env']}" if "peer" in row else row["env"]
+                if row.get("warmup"):
+                    what += f" after {row['warmup']} steps"
                 best = found.setdefault(what, {})
                 best[row["num_envs"]] = max(best.get(row["num_envs"], 0), row["env_steps_per_s"])
         device = "H200" if "h200" in file else "2 CPU cores"
