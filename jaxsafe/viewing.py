@@ -10,6 +10,7 @@ from typing import Any
 
 import jax
 
+from jaxsafe import runner
 from jaxsafe.command import (
     Actor,
     NoVideo,
@@ -76,6 +77,7 @@ def parser_of(description: str, what: str, more: str) -> argparse.ArgumentParser
 def parse(parser: argparse.ArgumentParser) -> tuple[argparse.Namespace, list[Path], list[str]]:
     """The arguments, and of those without a flag the folders and what begins with env."""
     args = parser.parse_args()
+    runner.use_compilation_cache()
     if not 0 <= args.seed <= MAX_SEED:
         raise ConfigError(f"--seed {args.seed}: expected 0 to {MAX_SEED}")
     options = [text for text in args.what if text.startswith(("env=", "env."))]
