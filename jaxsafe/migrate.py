@@ -274,6 +274,7 @@ OMNISAFE: dict[str, Key] = {  # later keys win
     "lagrange_cfgs.penalty_max": Key("", "OmniSafe does not read it with sum_norm", same=None),
 }
 
+OURS_ALONE = ("rules", "awake", "contact_room")  # options that Engine does not have
 # Engine's options that ours takes, and does not use yet.
 VISION = ("observe_vision", "vision_size", "vision_render", "vision_render_size")
 
@@ -381,6 +382,10 @@ def safety_gym(config: dict[str, Any], envs: Any) -> Migrated:
         ConfigError: an option that Engine does not have, or a value of the wrong type.
     """
     config = {**config}
+    known = [field for field in envs.defaults() if field not in OURS_ALONE]
+    for key in config:
+        if key not in known:
+            raise ConfigError(f"unknown option {key} of Engine{nearest(key, known)}")
     lines = []
     for key in [k for k in VISION if k in config]:
         asked = key == "observe_vision" and bool(config[key])

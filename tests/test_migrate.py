@@ -213,8 +213,9 @@ def test_an_engine_dict_is_the_nearest_environment_and_the_rest():
     assert {line.key for line in found.lines} == set(config)
     request = command.read_arguments(found.argv, envs, algos)
     assert expected[1] in request.argv
-    with pytest.raises(ConfigError, match="did you mean 'hazards_num'"):
-        migrate.safety_gym({"hazard_num": 3}, envs)
+    for name, message in (("hazard_num", "did you mean 'hazards_num'"), ("awake", "of Engine")):
+        with pytest.raises(ConfigError, match=message):
+            migrate.safety_gym({name: 3}, envs)
     assert lost(migrate.safety_gym({"observe_vision": True}, envs)) == ["observe_vision"]
 
 
