@@ -1,9 +1,11 @@
 """What mkdocs does on the way to a page, so that the same files read well on GitHub.
 
 - The list of pages: those of SECTIONS, and all there are in its folders, by their titles.
-- A line <!-- readme: SECTION --> LINK becomes that section of the README, without its heading; with
+- A line LINK <!-- readme: SECTION --> becomes that section of the README, without its heading; with
   <!-- readme: SECTION: WORDS --> the part of it that begins with **WORDS**. GitHub shows LINK.
-- Links to files that are no part of the site lead to copies of them in source/, as text.
+- Links to files that are no part of the site lead to copies of them in source/, as text; links to
+  folders without README.md to a list of what is in them.
+- Docstrings of the reference get lists of fields, and blank lines before sections: `laid_out`.
 """
 
 import posixpath
@@ -19,11 +21,13 @@ SECTIONS: list[tuple[str, list[str]]] = [
     ("How to", ["howto/"]),
     ("Environments", ["environments/"]),
     ("Algorithms", ["algorithms/"]),
-    ("Results", ["results/README.md", "benchmark.md", "performance.md", "fidelity.md"]),
+    ("Results", ["results/", "benchmark.md", "performance.md", "fidelity.md"]),
     ("Reference", ["reference/"]),
 ]
-MARK = re.compile(r"^<!-- readme: (?P<section>[^:\n]+?)(?:: (?P<words>[^\n]+?))? -->.*$", re.M)
+MARK = re.compile(r"^.*<!-- readme: (?P<section>[^:\n]+?)(?:: (?P<words>[^\n]+?))? -->$", re.M)
 LINK = re.compile(r"(\]\(|src=\")([^)\"\s]+)")
+FIELD = re.compile(r"^(?=[a-z_])([\w, ]+(?:\([\w, ]+\))?(?: \[[^\]]*\])?): (?=\S)", re.M)
+BEFORE_SECTION = re.compile(r"(?<=\S)\n(?=(?:Args|Returns|Raises|Source):)")
 
 
 def listed(docs: Path) -> list[Any]:
@@ -32,8 +36,8 @@ def listed(docs: Path) -> list[Any]:
     for title, names in SECTIONS:
         pages: list[str] = []
         for name in names:
-            found = sorted((docs / name).glob("*.md")) if name.endswith("/") else [docs / name]
-            found.sort(key=lambda path: (path.name != "README.md", heading(path)))
+            found = [*(docs / name).rglob("*.md")] if name.endswith("/") else [docs / name]
+            found.sort(key=lambda path: (path != docs / name / "README.md", heading(path)))
             pages += [str(path.relative_to(docs)) for path in found]
         nav.append({title: pages[0] if len(pages) == 1 else pages})
     return nav
@@ -86,9 +90,9 @@ def relinked(text: str, origin: str, page: str, docs: Path) -> str:
             if home and f"docs/{home}" == page:
                 return f"{before}{hash}{anchor}"
             full, hash, anchor = f"docs/{home}" if home else full, "", ""
-        if (ROOT / full).is_dir():
+        if (ROOT / full / "README.md").exists():
             full = f"{full}/README.md"
-        if not full.startswith("docs/") or full.endswith(".py"):
+        if not full.startswith("docs/") or full.endswith(".py") or (ROOT / full).is_dir():
             full = f"{SOURCES}{full}.txt"
         return before + posixpath.relpath(full, posixpath.dirname(page)) + hash + anchor
 
@@ -121,6 +125,17 @@ def sources(docs: Path) -> set[str]:
     return found
 
 
+def laid_out(docstring: str) -> str:
+    """Sections apart, and each paragraph of lines `name: what` as a list."""
+    blocks = BEFORE_SECTION.sub("\n\n", docstring).split("\n\n")
+    for i, block in enumerate(blocks):
+        if FIELD.match(block):
+            blocks[i] = re.sub(r"\n(?!- )\s*", "\n    ", FIELD.sub(r"- `\1`: ", block))
+        elif block.startswith("Source: "):  # text, where a section would be made of it
+            blocks[i] = re.sub(r"\s*\n\s*", " ", block.replace("Source: ", "*Source:* ", 1))
+    return "\n\n".join(blocks)
+
+
 def on_config(config: Any) -> Any:
     config.nav = listed(Path(config.docs_dir))
     return config
@@ -130,8 +145,10 @@ def on_files(files: Any, config: Any) -> Any:
     from mkdocs.structure.files import File  # here, so that tests need no mkdocs
 
     for path in sorted(sources(Path(config.docs_dir))):
-        where = f"{SOURCES}{path}.txt".removeprefix("docs/")
-        files.append(File.generated(config, where, content=(ROOT / path).read_text()))
+        where, full = f"{SOURCES}{path}.txt".removeprefix("docs/"), ROOT / path
+        names = sorted(file.name for file in full.iterdir()) if full.is_dir() else []
+        text = "\n".join([path, *names]) if names else full.read_text()
+        files.append(File.generated(config, where, content=text))
     return files
 
 

@@ -24,7 +24,7 @@ sys.path[:0] = [str(HERE), str(HERE / "results")]
 results, tables = importlib.import_module("make"), importlib.import_module("tables")
 TASKS = {  # what a robot is paid for
     "goal": "Reach the goal (green), again and again: after each success it is elsewhere.",
-    "button": "Press the button that is lit (green), again and again: each success draws another.",
+    "button": "Press the marked button (orange cylinder), again and again: each success draws another.",
     "push": "Push the box (yellow) to the goal (green), again and again.",
     "run": "Run along x, as far as possible.",
     "circle": "Run along a circle of 1.5 m around the origin.",
@@ -125,15 +125,16 @@ The code: [algos/{module}.py](../../algos/{module}.py).
 
 
 def fidelity(name: str) -> list[str]:
-    """The rows of docs/fidelity.md on an environment, with the engine before them."""
-    rows, engine = [], ""
+    """The row of docs/fidelity.md on an environment for each engine: of its first table."""
+    rows: dict[str, str] = {}
+    engine = ""
     for line in (HERE / "fidelity.md").read_text().splitlines():
         if line.startswith("## "):
             engine = line[3:].removeprefix("Engine ")
-        elif line.startswith(f"| {name} |") and engine.startswith("`"):
+        elif line.startswith(f"| {name} |") and engine.startswith("`") and engine not in rows:
             cells = [cell.strip() for cell in line.strip("|").split("|")]
-            rows.append(f"| {' | '.join([f'`{name}`', engine, *cells[1:5], cells[8], cells[9]])} |")
-    return rows
+            rows[engine] = f"| {' | '.join([f'`{name}`', engine, *cells[1:5], cells[8], cells[9]])} |"
+    return [*rows.values()]
 
 
 def objects(env: Any) -> str:

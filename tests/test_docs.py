@@ -41,7 +41,7 @@ def test_the_list_of_pages_has_every_page_once():
 def test_pages_take_in_the_readme_and_show_a_link_on_github():
     marks = [mark for page in PAGES for mark in hooks.MARK.finditer(page.read_text())]
     assert len(marks) >= 7
-    assert all(re.search(r"\[.*\]\((\.\./)+README\.md(#[\w-]+)?\)", mark[0]) for mark in marks)
+    assert all(re.match(r"\[.*\]\((\.\./)+README\.md(#[\w-]+)?\) <!--", mark[0]) for mark in marks)
     for page in PAGES:
         text = hooks.composed(page.read_text(), f"docs/{page.relative_to(DOCS)}", DOCS)
         assert "<!-- readme:" not in text
@@ -62,6 +62,7 @@ def test_pages_take_in_the_readme_and_show_a_link_on_github():
         ("[a](docs/results/README.md#x)", "[a](../results/README.md#x)"),
         ("[a](docs/results)", "[a](../results/README.md)"),
         ("[a](envs/suite.py)", "[a](../source/envs/suite.py.txt)"),
+        ("[a](scripts)", "[a](../source/scripts.txt)"),
         ("[a](docs/pages.py)", "[a](../source/docs/pages.py.txt)"),
         ('<img src="docs/images/car_push2.png" width="270">',
          '<img src="../images/car_push2.png" width="270">'),
@@ -79,7 +80,15 @@ def test_links_of_the_readme_work_on_a_page(link, expected):
 def test_files_that_pages_link_to_are_there():
     found = hooks.sources(DOCS)
     assert {"algos/cpo.py", "CONTRIBUTING.md"} - found == {"CONTRIBUTING.md"}
-    assert all((ROOT / path).is_file() for path in found)
+    assert all((ROOT / path).exists() for path in found)
+
+
+def test_docstrings_show_fields_and_sections():
+    fields = "State.\n\nobs: float [O], of\n    it.\nreward, cost: float [].\n\n"
+    shown = "State.\n\n- `obs`: float [O], of\n    it.\n- `reward, cost`: float [].\n\n"
+    args = "Args:\n    x: y.\nReturns:\n    z."
+    assert hooks.laid_out(fields + args) == f"{shown}Args:\n    x: y.\n\nReturns:\n    z."
+    assert hooks.laid_out("Does.\nSource: A\n    (2020).") == "Does.\n\n*Source:* A (2020)."
 
 
 def test_every_task_of_the_suite_has_a_small_picture():
