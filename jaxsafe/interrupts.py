@@ -16,16 +16,25 @@ class Interrupts:
 
     Python runs signal handlers between its own instructions only, and one XLA compilation can
     take minutes. So a thread reads the signals from the wakeup socket, which is written at once.
+
+    Args:
+        say: where to say what a signal does.
+        hosted: the process goes on afterwards, as a notebook does. To leave at once is then a
+            KeyboardInterrupt, which has to wait for a compilation, and SIGTERM is not for us.
     """
 
-    def __init__(self, say: Callable[[str], None]):
-        self.say = say
+    def __init__(self, say: Callable[[str], None], hosted: bool = False):
+        self.say, self.hosted = say, hosted
         self.requested = False
         self.nothing_to_save = ""  # what to say when leaving at once is all right
 
     def __enter__(self) -> "Interrupts":
         self.handlers = {}
-        if threading.current_thread() is threading.main_thread():  # elsewhere Python allows no handlers
+        if threading.current_thread() is not threading.main_thread():
+            return self  # there Python allows no handlers
+        if self.hosted:
+            self.handlers[signal.SIGINT] = signal.signal(signal.SIGINT, self._interrupted)
+        else:
             self.reader, self.writer = socket.socketpair()
             self.writer.setblocking(False)
             self.wakeup = signal.set_wakeup_fd(self.writer.fileno(), warn_on_full_buffer=False)
@@ -37,11 +46,16 @@ class Interrupts:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self.handlers:
-            for number, handler in self.handlers.items():
-                signal.signal(number, handler)
+        for number, handler in self.handlers.items():
+            signal.signal(number, handler)
+        if self.handlers and not self.hosted:
             signal.set_wakeup_fd(self.wakeup)
             self.writer.close()  # ends the thread
+
+    def _interrupted(self, *_: object) -> None:  # says nothing: it may interrupt what is being said
+        if self.requested or self.nothing_to_save:
+            raise KeyboardInterrupt(self.nothing_to_save or "stopped without a last checkpoint")
+        self.requested = True
 
     def _listen(self) -> None:
         with self.reader:

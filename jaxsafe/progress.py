@@ -1,4 +1,5 @@
-"""What a training run says while it runs: a live bar on a terminal, plain lines elsewhere."""
+"""What a training run says while it runs: a live bar on a terminal, one changing line in a notebook,
+plain lines elsewhere."""
 
 import math
 import time
@@ -10,6 +11,7 @@ from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn
 from rich.text import Text
 
 PLAIN_EVERY = 5.0  # s between lines when stdout is no terminal
+NOTEBOOK_EVERY = 0.25  # s between changes of the line
 
 
 def short(value: float) -> str:
@@ -37,11 +39,26 @@ def clock(seconds: float) -> str:
 
 
 class Report:
-    """Prints to stdout; `with` it, so that a live bar is taken down whatever happens."""
+    """Prints to stdout; `with` it, so that a live bar is taken down whatever happens.
 
-    def __init__(self, console: Console | None = None):
-        self.console = console or Console(highlight=False, soft_wrap=True)
+    Args:
+        console: where to, if not there.
+        hosted: in a program that goes on after Ctrl-C.
+    """
+
+    def __init__(self, console: Console | None = None, hosted: bool = False):
+        self.notebook = console is None and Console().is_jupyter
+        # rich's own output in notebooks is a block of HTML a line, and its bar wants ipywidgets
+        own = Console(
+            highlight=False,
+            soft_wrap=True,
+            force_jupyter=False,
+            force_terminal=False if self.notebook else None,
+        )
+        self.console = console or own
+        self.hosted = hosted
         self.live: Progress | None = None
+        self.width = 0  # of the changing line in a notebook
 
     def __enter__(self) -> "Report":
         return self
@@ -52,6 +69,7 @@ class Report:
         self.stop()
 
     def line(self, text: str) -> None:
+        self._end_changing()
         self.console.print(text, markup=False)
 
     def start(self, total_steps: int, steps: int, cost_limits: Sequence[float]) -> None:
@@ -90,11 +108,22 @@ class Report:
         )
         if self.live:
             self.live.update(self.task, completed=steps, text=text)
+        elif self.notebook:
+            if now - self.printed >= NOTEBOOK_EVERY or steps >= self.total:
+                self.printed, text = now, f"{100 * steps / self.total:3.0f}%  {text}"
+                print("\r" + text.ljust(self.width), end="", flush=True)
+                self.width = len(text)
         elif now - self.printed >= PLAIN_EVERY or steps >= self.total:
             self.printed = now
             self.line(f"{100 * steps / self.total:3.0f}%  {text}")
 
+    def _end_changing(self) -> None:
+        if self.width:
+            print()
+            self.width = 0
+
     def stop(self) -> None:
+        self._end_changing()
         if self.live:
             self.live.stop()
             self.live = None

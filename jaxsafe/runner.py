@@ -302,7 +302,7 @@ def train(
     iterations = -(-settings.total_steps // per_update)
     store = folder / "checkpoints"
     resuming = bool(distributed.first(np.array(bool(checkpoint.checkpoints(store)))))
-    with report, Interrupts(report.line) as stop:
+    with report, Interrupts(report.line, report.hosted) as stop:
         stop.nothing_to_save = (
             f"stopped before the first update; {resume_command if resuming else 'nothing to save'}"
         )

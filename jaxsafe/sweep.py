@@ -237,6 +237,10 @@ def fitting(settings: Settings, most: int | None, envs: Any, algos: Any) -> tupl
 def train(sweep: Sweep, envs: Any, algos: Any, again: str, report: Report) -> int:
     """Train every group that is not finished. Returns the exit status."""
     known = open_folder(sweep)
+    sizes = [len(s.configs) for s in sweep.groups.values()]
+    report.line(
+        f"sweep: {sum(sizes)} settings in {len(sizes)} group{'s' * (len(sizes) > 1)}, in {sweep.folder}"
+    )
     for name, settings in sweep.groups.items():
         members = len(settings.configs) * settings.train.num_seeds
         programs: dict[int, runner.Program] = {}  # by the number of their members
@@ -244,7 +248,7 @@ def train(sweep: Sweep, envs: Any, algos: Any, again: str, report: Report) -> in
         if not any(checkpoint.checkpoints(f / "checkpoints") for f in begun):
             for leftover in begun:  # stopped before a first checkpoint, perhaps in other parts
                 shutil.rmtree(leftover)
-            with Interrupts(report.line) as stop:
+            with Interrupts(report.line, report.hosted) as stop:
                 stop.nothing_to_save = f"stopped before the first update; {again}"
                 known[name], program = fitting(settings, sweep.max_parallel, envs, algos)
             programs[len(program.members)] = program
@@ -345,14 +349,9 @@ def main(envs: Any, algos: Any) -> int:
                 command.load_own(text.removeprefix("env="), envs)
             print(summarise(args.summary, envs, algos), end="")
             return 0
-        asked, report = read(args.options, envs, algos), Report()
-        settings = [len(s.configs) for s in asked.groups.values()]
-        report.line(
-            f"sweep: {sum(settings)} settings in {len(settings)} group{'s' * (len(settings) > 1)}, "
-            f"in {asked.folder}"
-        )
+        asked = read(args.options, envs, algos)
         again = f"python scripts/sweep.py {shlex.join(sys.argv[1:])}"
-        status = train(asked, envs, algos, again, report)
+        status = train(asked, envs, algos, again, Report())
         print(summarise(asked.folder, envs, algos) + f"sweep folder: {asked.folder}")
         return status
 
