@@ -1,6 +1,7 @@
 """The algorithms by name. A new one is a module and a line here."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from jaxsafe.algos import (
@@ -35,8 +36,9 @@ from jaxsafe.on_policy import Algorithm
 class Entry(NamedTuple):
     config: type[Any]
     make: Callable[..., Algorithm]  # make(env, axis_name=None)
-    summary: str
-    published: dict[str, dict[str, Any]]  # setting -> overrides of the config that reproduce it
+    summary: str = ""
+    # setting -> overrides of the config that reproduce it
+    published: Mapping[str, dict[str, Any]] = MappingProxyType({})
 
 
 ALGOS: dict[str, Entry] = {

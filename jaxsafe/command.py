@@ -569,6 +569,9 @@ class Scores(NamedTuple):
     rows: dict[str, stats.Estimate]
     seeds: dict[str, list[float]]  # the mean over the episodes of each
 
+    def __str__(self) -> str:
+        return evaluation.table(self.rows)
+
 
 def evaluate(
     settings: Settings, algo: Algorithm, ts: PyTree, num: int, seed: int, folder: Path
@@ -687,7 +690,12 @@ def policy_of(settings: Settings, env: Env, algos: Any, folder: Path) -> tuple[A
 def compose(texts: list[str], envs: Any, algos: Any) -> Settings:
     """The settings that train.py would have from these arguments."""
     request = read_arguments(texts, envs, algos)
-    register(request)
+    named = {*DEFAULT.values(), *(text.partition("=")[2] for text in request.argv)}
+    groups = {
+        group: {name: node for name, node in options.items() if name in named} or options
+        for group, options in request.groups.items()
+    }
+    register(request._replace(groups=groups))  # all of them take a second
     with hydra.initialize(version_base="1.3", config_path=None):
         config = hydra.compose("train", overrides=request.argv)
     return settle(OmegaConf.to_container(config, resolve=True), envs, algos)  # type: ignore[arg-type]
@@ -820,7 +828,7 @@ def evaluate_main(envs: Any, algos: Any) -> int:
         for s in evaluate(settings, algo, ts, args.episodes, args.seed, args.run):
             if not alone:
                 print(f"\n{s.name} | cost limit {s.cost_limit:g}")
-            print(evaluation.table(s.rows))
+            print(s)
         return 0
 
     return guarded(command)

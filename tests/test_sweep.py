@@ -16,7 +16,7 @@ import pytest
 from tasks import FAST
 from toys import Corridor
 
-from jaxsafe import algos, checkpoint, command, envs, plots, run_folder, runner, sweep
+from jaxsafe import algos, checkpoint, command, envs, plots, run_folder, runner, sweeps
 from jaxsafe.config import ConfigError, float_fields
 from jaxsafe.progress import Report
 
@@ -40,8 +40,8 @@ GRID = ["algo.cost_limit=0.5,5", "algo.dual_lr=0.01,1", "num_seeds=2"]
 
 
 def train(folder: Path, *texts: str) -> None:
-    asked = sweep.read([*SMALL, *texts, f"run_dir={folder}"], TOYS, algos)
-    assert sweep.train(asked, TOYS, algos, "again", Report()) == 0
+    asked = sweeps.read([*SMALL, *texts, f"run_dir={folder}"], TOYS, algos)
+    assert sweeps.train(asked, TOYS, algos, "again", Report()) == 0
 
 
 def tables(folder: Path) -> dict[tuple, dict[str, np.ndarray]]:
@@ -90,7 +90,7 @@ def finished(tmp_path_factory) -> Path:
 
 
 def test_a_grid_is_floats_side_by_side_and_a_group_of_each_other_value():
-    asked = sweep.read(
+    asked = sweeps.read(
         ["env=point_goal1", "algo=ppo_lag,cppo_pid", "algo.hidden=[8,8],[4]", "algo.clip=0.1,0.2",
          "algo.cost_limit=5,10,25", "num_seeds=3", "seed=7"],
         envs, algos,
@@ -110,20 +110,20 @@ def test_a_grid_is_floats_side_by_side_and_a_group_of_each_other_value():
 
 
 def test_parts_are_whole_settings_or_seeds_of_one_and_of_equal_size():
-    asked = sweep.read(["algo.cost_limit=1,2,3,4", "num_seeds=8"], envs, algos)
+    asked = sweeps.read(["algo.cost_limit=1,2,3,4", "num_seeds=8"], envs, algos)
     (settings,) = asked.groups.values()
 
     def shapes(parallel: int) -> list[tuple]:
         return [
             ([c.cost_limit for c in p.configs], p.train.seed, p.train.num_seeds)
-            for p in sweep.parts(settings, parallel)
+            for p in sweeps.parts(settings, parallel)
         ]
 
     assert shapes(32) == [([1, 2, 3, 4], 0, 8)]
     assert shapes(31) == shapes(16) == [([1, 2], 0, 8), ([3, 4], 0, 8)]
     assert shapes(5) == [([limit], seed, 4) for limit in (1, 2, 3, 4) for seed in (0, 4)]
     assert len(shapes(1)) == 32
-    assert sweep.slices(7, 3) == [slice(0, 2), slice(2, 4), slice(4, 7)]
+    assert sweeps.slices(7, 3) == [slice(0, 2), slice(2, 4), slice(4, 7)]
 
 
 @pytest.mark.parametrize("name", sorted(algos.ALGOS))
@@ -161,7 +161,7 @@ def test_parts_give_what_all_at_once_give(finished, tmp_path):
     train(tmp_path / "sweep", *GRID, "max_parallel=1")
     assert len(list(tmp_path.glob("sweep/*.part*"))) == 8
     assert_close(tables(tmp_path / "sweep"), tables(finished))
-    rows, expected = (sweep.rows_of(f, TOYS, algos) for f in (tmp_path / "sweep", finished))
+    rows, expected = (sweeps.rows_of(f, TOYS, algos) for f in (tmp_path / "sweep", finished))
     for a, b in zip(rows, expected, strict=True):
         assert (a.by, a.cost_limit, a.steps) == (b.by, b.cost_limit, b.steps)
         np.testing.assert_allclose([a.costs, a.returns], [b.costs, b.returns], rtol=1e-3, atol=1e-4)
@@ -197,9 +197,9 @@ def test_an_interrupted_sweep_goes_on_and_ends_bit_for_bit_as_if_uninterrupted(t
 
 
 def test_the_memory_decides_how_many_members_run_at_once(monkeypatch):
-    asked = sweep.read([*SMALL, *GRID], TOYS, algos)
+    asked = sweeps.read([*SMALL, *GRID], TOYS, algos)
     (settings,) = asked.groups.values()
-    parallel, program = sweep.fitting(settings, None, TOYS, algos)
+    parallel, program = sweeps.fitting(settings, None, TOYS, algos)
     assert parallel == len(program.members) == 8
     like = jax.eval_shape(program.init, program.start)
     used = runner.compiled(program, like).memory_analysis()
@@ -208,13 +208,13 @@ def test_the_memory_decides_how_many_members_run_at_once(monkeypatch):
     assert 3 <= runner.capacity(program) <= 4
     monkeypatch.setattr(runner, "device_memory", lambda: (1.0, "this machine"))
     with pytest.raises(ConfigError, match="this machine has"):
-        sweep.fitting(settings, None, TOYS, algos)
+        sweeps.fitting(settings, None, TOYS, algos)
 
 
 def test_a_folder_of_another_sweep_is_refused_and_a_longer_one_is_not(finished, tmp_path):
     def opened(*texts: str) -> dict[str, int]:
-        asked = sweep.read([*SMALL, *texts, f"run_dir={finished}"], TOYS, algos)
-        return sweep.open_folder(asked)
+        asked = sweeps.read([*SMALL, *texts, f"run_dir={finished}"], TOYS, algos)
+        return sweeps.open_folder(asked)
 
     assert [*opened(*GRID, "total_steps=1e6").values()] == [8]
     with pytest.raises(ConfigError, match=r"another sweep: seed is 0 there, 3 here"):
@@ -225,7 +225,7 @@ def test_a_folder_of_another_sweep_is_refused_and_a_longer_one_is_not(finished, 
         opened(*GRID, "algo.epochs=1,2")
     (tmp_path / "config.yaml").touch()
     with pytest.raises(ConfigError, match="holds something else than a sweep"):
-        sweep.open_folder(sweep.read([*SMALL, *GRID, f"run_dir={tmp_path}"], TOYS, algos))
+        sweeps.open_folder(sweeps.read([*SMALL, *GRID, f"run_dir={tmp_path}"], TOYS, algos))
 
 
 def test_the_policies_of_a_group_are_evaluated_setting_by_setting(finished):
@@ -260,8 +260,8 @@ def write(folder: Path, configs: dict[str, Any], table: list[tuple]) -> None:
 
 
 def test_the_summary_is_the_last_tenth_of_training_over_the_seeds_of_each_setting(tmp_path):
-    asked = sweep.read([*SMALL, "algo.cost_limit=2,4,8,16", f"run_dir={tmp_path}"], TOYS, algos)
-    sweep.write_folder(asked, {})
+    asked = sweeps.read([*SMALL, "algo.cost_limit=2,4,8,16", f"run_dir={tmp_path}"], TOYS, algos)
+    sweeps.write_folder(asked, {})
     ((name, settings),) = asked.groups.items()
     plain: Any = settings.plain() | {"num_seeds": 2}
     three = plain | {"algo": plain["algo"] | {"cost_limit": [2.0, 4.0, 8.0]}}
@@ -270,7 +270,7 @@ def test_the_summary_is_the_last_tenth_of_training_over_the_seeds_of_each_settin
     for seed in range(2):  # a setting whose seeds were trained apart
         alone = plain | {"algo": plain["algo"] | {"cost_limit": 16.0}, "seed": seed, "num_seeds": 1}
         write(tmp_path / f"{name}.part{seed + 1}", alone, [(seed, None, 1.0, np.nan)])
-    assert sweep.summarise(tmp_path, TOYS, algos) == (
+    assert sweeps.summarise(tmp_path, TOYS, algos) == (
         "| algo.cost_limit | seeds | steps | return | cost | limit | limit held |\n"
         "| --- | ---: | ---: | ---: | ---: | ---: | ---: |\n"
         "| 2 | 2 | 200 | 2 [1, 3] | 2 [1, 3] | 2 | yes |\n"
@@ -324,15 +324,15 @@ def test_a_bad_sweep_is_one_line_and_status_2(arguments, tmp_path, monkeypatch, 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["sweep.py", *arguments.split()])
     monkeypatch.setattr(runner, "train", lambda *a, **k: pytest.fail("it went on to train"))
-    assert sweep.main(envs, algos) == 2
+    assert sweeps.main(envs, algos) == 2
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1 and lines[0].startswith("error: ") and BAD[arguments] in lines[0]
     assert not list(tmp_path.glob("runs/*"))
 
 
 def test_the_script_rewrites_the_summary_of_a_sweep_at_any_time(tmp_path):
-    asked = sweep.read(["env=point_goal0", "algo.cost_limit=2,4", f"run_dir={tmp_path}"], envs, algos)
-    sweep.write_folder(asked, {})
+    asked = sweeps.read(["env=point_goal0", "algo.cost_limit=2,4", f"run_dir={tmp_path}"], envs, algos)
+    sweeps.write_folder(asked, {})
     ((name, settings),) = asked.groups.items()
     write(tmp_path / name, settings.plain(), [(0, 2.0, 1.0, 1.0), (0, 4.0, 1.0, 1.0)])
     script = Path(__file__).parent.parent / "scripts" / "sweep.py"

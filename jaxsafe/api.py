@@ -1,0 +1,518 @@
+"""What a notebook or a program of yours imports: train, evaluate, render and sweep, in one line each.
+
+    run = jaxsafe.train("point_goal1", "ppo_lag", cost_limit=10, num_seeds=4, total_steps=1e6)
+    print(jaxsafe.evaluate(run))
+    jaxsafe.render(run, "policy.gif")
+
+They are the scripts' own functions, so a run folder is the same whoever trained it. This is the one
+module of the package that knows the environments and the algorithms; `import jaxsafe` loads it when one
+of its names is first used.
+"""
+
+import contextlib
+import dataclasses
+import functools
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from hydra.errors import HydraException
+from omegaconf.errors import OmegaConfBaseException
+
+from jaxsafe import algos, command, compare, distributed, envs, run_folder, runner, sweeps
+from jaxsafe.config import ConfigError, nearest
+from jaxsafe.env_check import check_env
+from jaxsafe.envs import SafetyGym, SafetyGymConfig
+from jaxsafe.envs.physics import default_engine
+from jaxsafe.on_policy import Algorithm
+from jaxsafe.progress import Report
+from jaxsafe.types import Env, PyTree
+
+__all__ = ["ConfigError", "Run", "SweepResult", "evaluate", "make", "render", "sweep", "train"]
+
+SETTINGS = [f.name for f in dataclasses.fields(runner.TrainConfig)]
+PLAIN = (bool, int, float, str, list, tuple, dict, type(None))
+
+
+def make(env: str | SafetyGymConfig, **options: Any) -> SafetyGym:
+    """Build an environment: `reset(key)` and `step(state, action)`, pure and without a batch axis.
+
+        env = jaxsafe.make("point_goal1", hazards_num=12)
+        state = jax.jit(env.step)(env.reset(jax.random.key(0)), jnp.array([1.0, 0.2]))
+
+    Observations are float [obs_size], actions float [action_size] in [-1, 1]; `state` has the reward
+    and the cost of the step and, in `costs`, those of each of `env.cost_names`.
+
+    Args:
+        env: a name ('car_push1'), Safety Gym's id ('Safexp-CarPush1-v0'), 'module:name' for code of
+            yours, which is imported, or a config.
+        options: Safety Gym's (`hazards_num`, ...; lengths in m, angles in rad) and `engine`: 'auto',
+            'c', 'warp' or 'jax'.
+
+    Returns:
+        The environment; of 'module:name' what stands there, if it is an `Env` (jaxsafe.types).
+
+    Raises:
+        ConfigError: an unknown name or option (with the nearest valid one), a value of the wrong type,
+            or a task that cannot be built or has no valid layout.
+
+    Source: Ray, Achiam and Amodei (2019), "Benchmarking Safe Exploration in Deep Reinforcement
+        Learning", for the tasks and their options.
+    """
+    if isinstance(env, str):
+        command.load_own(env, envs)
+    return envs.make(env, **options)
+
+
+class Run:
+    """A finished or stopped run, read from its folder.
+
+        run = jaxsafe.Run("runs/point_goal1-ppo_lag/20260101-120000-seed0")
+
+    Its policies are numbered: every seed of the first setting, then of the next. Nothing in the folder
+    is executed.
+
+    Args:
+        folder: the run folder.
+        env: the environment, where the run was trained with an object of yours or 'module:name'.
+        algo: the algorithm, likewise.
+
+    Attributes:
+        folder: Path.
+        settings: everything the run is made of, checked; `settings.algo.cost_limit`, for one.
+
+    Raises:
+        ConfigError: no run folder, or one of settings that this version does not have.
+    """
+
+    def __init__(self, folder: str | Path, env: str | Env | None = None, algo: Any = None):
+        self._known = registries(env, algo)
+        self.folder = Path(folder).expanduser()
+        self.settings = command.settle(
+            run_folder.read_config(self.folder), self._known.envs, self._known.algos
+        )
+
+    def __repr__(self) -> str:
+        s = self.settings
+        seeds = f"{s.train.num_seeds} seed{'s' * (s.train.num_seeds > 1)}"
+        settings = f"{len(s.configs)} settings, " * (len(s.configs) > 1)
+        name = f"{s.env_name}, {s.algo_name}, {settings}{seeds}"
+        return f"Run({str(self.folder)!r}: {name}, {self.steps:,} steps)"
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """config.yaml as plain values: {'env': {...}, 'algo': {...}, 'total_steps': ...}."""
+        return self.settings.plain()
+
+    @property
+    def steps(self) -> int:
+        """Environment steps of each seed up to the newest checkpoint; 0 without one."""
+        done = run_folder.progress(self.folder)
+        return done[1] if done else 0
+
+    @property
+    def metrics(self) -> dict[str, np.ndarray]:
+        """metrics.csv: 'steps', 'iteration' and 'seconds' are float [T], over iterations, the rest are
+        float [T, P], over policies, with NaN where an iteration had no value (no episode ended).
+
+        Steps are of one seed; 'train/return' and 'train/cost' are undiscounted sums of an episode.
+        Empty before the first iteration.
+        """
+        table = run_folder.read_metrics(self.folder)
+        num = len(self.settings.configs) * self.settings.train.num_seeds
+        rows = len(table["steps"]) // num if table else 0
+        whole = {name: x[: rows * num].reshape(rows, num) for name, x in table.items()}
+        common = ("steps", "iteration", "seconds")
+        return {name: x[:, 0] if name in common else x for name, x in whole.items()}
+
+    def policy(self, obs: jax.Array, key: jax.Array | None = None, index: int = 0) -> jax.Array:
+        """The action of a trained policy, compiled; it may be used inside `jit`, `vmap` and `scan`.
+
+        Args:
+            obs: float [..., obs_size] of `run.env(index)`, as the environment gives it.
+            key: a random key to sample with; None is the mean, which `evaluate` uses too.
+            index: which policy.
+
+        Returns:
+            float [..., action_size]; environments clip it to [-1, 1].
+
+        Raises:
+            ConfigError: no such policy, or no checkpoint yet.
+        """
+        return self._act(self._opened[3], self._checked(index), obs, key)
+
+    def env(self, index: int = 0) -> Env:
+        """The environment as a policy meets it: with what an algorithm adds to the observation, as
+        PPO-Saute does its budget.
+
+        Args:
+            index: which policy.
+
+        Returns:
+            An environment: `reset(key)` and `step(state, action)`, without a batch axis.
+
+        Raises:
+            ConfigError: no such policy, or no checkpoint yet.
+        """
+        return self._opened[2].task(self._state(index))
+
+    def _checked(self, index: int) -> int:
+        count = len(self.settings.configs) * self.settings.train.num_seeds
+        if not 0 <= index < count:
+            raise ConfigError(f"index {index}: the run has {count} policies, from 0")
+        return index
+
+    def _state(self, index: int) -> PyTree:
+        """The train state of one policy."""
+        self._checked(index)
+        return jax.tree.map(lambda x: x[index], self._opened[3])
+
+    @functools.cached_property
+    def _opened(self) -> tuple[command.Settings, Env, Algorithm, PyTree]:
+        runner.use_compilation_cache()
+        return command.open_run(self.folder, None, self._known.envs, self._known.algos)
+
+    @functools.cached_property
+    def _act(self) -> Any:
+        algo = self._opened[2]
+
+        def act(states: PyTree, index: Any, obs: jax.Array, key: jax.Array | None) -> jax.Array:
+            return algo.act(jax.tree.map(lambda x: x[index], states), obs, key)
+
+        return jax.jit(act)
+
+
+class SweepResult(NamedTuple):
+    """A trained sweep; printed, it is the table of its settings.
+
+    folder: with summary.md, summary.csv and summary.png, and a run folder for each program.
+    rows: one a setting: `row.name`, `row.cost_limit`, `row.ret` and `row.cost` (mean, low, high over
+        seeds of the last 10 % of training), `row.returns` and `row.costs`, float [S], and `row.held`,
+        whether the limit is.
+    runs: the run folders.
+    """
+
+    folder: Path
+    rows: list[compare.Group]
+    runs: list[Run]
+
+    def __str__(self) -> str:
+        return sweeps.markdown(self.rows)
+
+
+def train(env: str | Env | None = None, algo: Any = None, **options: Any) -> Run:
+    """Train, then evaluate and film the policy: scripts/train.py as a function.
+
+        jaxsafe.train("point_goal1", "ppo_lag", cost_limit=10, num_seeds=4, total_steps=1e6)
+        jaxsafe.train(jaxsafe.make("point_goal1", hazards_num=12), "cpo", run_dir="runs/twelve")
+
+    Ctrl-C, or a notebook's stop button, saves a checkpoint after the iteration under way and then
+    raises KeyboardInterrupt; `jaxsafe.train(resume=FOLDER)` goes on from there, and
+    `jaxsafe.Run(FOLDER)` reads what there is. A second one leaves at once.
+
+    Args:
+        env: a name, default 'point_goal1'; an environment from `make`; or any `Env` of yours
+            (jaxsafe.types), which is recorded under the name of its class.
+        algo: a name, default 'ppo_lag'; or one of yours: an object with `config`, a class under
+            `jaxsafe.config.config`, and `make(env, axis_name=None)`, such as `jaxsafe.algos.Entry`,
+            which is recorded under the name of that class.
+        options: settings of the run as on the command line (`total_steps` of each seed, `num_envs`,
+            `num_seeds`, `seed`, `devices`, `preset`, `run_dir`, `resume`, `init_from`, `video`, ...)
+            and of the algorithm, whose prefix may be left out (`cost_limit`: undiscounted cost of an
+            episode). An option of the environment is `**{"env.hazards_num": 12}`, or an argument of
+            `make`.
+
+    Returns:
+        The run. One with an object of yours goes on, and opens, with that object alone
+        (`train(env, algo, resume=FOLDER)`, `Run(FOLDER, env, algo)`), not from the command line.
+
+    Raises:
+        ConfigError: where the script would print a line and end: an unknown name (with the nearest
+            valid one), a value of the wrong type or out of bounds, a run that does not fit the memory.
+        jaxsafe.checkpoint.CheckpointError, OSError: the disk failed; the last checkpoint stays.
+        KeyboardInterrupt: stopped, see above.
+    """
+    for name in distributed.OPTIONS:
+        if options.get(name) is not None:
+            raise ConfigError(f"{name}: several processes are for scripts/train.py")
+    known = registries(env, algo)
+    report = Report(hosted=True)
+    with one_line():
+        settings = command.compose(texts(known, options), known.envs, known.algos)
+        folder = command.choose_folder(settings, known.envs, known.algos, None, report.line)
+        program_env, program = command.prepare(settings, known.envs, known.algos)
+        say_whose(known, report)
+        needed = {kind: f"<your {name}>" for kind, name in known.own.items()}
+        if ":" in settings.env_name:
+            needed["env"] = repr(settings.env_name)
+        again = "".join(f"{kind}={what}, " for kind, what in needed.items())
+        again = f"jaxsafe.train({again}resume={str(folder)!r})"
+        status = command.run(
+            settings, program_env, program, folder, known.envs, known.algos, report, again
+        )
+    if status:
+        raise KeyboardInterrupt(f"stopped; continue with {again}")
+    return Run(folder, env, algo)
+
+
+def sweep(env: Any = None, algo: Any = None, **options: Any) -> SweepResult:
+    """Train a grid of settings, scripts/sweep.py as a function: every option that is a list is swept.
+
+        jaxsafe.sweep("point_goal1", "ppo_lag", cost_limit=[5, 10, 25, 50], num_seeds=8)
+        jaxsafe.sweep("point_goal1", ["cpo", "ppo_lag"], hidden=[(64, 64), (128, 128)])
+
+    Floats of the algorithm and seeds train side by side, as members of one compiled program; any other
+    option is a program for each of its values. The same call again goes on where it was stopped.
+
+    Args:
+        env: as of `train`, or a list of names.
+        algo: as of `train`, or a list.
+        options: as of `train`; a list holds the values to sweep, so that a value which is itself a
+            list is a tuple. `max_parallel` is the number of members trained at once, by default as
+            many as the memory holds; `run_dir` the sweep's folder.
+
+    Returns:
+        Its table and its runs.
+
+    Raises:
+        ConfigError: as of `train`, or nothing to sweep.
+        jaxsafe.checkpoint.CheckpointError, OSError: the disk failed; what was saved stays.
+        KeyboardInterrupt: stopped, with a checkpoint.
+    """
+    known = registries(env, algo)
+    again = "the same call of jaxsafe.sweep"
+    with one_line():
+        asked = sweeps.read(texts(known, options, swept=True), known.envs, known.algos)
+        report = Report(hosted=True)
+        say_whose(known, report)
+        if sweeps.train(asked, known.envs, known.algos, again, report):
+            raise KeyboardInterrupt(f"stopped; continue with {again}")
+        sweeps.summarise(asked.folder, known.envs, known.algos)
+        rows = sweeps.rows_of(asked.folder, known.envs, known.algos)
+    folders = (path.parent for path in sorted(asked.folder.glob("*/config.yaml")))
+    return SweepResult(asked.folder, rows, [Run(folder, env, algo) for folder in folders])
+
+
+def evaluate(
+    run: Run | str | Path, episodes: int = 100, seed: int = 1, setting: int = 0
+) -> command.Scores:
+    """Fresh whole episodes of a run's deterministic policies, scripts/evaluate.py as a function.
+
+    Args:
+        run: a run, or its folder.
+        episodes: of each seed.
+        seed: of the episodes; every policy meets the same.
+        setting: which one, of a run that trained several side by side.
+
+    Returns:
+        Printed, a table. `scores.rows` has an estimate (mean, low, high: the 95 % bootstrap interval
+        over seeds and episodes) of 'return' and 'cost' (undiscounted sums of an episode), 'violation
+        rate' (the share of episodes over the limit), 'episode length' (steps), 'cost rate (training)'
+        (cost a step) and, where known, Safety Gym's normalised scores; `scores.seeds` has the mean of
+        each seed.
+
+    Raises:
+        ConfigError: no run folder, no checkpoint yet, no such setting, or episodes < 1.
+
+    Source: Ray, Achiam and Amodei (2019), "Benchmarking Safe Exploration in Deep Reinforcement
+        Learning", section 5, for the measures.
+    """
+    run = run if isinstance(run, Run) else Run(run)
+    if episodes < 1 or seed < 0:
+        raise ConfigError(
+            f"episodes={episodes}, seed={seed}: expected at least 1 episode and a seed of at least 0"
+        )
+    if not 0 <= setting < (count := len(run.settings.configs)):
+        raise ConfigError(f"setting {setting}: the run has {count}, from 0")
+    settings, _, algo, states = run._opened
+    return command.evaluate(settings, algo, states, episodes, seed, run.folder)[setting]
+
+
+def render(
+    run: Run | str | Path, path: str | Path | None = None, index: int = 0, seed: int = 1
+) -> Path:
+    """Film one episode of a policy at 30 frames a second, scripts/render.py as a function.
+
+    Args:
+        run: a run, or its folder.
+        path: an .mp4 or .gif; None is video.mp4 in the run folder.
+        index: which policy.
+        seed: of the episode.
+
+    Returns:
+        The path written.
+
+    Raises:
+        ConfigError: no run folder, no checkpoint yet, no such policy, another kind of file, or an
+            environment that is none of Safety Gym's.
+        jaxsafe.command.NoVideo: this machine can draw nothing: no EGL, OSMesa or display.
+    """
+    run = run if isinstance(run, Run) else Run(run)
+    out = Path(path or run.folder / "video.mp4").expanduser()
+    if out.suffix not in (".mp4", ".gif"):
+        raise ConfigError(f"{out}: expected a name that ends in .mp4 or .gif")
+    _, env, algo, _ = run._opened
+    command.film(run._known.envs, env, algo, run._state(index), out, seed)
+    return out
+
+
+# ---- from Python's values to a command line --------------------------------------------------
+
+
+class Registries(NamedTuple):
+    """What the functions of `command` are handed: what the package has, and the caller's objects."""
+
+    envs: Any
+    algos: Any
+    chosen: list[str]  # the arguments of a command line that choose from them
+    own: dict[str, str]  # 'env', 'algo': the names of the caller's objects
+
+
+def registries(env: Any, algo: Any) -> Registries:
+    known_envs, env_texts, own_env = choose_env(env)
+    known_algos, algo_texts, own_algos = choose_algo(algo)
+    return Registries(known_envs, known_algos, [*env_texts, *algo_texts], own_env | own_algos)
+
+
+def say_whose(known: Registries, report: Report) -> None:
+    if known.own:
+        report.line(
+            f"only this program knows {' and '.join(known.own.values())}: the run continues and opens "
+            "from Python with the same object, not from the command line"
+        )
+
+
+def choose_env(env: Any) -> tuple[Any, list[str], dict[str, str]]:
+    """A registry that has `env`, the arguments that choose it, and its name if it is the caller's."""
+    if env is None:
+        return envs, [], {}
+    if isinstance(env, str):
+        command.load_own(env, envs)
+        return envs, [f"env={text(env)}"], {}
+    if isinstance(env, list | tuple):
+        if not env or not all(isinstance(e, str) for e in env):
+            raise ConfigError("env: expected names in a list; an object of yours stands alone")
+        return envs, ["env=" + ",".join(map(text, env))], {}
+    gym = isinstance(env, SafetyGym)
+    fields = command.to_plain(described(env))
+    if gym and isinstance(envs.ENVS.get(env.name), dict):  # a name and options say it all
+        defaults = command.to_plain(envs.env_defaults(env.name))
+        fields["engine"] = "auto" if env.engine == default_engine() else env.engine
+        changed = [f"env.{k}={text(v)}" for k, v in fields.items() if v != defaults[k]]
+        return envs, [f"env={env.name}", *changed], {}
+    name = env.name if gym else type(env).__name__
+    env = check_env(env, name)
+
+    def made(_: str, **options: Any) -> Env:
+        if options:
+            raise ConfigError(
+                f"{', '.join(f'env.{k}={v}' for k, v in options.items())}: this {name} has another "
+                "value; set it where you make the environment"
+            )
+        return env
+
+    own = {
+        "ENVS": {**envs.ENVS, name: fields},
+        "canonical": lambda given: given if given == name else envs.canonical(given),
+        "env_defaults": lambda given: dict(fields) if given == name else envs.env_defaults(given),
+        "make": made,
+    }
+    drawn = [] if gym else ["video=false"]  # there is a picture of Safety Gym's alone
+    return SimpleNamespace(**vars(envs) | own), [f"env={name}", *drawn], {"env": name}
+
+
+def described(env: Any) -> dict[str, Any]:
+    """What config.yaml keeps of an environment: the plain fields of a dataclass."""
+    fields = env.config if isinstance(env, SafetyGym) else env
+    if not dataclasses.is_dataclass(fields):
+        return {}
+    values = {f.name: getattr(fields, f.name) for f in dataclasses.fields(fields)}
+    return {name: value for name, value in values.items() if isinstance(value, PLAIN)}
+
+
+def choose_algo(algo: Any) -> tuple[Any, list[str], dict[str, str]]:
+    """As `choose_env`, for one algorithm or a list."""
+    if algo is None:
+        return algos, [], {}
+    names, own = [], {}
+    for one in algo if type(algo) in (list, tuple) else [algo]:  # an Entry is a tuple too
+        if isinstance(one, str):
+            names.append(one)
+            continue
+        kind: Any = getattr(one, "config", None)
+        make_algo: Any = getattr(one, "make", None)
+        if not (isinstance(kind, type) and dataclasses.is_dataclass(kind) and make_algo):
+            raise ConfigError(
+                f"algo: expected a name or an object with a config class and make, not {one!r}"
+            )
+        name = kind.__name__.removesuffix("Config")
+        own[name] = algos.Entry(kind, make_algo, "", {})
+        names.append(name)
+    known = SimpleNamespace(ALGOS={**algos.ALGOS, **own}) if own else algos
+    whose = {"algo": ", ".join(own)} if own else {}
+    return known, ["algo=" + ",".join(map(text, names))], whose
+
+
+def texts(known: Registries, options: dict[str, Any], swept: bool = False) -> list[str]:
+    """The arguments of the script that does the same. `swept`: a list holds several values."""
+    out = [*known.chosen]
+    for name, value in options.items():
+        key, value = key_of(name, known, swept), as_list(value)
+        if swept and isinstance(value, list):
+            if not value:
+                raise ConfigError(f"{name}=[]: expected values to sweep")
+            out.append(f"{key}={','.join(text(v) for v in value)}")
+        else:
+            out.append(f"{key}={text(value)}")
+    return out
+
+
+def as_list(value: Any) -> Any:
+    if isinstance(value, np.ndarray | jax.Array):
+        return value.tolist()
+    return list(value) if isinstance(value, range) else value
+
+
+def key_of(name: str, known: Registries, swept: bool) -> str:
+    """'total_steps', 'algo.cost_limit': an option as the command line calls it."""
+    own = [*SETTINGS, *(["max_parallel"] if swept else [])]
+    if "." in name or name in own:
+        return name
+    fields = {f.name for a in known.algos.ALGOS.values() for f in dataclasses.fields(a.config)}
+    if name not in fields:
+        raise ConfigError(f"unknown option {name}{nearest(name, [*own, *fields])}")
+    return f"algo.{name}"
+
+
+def text(value: Any) -> str:
+    """A plain value in Hydra's grammar."""
+    value = value.item() if isinstance(value, np.generic) else as_list(value)
+    if isinstance(value, str | Path):
+        value = str(value)
+        bare = re.fullmatch(r"[A-Za-z_./][\w./:-]*", value)
+        if bare and value.lower() not in ("true", "false", "null", "inf", "nan"):
+            return value
+        escaped = re.sub(r"(\\*)('|$)", lambda m: 2 * m[1] + ("\\'" if m[2] else ""), value)
+        return f"'{escaped}'"
+    if isinstance(value, list | tuple):
+        return f"[{','.join(map(text, value))}]"
+    if isinstance(value, dict):
+        return f"{{{','.join(f'{text(k)}: {text(v)}' for k, v in value.items())}}}"
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    if isinstance(value, int | float):
+        return repr(value)
+    raise ConfigError(f"{value!r}: expected a number, a string, true or false, None, a list or a dict")
+
+
+@contextlib.contextmanager
+def one_line() -> Iterator[None]:
+    """Hydra's errors, several lines long, as a ConfigError of one."""
+    try:
+        yield
+    except (HydraException, OmegaConfBaseException) as error:
+        raise ConfigError(command.one_line(error)) from error
