@@ -355,8 +355,9 @@ def render(
     out = Path(path or run.folder / "video.mp4").expanduser()
     if out.suffix not in (".mp4", ".gif"):
         raise ConfigError(f"{out}: expected a name that ends in .mp4 or .gif")
-    _, env, algo, _ = run._opened
-    command.film(run._known.envs, env, algo, run._state(index), out, seed)
+    settings, env, algo, _ = run._opened
+    actor = command.Actor(settings, env, algo, run._state(index))
+    command.film(run._known.envs, [actor], out, seed)
     return out
 
 
