@@ -270,7 +270,7 @@ def fetch(address: str) -> bytes:
 
 @pytest.mark.slow  # needs playwright and Debian's chromium
 def test_a_browser_shows_it_and_its_keys_drive(page):
-    from playwright.sync_api import sync_playwright
+    from playwright.sync_api import sync_playwright  # pyright: ignore[reportMissingImports]
 
     with sync_playwright() as play:
         quiet = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--no-first-run"]
