@@ -124,11 +124,13 @@ def test_a_rod_and_a_box_are_as_far_apart_as_mujoco_says(rod):
 
     dist, _, frame = contacts(qpos)
     truth = np.array(truth)
-    error = np.abs(dist[:, 0] - truth[:, 0])
+    error = np.abs(dist.min(1) - truth[:, 0])
     assert np.median(error) < 1e-5 and np.quantile(error, 0.97) < 4e-3  # rims on corners
     certain = np.abs(truth[:, 0]) > 1e-3
     assert np.median((frame[:, 0, 0] * truth[:, 1:])[certain].sum(1)) > 0.999
-    assert (dist[:, 1] >= dist[:, 0]).all()
+    beside = (np.arange(200) % 2 == 1) & (np.abs(truth[:, 3]) < 0.1)  # sides touch at both their ends
+    alike = np.abs(dist[beside, 0] - dist[beside, 1]) < 1e-5
+    assert beside.sum() > 10 and alike.mean() > 0.9  # but where an end just meets a corner
 
 
 @pytest.mark.parametrize("engine", ["c", "warp"])

@@ -9,10 +9,16 @@ import jax.numpy as jnp
 import pytest
 from toys import Clock, Corridor
 
-from jaxsafe import algos, command, envs
+from jaxsafe import algos, command, envs, viewing
 from jaxsafe.config import ConfigError
 from jaxsafe.env_check import check_env
 from jaxsafe.envs.suite import ROBOTS, TASKS
+
+MAINS = {
+    "train": command.train_main,
+    "evaluate": command.evaluate_main,
+    "render": viewing.render_main,
+}
 
 
 @pytest.fixture(autouse=True)
@@ -150,7 +156,7 @@ def call(tmp_path, monkeypatch, capsys):
     def call(script: str, *args: str) -> tuple[int | str | None, str, str]:
         monkeypatch.setattr(sys, "argv", [f"{script}.py", *args])
         try:
-            status = getattr(command, f"{script}_main")(envs, algos)
+            status = MAINS[script](envs, algos)
         except SystemExit as stop:
             status = stop.code
         return status, *capsys.readouterr()
