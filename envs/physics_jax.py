@@ -105,9 +105,9 @@ def rod_box(rod: Any, box: Any, cap: float) -> Collision:
     high = jnp.min(jnp.where(free, bounds[1], half), initial=half)
     point = jnp.clip((pairs[0][1] - centre).dot(axis), -half, half)
     point = jnp.where(jnp.abs(lean) > FLAT, jnp.sign(lean) * half, point)
-    ends = jnp.where(lies & (low < high), jnp.stack([low, high]), point)
-    rise = jnp.max(ends * lean) - ends * lean  # of the rod's side over the box, from the deepest end
     second = lies & (low < high)
+    ends = jnp.where(second, jnp.stack([low, high]), point)
+    rise = jnp.max(ends * lean) - ends * lean  # of the rod's side over the box, from the deepest end
 
     # from the axis to the rod's farthest point along n
     across = n - lean * axis

@@ -310,10 +310,10 @@ def evaluate(
 
     Returns:
         Printed, a table. `scores.rows` has an estimate (mean, low, high: the 95 % bootstrap interval
-        over seeds and episodes) of 'return' and 'cost' (undiscounted sums of an episode), 'violation
-        rate' (the share of episodes over the limit), 'episode length' (steps), 'cost rate (training)'
-        (cost a step) and, where known, Safety Gym's normalised scores; `scores.seeds` has the mean of
-        each seed.
+        over seeds, or over the episodes of a lone one) of 'return' and 'cost' (undiscounted sums of an
+        episode), 'violation rate' (the share of episodes over the limit), 'episode length' (steps),
+        'cost rate (training)' (cost a step) and, where known, Safety Gym's normalised scores;
+        `scores.seeds` has the mean of each seed.
 
     Raises:
         ConfigError: no run folder, no checkpoint yet, no such setting, or episodes < 1.
@@ -353,8 +353,7 @@ def render(
     """
     run = run if isinstance(run, Run) else Run(run)
     out = Path(path or run.folder / "video.mp4").expanduser()
-    if out.suffix not in (".mp4", ".gif"):
-        raise ConfigError(f"{out}: expected a name that ends in .mp4 or .gif")
+    command.check_video(out)
     settings, env, algo, _ = run._opened
     actor = command.Actor(settings, env, algo, run._state(index))
     command.film(run._known.envs, [actor], out, seed)

@@ -648,6 +648,11 @@ class Actor(NamedTuple):
         return self.algo.act(self.ts, obs, None)
 
 
+def check_video(path: Path) -> None:
+    if path.suffix not in (".mp4", ".gif"):
+        raise ConfigError(f"{path}: expected a name that ends in .mp4 or .gif")
+
+
 def film(
     envs: Any, actors: list[Actor], path: Path, seed: int, labels: list[str] | None = None
 ) -> None:

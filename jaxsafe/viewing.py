@@ -14,6 +14,7 @@ from jaxsafe import runner
 from jaxsafe.command import (
     Actor,
     NoVideo,
+    check_video,
     compose,
     fail,
     film,
@@ -106,8 +107,7 @@ def render_main(envs: Any, algos: Any) -> int:
             raise ConfigError(f"{own[0]}: expected a run folder too")
         several = len(folders) > 1
         out = args.out or (Path("compared.mp4") if several else folders[0] / "video.mp4")
-        if out.suffix not in (".mp4", ".gif"):
-            raise ConfigError(f"--out {out}: expected a name that ends in .mp4 or .gif")
+        check_video(out)
         actors = [open_actor(f, next(iter(own), None), args.index, envs, algos) for f in folders]
         check_one_task(folders, actors)
         names = labels(folders, [actor.settings.algo_name for actor in actors]) if several else None

@@ -3,6 +3,8 @@ from collections.abc import Iterator
 import jax
 import pytest
 
+from jaxsafe.envs import render
+
 
 @pytest.fixture(autouse=True, scope="module")
 def forgotten_programs(request: pytest.FixtureRequest) -> Iterator[None]:
@@ -13,3 +15,12 @@ def forgotten_programs(request: pytest.FixtureRequest) -> Iterator[None]:
     yield
     if not request.module.__name__.startswith("test_envs"):
         jax.clear_caches()
+
+
+@pytest.fixture(scope="session")
+def display() -> None:
+    """What draws pictures, where the machine has it."""
+    try:
+        render.find_backend()
+    except render.NoDisplay as error:
+        pytest.skip(str(error))

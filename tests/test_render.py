@@ -20,14 +20,6 @@ from jaxsafe.envs import render
 WIDTH, HEIGHT = 320, 240
 
 
-@pytest.fixture(scope="module")
-def display() -> None:
-    try:
-        render.find_backend()
-    except render.NoDisplay as error:
-        pytest.skip(str(error))
-
-
 def reset(name: str, **options):
     env = envs.make(name, engine="c", **options)
     return env, jax.jit(env.reset)(jax.random.key(0))

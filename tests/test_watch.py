@@ -21,7 +21,7 @@ import pytest
 
 from jaxsafe import algos, envs, viewing
 from jaxsafe.config import ConfigError
-from jaxsafe.envs import render, watch
+from jaxsafe.envs import watch
 from jaxsafe.envs.driving import FRONT, drive, robot_of
 
 ROOT = Path(__file__).parent.parent
@@ -197,7 +197,9 @@ def test_without_a_display_a_page_needs_its_package_a_port_and_a_browser_to_open
 
 def test_render_refuses_in_one_line(monkeypatch, capsys):
     assert "not a run folder" in said(monkeypatch, capsys, viewing.render_main, "nowhere", "elsewhere")
-    assert "--out a.avi" in said(monkeypatch, capsys, viewing.render_main, "nowhere", "--out", "a.avi")
+    assert "a.avi: expected a name that ends in" in said(
+        monkeypatch, capsys, viewing.render_main, "nowhere", "--out", "a.avi"
+    )
     assert "expected a run folder" in said(monkeypatch, capsys, viewing.render_main, "env=a:b")
 
 
@@ -234,12 +236,8 @@ def free_port() -> int:
 
 
 @pytest.fixture(scope="module")
-def page() -> Any:
+def page(display: None) -> Any:
     """A page that plays point_goal0, in a process of its own: (process, address)."""
-    try:
-        render.find_backend()
-    except render.NoDisplay as error:
-        pytest.skip(str(error))
     port = free_port()  # NiceGUI serves nothing where it sees pytest
     environ = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
     process = subprocess.Popen(
