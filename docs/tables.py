@@ -4,6 +4,7 @@ Each table stands between <!-- table: NAME --> and <!-- end -->; a test holds th
 """
 
 import functools
+from collections.abc import Mapping
 from pathlib import Path
 
 from jaxsafe.algos import ALGOS
@@ -58,14 +59,20 @@ TABLES = {
 }
 
 
+def replaced(text: str, written: Mapping[str, str]) -> str:
+    """`text` with what stands between the marks of these tables."""
+    for name, table in written.items():
+        begin, end = f"<!-- table: {name} -->\n", "\n<!-- end -->"
+        before, found, rest = text.partition(begin)
+        if not found:
+            raise ValueError(f"no {begin.strip()}")
+        text = before + begin + table + end + rest.partition(end)[2]
+    return text
+
+
 def filled(path: Path) -> str:
     """The file's text with its tables made anew."""
-    text = path.read_text()
-    for name, table in TABLES[path].items():
-        begin, end = f"<!-- table: {name} -->\n", "\n<!-- end -->"
-        before, _, rest = text.partition(begin)
-        text = before + begin + table() + end + rest.partition(end)[2]
-    return text
+    return replaced(path.read_text(), {name: table() for name, table in TABLES[path].items()})
 
 
 if __name__ == "__main__":

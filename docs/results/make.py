@@ -1,19 +1,25 @@
-"""Draw the curves and print the numbers of these runs: python docs/results/make.py
+"""Draw the curves of these runs and write the tables of README.md and ../../README.md:
+
+    python docs/results/make.py
 
 Each folder holds the metrics of one command (versions.json has it), compressed. The runs compared, in
 tables and figures: python scripts/plot.py docs/results --published docs/results/published.csv
 """
 
+import importlib
 import json
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
 
-from jaxsafe import compare, plots, run_folder, scores, stats, tables
+from jaxsafe import algos, compare, envs, plots, run_folder, scores, stats, tables
 
 HERE = Path(__file__).parent
-LIMIT = 25.0
+sys.path.insert(0, str(HERE.parent))
+marked = importlib.import_module("tables")
 # OmniSafe: evaluated policies. We know of no constrained table of Push.
 PUBLISHED = compare.read_published(HERE / "published.csv")
 # Where a run's evaluation.json was not kept: what its command printed.
@@ -52,7 +58,39 @@ def published(env: str, algo: str) -> str:
 def row(name: str, metrics: dict[str, np.ndarray], *more: str) -> str:
     figures = (last_tenth(metrics, f"train/{what}") for what in ("return", "cost"))
     minutes = f"{metrics['seconds'].max() / 60:.1f}"
-    return f"| {' | '.join([name, str(len(np.unique(metrics['seed']))), *figures, *more, minutes])} |"
+    what = " ".join(f"`{part}`" for part in name.split("-", 2))
+    return f"| {' | '.join([what, str(len(np.unique(metrics['seed']))), *figures, *more, minutes])} |"
+
+
+def all_runs() -> str:
+    """A row for each folder."""
+    lines = [
+        "| run | seeds | return, last 10% | cost, last 10% | final policy | published | minutes |",
+        "|---|---:|---:|---:|---|---|---:|",
+    ]
+    for path in sorted(HERE.glob("*/config.yaml")):
+        name, metrics = path.parent.name, run_folder.read_metrics(path.parent)
+        env, algo, *_ = name.split("-")
+        lines.append(row(name, metrics, final_policy(name), published(env, algo)))
+    return "\n".join(lines)
+
+
+def by_algorithm(groups: Sequence[compare.Group]) -> str:
+    """Return and cost of each algorithm on each task, beside what is published."""
+    tasks = sorted({g.env for g in groups})
+    found = {(g.env, g.name): g for g in groups}
+    known = [env for env in tasks if any(env == other for other, _ in PUBLISHED)]
+    header = [c for env in tasks for c in (f"`{env}`", *(["OmniSafe"] * (env in known)))]
+    lines = [f"| | {' | '.join(header)} |", "|---|" + "---:|" * len(header)]
+    for algo in sorted({g.name for g in groups}):
+        cells = []
+        for env in tasks:
+            g, theirs = found.get((env, algo)), PUBLISHED.get((env, algo))
+            cells.append(f"{g.ret.mean:.1f}, {g.cost.mean:.1f}" if g else "")
+            if env in known:
+                cells.append(f"{theirs.ret[0]:.1f}, {theirs.cost[0]:.1f}" if theirs else "")
+        lines.append(f"| `{algo}` | {' | '.join(cells)} |")
+    return "\n".join(lines)
 
 
 def throughput(path: Path) -> None:
@@ -82,17 +120,25 @@ def throughput(path: Path) -> None:
     plt.close(figure)
 
 
+def figures(groups: Sequence[compare.Group]) -> None:
+    """Curves of every task, and return against cost."""
+    plots.save(plots.learning(groups), HERE / "curves", ["png"])
+    known = {(g.env, g.name): compare.beside(g, PUBLISHED) for g in groups}
+    plots.save(plots.trade_off(groups, "last 10 % of training", known), HERE / "trade_off", ["png"])
+
+
 def main() -> None:
     throughput(HERE / "throughput.png")
-    print("| run | seeds | return | cost (limit 25) | final policy | published | minutes |")
-    print("|---|---:|---:|---:|---|---|---:|")
-    for path in sorted(HERE.glob("*/config.yaml")):
-        name, metrics = path.parent.name, run_folder.read_metrics(path.parent)
-        plots.curves(metrics, HERE / f"{name}.png", name.replace("-", ", "), LIMIT)
-        env, algo, *_ = name.split("-")
-        print(row(name, metrics, final_policy(name), published(env, algo)))
+    runs = [run for run in compare.read([HERE], envs, algos) if run.config["preset"] == "fast"]
+    groups = compare.ordered(compare.group(runs, ["algo.name"]))
+    figures(groups)
+    for path, name, table in (
+        (HERE / "README.md", "runs", all_runs()),
+        (HERE.parent.parent / "README.md", "results", by_algorithm(groups)),
+    ):
+        path.write_text(marked.replaced(path.read_text(), {name: table}))
     for path in sorted((HERE / "ablations").glob("*.csv.xz")):
-        print(row(path.name.removesuffix(".csv.xz"), run_folder.read_table(path), "-", "-"))
+        print(row(path.name.removesuffix(".csv.xz"), run_folder.read_table(path)))
 
 
 if __name__ == "__main__":
