@@ -19,10 +19,15 @@ import jax
 import mujoco
 import warp as wp
 from mujoco.mjx.third_party import mujoco_warp
-from mujoco.mjx.third_party.mujoco_warp._src import collision_primitive, collision_primitive_core
+from mujoco.mjx.third_party.mujoco_warp._src import (
+    collision_primitive,
+    collision_primitive_core,
+    solver,
+)
 
 from jaxsafe.envs.physics import STATE, columns, widths
 from jaxsafe.envs.scene import Scene
+from jaxsafe.envs.solver_warp import solve
 
 wp.config.log_level = wp.LOG_WARNING  # a line for every kernel otherwise
 
@@ -60,8 +65,9 @@ def plane_capsule(
     return wp.vec2(dist1, dist2), at, frame
 
 
-# Before Warp compiles the kernels that name it; for all users of these kernels in the process.
+# For all users of MuJoCo Warp in the process; before Warp compiles the kernels that name the function.
 collision_primitive.plane_capsule = plane_capsule
+solver.solve = solve
 
 
 @wp.kernel

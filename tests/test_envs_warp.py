@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 from tasks import task
@@ -62,3 +63,82 @@ def test_contacts_without_room_are_counted():
     assert (t.idle(t.begin(64)).info["overflow"] == 1).all()
     with pytest.raises(envs.ConfigError, match=r"env.contact_room=0.0: expected above 0"):
         envs.make("point_goal1", contact_room=0.0)
+
+
+ROOM = """
+<mujoco>
+  <option timestep="0.01"/>
+  <worldbody>
+    <geom type="plane" size="5 5 1"/>
+    <body pos="0 0 .1">
+      <freejoint/><geom type="box" size=".1 .1 .1" condim="6" friction="1 .01 .01"/>
+    </body>
+    <body pos="1 0 1">
+      <joint name="a" axis="0 1 0" frictionloss=".5" limited="true" range="-20 20"/>
+      <geom type="capsule" fromto="0 0 0 .5 0 0" size=".05"/>
+      <body pos=".5 0 0">
+        <joint name="b" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 .4 0 0" size=".05"/>
+      </body>
+    </body>
+    <body pos="-1 0 1">
+      <joint name="c" axis="0 1 0" frictionloss=".01"/>
+      <geom type="capsule" fromto="0 0 0 .5 0 0" size=".05"/>
+    </body>
+  </worldbody>
+  <equality><joint joint1="b" joint2="c" polycoef="0 .5 0 0 0"/></equality>
+</mujoco>
+"""
+
+
+def test_the_solver_finds_what_mujocos_finds():
+    """Contacts, limits, equalities and dry friction, from the states on the way of 30 steps."""
+    from mujoco.mjx.third_party import mujoco_warp
+
+    from jaxsafe.envs import physics_warp, solver_warp
+
+    assert physics_warp.solver.solve is solver_warp.solve
+    model = mujoco.MjSpec.from_string(ROOM).compile()  # type: ignore[attr-defined]
+    m, worlds = mujoco_warp.put_model(model), 16
+    d = mujoco_warp.make_data(model, nworld=worlds, nconmax=20, njmax=80)
+    assert solver_warp.ours(m, d)
+    rng = np.random.default_rng(0)
+    d.qpos.assign(np.tile(model.qpos0, (worlds, 1)) + np.r_[0, 0, 0.05, np.zeros(4), 0.3, 0.3, 0.3])
+    d.qvel.assign(rng.normal(size=(worlds, model.nv)))
+    kinds, most = set(), 0
+    for _ in range(30):
+        mujoco_warp.step(m, d)
+        mujoco_warp.forward(m, d)
+        kinds |= {
+            int(k) for row, n in zip(d.efc.type.numpy(), d.nefc.numpy(), strict=True) for k in row[:n]
+        }
+        found = {}
+        for solve in (solver_warp.theirs, solver_warp.solve):
+            solve(m, d)
+            for name, x in (("qacc", d.qacc), ("qfrc", d.qfrc_constraint), ("Ma", d.efc.Ma)):
+                found.setdefault(name, []).append(x.numpy().copy())
+            given = np.arange(d.njmax) < d.nefc.numpy()[:, None]
+            found.setdefault("force", []).append(np.where(given, d.efc.force.numpy(), 0))
+            found.setdefault("iterations", []).append(d.solver_niter.numpy().copy())
+        for name, (theirs, ours) in found.items():
+            if name == "iterations":
+                assert (ours <= np.maximum(theirs, 1) + 2).all()
+                most = max(most, ours.max())
+            else:
+                scale = np.abs(theirs).max(axis=1, keepdims=True)
+                assert (np.abs(ours - theirs) < 2e-4 * (1 + scale)).all(), name
+    assert len(kinds) >= 4 and most > 2, (kinds, most)
+
+
+def test_the_solver_stops_where_numbers_have_ended():
+    from mujoco.mjx.third_party import mujoco_warp
+
+    from jaxsafe.envs import solver_warp
+
+    model = mujoco.MjSpec.from_string(ROOM).compile()  # type: ignore[attr-defined]
+    m, d = mujoco_warp.put_model(model), mujoco_warp.make_data(model, nworld=2, nconmax=20, njmax=80)
+    mujoco_warp.forward(m, d)
+    right = d.qacc.numpy().copy()
+    d.qfrc_smooth.assign(np.stack([np.full(model.nv, np.nan), d.qfrc_smooth.numpy()[1]]))
+    solver_warp.solve(m, d)
+    assert np.isnan(d.qacc.numpy()[0]).any() and d.solver_niter.numpy()[0] < 3
+    np.testing.assert_allclose(d.qacc.numpy()[1], right[1], rtol=1e-3, atol=1e-3)
