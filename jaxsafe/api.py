@@ -24,7 +24,7 @@ from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
 from jaxsafe import algos, command, compare, distributed, envs, run_folder, runner, sweeps
-from jaxsafe.config import ConfigError, nearest
+from jaxsafe.config import ConfigError, flat, nearest
 from jaxsafe.env_check import check_env
 from jaxsafe.envs import SafetyGym, SafetyGymConfig
 from jaxsafe.envs.physics import default_engine
@@ -272,7 +272,8 @@ def sweep(env: Any = None, algo: Any = None, **options: Any) -> SweepResult:
         env: as of `train`, or a list of names.
         algo: as of `train`, or a list.
         options: as of `train`; a list holds the values to sweep, so that a value which is itself a
-            list is a tuple. `max_parallel` is the number of members trained at once, by default as
+            list is a tuple; `cost_limits={"hazards": [5, 10], "vases_contact": 25}` sweeps one limit of
+            several. `max_parallel` is the number of members trained at once, by default as
             many as the memory holds; `run_dir` the sweep's folder.
 
     Returns:
@@ -460,7 +461,7 @@ def choose_algo(algo: Any) -> tuple[Any, list[str], dict[str, str]]:
 def texts(known: Registries, options: dict[str, Any], swept: bool = False) -> list[str]:
     """The arguments of the script that does the same. `swept`: a list holds several values."""
     out = [*known.chosen]
-    for name, value in options.items():
+    for name, value in (flat(options) if swept else options).items():
         key, value = key_of(name, known, swept), as_list(value)
         if swept and isinstance(value, list):
             if not value:
@@ -480,10 +481,11 @@ def as_list(value: Any) -> Any:
 def key_of(name: str, known: Registries, swept: bool) -> str:
     """'total_steps', 'algo.cost_limit': an option as the command line calls it."""
     own = [*SETTINGS, *(["max_parallel"] if swept else [])]
-    if "." in name or name in own:
+    head = name.partition(".")[0]
+    if head in ("env", "algo") or name in own:
         return name
     fields = {f.name for a in known.algos.ALGOS.values() for f in dataclasses.fields(a.config)}
-    if name not in fields:
+    if head not in fields:
         raise ConfigError(f"unknown option {name}{nearest(name, [*own, *fields])}")
     return f"algo.{name}"
 

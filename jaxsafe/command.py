@@ -37,8 +37,8 @@ from rich.console import Console
 
 import jaxsafe
 from jaxsafe import checkpoint, distributed, evaluation, plots, run_folder, runner, stats
-from jaxsafe.config import ConfigError, float_fields, from_dict, nearest
-from jaxsafe.constraints import check_names, own_limits
+from jaxsafe.config import ConfigError, flat, from_dict, is_float, nearest
+from jaxsafe.constraints import check_names, in_words, own_limits
 from jaxsafe.on_policy import Algorithm
 from jaxsafe.progress import Report
 from jaxsafe.types import Env, PyTree
@@ -51,6 +51,7 @@ ON_RESUME = (
     "video",
 )  # may change
 NOT_COMPARED = ("run_dir", "resume", *ON_RESUME)
+NAMED = "algo.cost_limits"  # floats by name: {hazards: 10}, or each as algo.cost_limits.hazards=10
 DEFAULT = {"env": "point_goal1", "algo": "ppo_lag"}
 BAD_DISK = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO)
 # Bounds of the hyperparameters that have one wherever they occur.
@@ -96,9 +97,7 @@ class Settings(NamedTuple):
 
     def plain(self) -> dict[str, Any]:
         """As config.yaml has it: a float in which the settings differ is a list of one a setting."""
-        fields = [dataclasses.asdict(cfg) for cfg in self.configs]
-        swept = [name for name in fields[0] if any(f[name] != fields[0][name] for f in fields)]
-        algo = fields[0] | {name: [f[name] for f in fields] for name in swept}
+        algo = together([dataclasses.asdict(cfg) for cfg in self.configs])
         return to_plain(
             {
                 "env": {"name": self.env_name, **self.env_options},
@@ -188,6 +187,9 @@ def read_arguments(argv: list[str], envs: Any, algos: Any) -> Request:
         check_key(override, text, base, groups, chosen)
         if override.is_sweep_override() and not args.multirun and not override.is_hydra_override():
             raise ConfigError(f"{text}: several values need --multirun (-m); a list is written [a,b]")
+    # Hydra adds a name to a dict, or to what was null, only if told to, and after the dict itself
+    alone = [text for text in texts if text.startswith(f"{NAMED}.")]
+    texts = [text for text in texts if text not in alone] + [f"++{text}" for text in alone]
     return Request([*flags, *texts], base, groups)
 
 
@@ -229,10 +231,11 @@ def check_key(
     elif head not in groups:
         raise ConfigError(f"unknown option {key}{nearest(head, groups)}")
     else:
+        option = NAMED.partition(".")[2] if key.startswith(f"{NAMED}.") else option
         for name in chosen[head]:
             options = [o for o in groups[head][name] if o != "name"]
             if option not in options:
-                if option == "cost_limits" and (
+                if f"{head}.{option}" == NAMED and (
                     takers := [n for n, o in groups[head].items() if option in o]
                 ):
                     raise ConfigError(
@@ -342,7 +345,9 @@ def settle(config: dict[str, Any], envs: Any, algos: Any) -> Settings:
 def settings_in(algo: dict[str, Any], kind: type) -> list[dict[str, Any]]:
     """One set of options a setting, where lists stand for floats: the first of each, the second, ..."""
     lists = {
-        name: algo[name] for name in float_fields(kind) if isinstance(algo.get(name), list | tuple)
+        name: value
+        for name, value in flat(algo).items()
+        if is_float(kind, name) and isinstance(value, list | tuple)
     }
     lengths = {name: len(values) for name, values in lists.items()}
     if len({*lengths.values()}) > 1 or 0 in lengths.values():
@@ -355,7 +360,29 @@ def settings_in(algo: dict[str, Any], kind: type) -> list[dict[str, Any]]:
         if rows.count(row) > 1:
             same = ", ".join(f"algo.{name}={v}" for name, v in zip(lists, row, strict=True))
             raise ConfigError(f"{same} occurs twice")
-    return [algo | dict(zip(lists, row, strict=True)) for row in rows]
+    return [replaced(algo, dict(zip(lists, row, strict=True))) for row in rows]
+
+
+def replaced(options: dict[str, Any], new: dict[str, Any], where: str = "") -> dict[str, Any]:
+    """`options` with some values, by their names in `flat`, replaced."""
+    return {
+        k: replaced(v, new, f"{where}{k}.") if isinstance(v, dict) else new.get(f"{where}{k}", v)
+        for k, v in options.items()
+    }
+
+
+def together(settings: list[Any]) -> Any:
+    """The inverse of `settings_in`: a list stands where the settings differ."""
+    first = settings[0]
+    if isinstance(first, dict):
+        return {name: together([each[name] for each in settings]) for name in first}
+    return first if all(each == first for each in settings) else settings
+
+
+def differences(a: dict[str, Any], b: dict[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """The names that have not the same value in both, with both values."""
+    pairs = {name: (a.get(name), b.get(name)) for name in {**a, **b}}
+    return {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
 
 
 def make_env(settings: Settings, envs: Any) -> Env:
@@ -421,9 +448,8 @@ def agree_on_folder(
     mine = flat(settings.plain())
     folder = choose_folder(settings, envs, algos, job, say) if distributed.leads() else ""
     folder, theirs = json.loads(distributed.first_text(json.dumps([str(folder), mine])))
-    for name, value in mine.items():
-        if theirs.get(name) != value:
-            raise ConfigError(f"{name}={value} in this process, {theirs.get(name)} in process 0")
+    for name, (here, there) in differences(mine, theirs).items():
+        raise ConfigError(f"{name}={here} in this process, {there} in process 0")
     return Path(folder)
 
 
@@ -433,10 +459,10 @@ def compare(settings: Settings, folder: Path, envs: Any, algos: Any) -> None:
     free = {*NOT_COMPARED}
     if len(settings.configs) * settings.train.num_seeds > 1:
         free.add("devices")  # each member is whole on one of them
-    for name, value in flat(settings.plain()).items():
-        if name not in free and saved.get(name) != value:
+    for name, (here, there) in differences(flat(settings.plain()), saved).items():
+        if name not in free:
             raise ConfigError(
-                f"{name}={value} but {folder} was trained with {saved.get(name)}; "
+                f"{name}={here} but {folder} was trained with {there}; "
                 f"for a new run from its policy use init_from={folder}"
             )
 
@@ -565,6 +591,7 @@ class Scores(NamedTuple):
 
     name: str  # '' where there is but one
     cost_limit: float
+    limits: dict[str, float]  # of named costs, where those have their own; else of '', the cost
     episodes: int  # of all its seeds
     rows: dict[str, stats.Estimate]
     seeds: dict[str, list[float]]  # the mean over the episodes of each
@@ -584,10 +611,11 @@ def evaluate(
     for i, member in enumerate(runner.members(settings.configs, settings.train)[::seeds]):
         own = evaluation.Episodes(*(x[i * seeds : (i + 1) * seeds] for x in episodes))
         limit, metrics = float(member.algo.cost_limit), tables[i] if i < len(tables) else {}
-        found = evaluation.measures(own, cost_names, own_limits(member.algo) or {"": limit})
+        limits = own_limits(member.algo) or {"": limit}
+        found = evaluation.measures(own, cost_names, limits)
         rows = evaluation.summary(settings.env_name, found, limit, metrics)
         by_seed = {name: values.mean(1).tolist() for name, values in found.items()}
-        scores.append(Scores(member.setting, limit, own.ret.size, rows, by_seed))
+        scores.append(Scores(member.setting, limit, limits, own.ret.size, rows, by_seed))
     return scores
 
 
@@ -607,13 +635,12 @@ def finish(settings: Settings, env: Env, envs: Any, algos: Any, folder: Path, re
         tables = {s.name: evaluation.as_json(s.rows) | {"seeds": s.seeds} for s in found}
         text = json.dumps({"episodes": train.eval_episodes, **tables.get("", tables)}, indent=1)
         run_folder.replace_text(folder / "evaluation.json", text)
-        several = ", ".join(f"{k} {v:g}" for k, v in own_limits(settings.algo).items())
-        for name, limit, episodes, rows, _ in found:
+        for name, _, limits, episodes, rows, _ in found:
             ret, cost, rate = rows["return"], rows["cost"], rows["violation rate"]
             report.line(
                 f"final policy{name and ', ' + name}: return {ret.mean:.4g} [{ret.low:.4g}, "
                 f"{ret.high:.4g}], cost {cost.mean:.4g} [{cost.low:.4g}, {cost.high:.4g}] "
-                f"(limit {several or f'{limit:g}'}), "
+                f"(limit {in_words(limits)}), "
                 f"{100 * rate.mean:.0f}% of {episodes} episodes over it"
             )
 
@@ -832,7 +859,7 @@ def evaluate_main(envs: Any, algos: Any) -> int:
         )
         for s in evaluate(settings, algo, ts, args.episodes, args.seed, args.run):
             if not alone:
-                print(f"\n{s.name} | cost limit {s.cost_limit:g}")
+                print(f"\n{s.name} | cost limit {in_words(s.limits)}")
             print(s)
         return 0
 
@@ -849,16 +876,6 @@ def to_plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [to_plain(v) for v in value]
     return value.item() if isinstance(value, np.generic) else value
-
-
-def flat(config: dict[str, Any]) -> dict[str, Any]:
-    """{'algo.clip': 0.2, ...}, one level deep."""
-    out: dict[str, Any] = {}
-    for name, value in config.items():
-        out |= (
-            {f"{name}.{k}": v for k, v in value.items()} if isinstance(value, dict) else {name: value}
-        )
-    return out
 
 
 def one_line(error: BaseException) -> str:

@@ -28,8 +28,8 @@ import numpy as np
 
 import jaxsafe
 from jaxsafe import command, evaluation, plots, run_folder, runner, scores, stats, tables
-from jaxsafe.config import ConfigError, nearest
-from jaxsafe.constraints import own_limits
+from jaxsafe.config import ConfigError, flat, nearest
+from jaxsafe.constraints import in_words, own_limits, written
 from jaxsafe.stats import Estimate
 from jaxsafe.tables import Table
 
@@ -50,7 +50,7 @@ class Run(NamedTuple):
     folder: Path
     env: str
     config: dict[str, Any]  # {'env.name': ..., 'algo.clip': ...}, and the folder as 'run_dir'
-    cost_limit: float  # NaN where named costs have limits of their own
+    limits: dict[str, float]  # by the name of a cost; '' is their sum
     table: dict[str, np.ndarray]  # the columns of metrics.csv
     seeds: np.ndarray  # [S]
     values: dict[str, np.ndarray]  # [S] by name; NaN for a seed without complete episodes
@@ -86,10 +86,15 @@ class Group(NamedTuple):
         return names.pop() if len(names) == 1 else None
 
     @property
+    def limits(self) -> dict[str, float]:
+        """Empty where runs have different ones."""
+        first = self.runs[0].limits
+        return first if all(run.limits == first for run in self.runs) else {}
+
+    @property
     def cost_limit(self) -> float:
-        """NaN of several."""
-        limits = {run.cost_limit for run in self.runs}
-        return limits.pop() if len(limits) == 1 else np.nan
+        """NaN of several, and where named costs have limits of their own."""
+        return self.limits.get("", np.nan)
 
     @property
     def steps(self) -> int:
@@ -123,13 +128,17 @@ class Group(NamedTuple):
 
     @property
     def held(self) -> str:
-        """Whether the limit is: 'unclear' where the mean is above it and its interval is not."""
-        cost, limit = self.cost, self.cost_limit
-        if np.isnan(cost.mean) or np.isnan(limit):
-            return "-"
-        if cost.mean <= limit:
-            return "yes"
-        return "unclear" if cost.low <= limit else "no"
+        """Whether each limit is: 'unclear' where the mean is above it and its interval is not."""
+
+        def answer(cost: Estimate, limit: float) -> str:
+            if np.isnan(cost.mean):
+                return "-"
+            if cost.mean <= limit:
+                return "yes"
+            return "unclear" if cost.low <= limit else "no"
+
+        found = {answer(self.estimate(written(name)), most) for name, most in self.limits.items()}
+        return next((word for word in ("no", "-", "unclear", "yes") if word in found), "-")
 
 
 @functools.cache
@@ -199,16 +208,16 @@ def read_one(folder: Path, envs: Any, algos: Any) -> list[Run]:
     names = [m.setting for m in runner.members(saved.configs, saved.train)[:: saved.train.num_seeds]]
     for cfg, name, table in zip(saved.configs, names, parts, strict=False):
         own = own_limits(cfg)
-        limit = np.nan if own else float(cfg.cost_limit)
-        fields = command.flat(saved._replace(configs=(cfg,)).plain()) | {"run_dir": str(folder)}
-        values, seeds = measured(saved.env_name, table, own or {"": limit}), np.unique(table["seed"])
+        limits = own or {"": float(cfg.cost_limit)}
+        fields = flat(saved._replace(configs=(cfg,)).plain()) | {"run_dir": str(folder)}
+        values, seeds = measured(saved.env_name, table, limits), np.unique(table["seed"])
         for what, final in run_folder.read_evaluation(folder, name).items():
             if len(final) != len(seeds):
                 raise ConfigError(
                     f"{folder}: evaluation.json is of {len(final)} seeds, metrics.csv of {len(seeds)}"
                 )
             values[f"final {what}"] = final
-        runs.append(Run(folder, saved.env_name, fields, limit, table, seeds, values))
+        runs.append(Run(folder, saved.env_name, fields, limits, table, seeds, values))
     return runs
 
 
@@ -235,7 +244,7 @@ def measured(
     if (rate := evaluation.cost_rate(columns)) is not None:
         values["cost rate"] = rate
     for name in cost_names(table):
-        values[f"cost {name}"] = late(f"train/cost_{name}")
+        values[written(name)] = late(f"train/cost_{name}")
     if env in scores.CHARACTERISTIC:
         values["normalised return"] = scores.normalized_return(env, values["return"])
         if "" in limits:
@@ -376,7 +385,7 @@ def results(
     """Return or cost: a row a setting, with what was published below it, and a column a task."""
     envs = tasks_of(groups)
     at = {(g.name, g.env): g for g in groups}
-    limits = {g.cost_limit for g in groups}
+    limits = {in_words(g.limits) for g in groups}
     safe = [g for g in groups if g.held == "yes" and not np.isnan(g.ret.mean) and len(limits) == 1]
     best = {env: max((g.ret.mean for g in safe if g.env == env), default=None) for env in envs}
     rows = []
@@ -401,8 +410,8 @@ def results(
             rows.append([source, *theirs])
     what = "Return" if metric == "return" else "Cost"
     caption = f"{what} of an episode, last 10% of training: mean and 95% interval over seeds."
-    if len(limits) == 1 and not np.isnan(limit := next(iter(limits))):
-        caption += f" Cost limit {limit:g}."
+    if len(limits) == 1 and (words := next(iter(limits))) != "-":
+        caption += f" Cost limit {words}."
     if metric == "return" and safe:
         caption += " Bold: the highest return of a task whose mean cost is within the limit."
     if published:
@@ -419,7 +428,7 @@ def details(groups: Sequence[Group]) -> list[Table]:
         [
             f"`{g.env}`", f"`{g.name}`", str(len(g.costs)), f"{g.steps:,}",
             *(tables.cell(g.estimate(m, stats.iqm)) for m in ("return", "cost")),
-            tables.number(g.cost_limit), g.held,
+            in_words(g.limits), g.held,
             *(tables.cell(g.estimate(m), ".3g") for m in known),
         ]
         for g in groups

@@ -40,6 +40,21 @@ def float_fields(cls: type) -> list[str]:
     return fields_of(cls, float)
 
 
+def is_float(cls: type, name: str) -> bool:
+    """Whether `name` is a float of the config: 'clip', or by name as in 'cost_limits.hazards'."""
+    field, _, inside = name.partition(".")
+    return field in (fields_of(cls, dict[str, float] | None) if inside else float_fields(cls))
+
+
+def flat(values: dict[str, Any]) -> dict[str, Any]:
+    """{'algo.clip': 0.2, 'algo.cost_limits.hazards': 10.0, ...} of dicts in dicts."""
+    out: dict[str, Any] = {}
+    for name, value in values.items():
+        inside = flat(value) if isinstance(value, dict) else {}
+        out |= {f"{name}.{k}": v for k, v in inside.items()} or {name: value}
+    return out
+
+
 def nearest(name: str, names: typing.Iterable[str]) -> str:
     """'; did you mean X?' for the closest of `names`, or the list of them if none is close."""
     names = sorted(names)

@@ -44,7 +44,17 @@ def limit(cfg: Any, names: Names) -> jax.Array:
 
 def own_limits(cfg: Any) -> dict[str, float]:
     """The limits by name, of the config of any algorithm; none where there is but cost_limit."""
-    return dataclasses.asdict(cfg).get("cost_limits") or {}
+    return dict(sorted((dataclasses.asdict(cfg).get("cost_limits") or {}).items()))
+
+
+def written(name: str) -> str:
+    """What tables call a cost; '' is the name of `cost`."""
+    return f"cost {name}" if name else "cost"
+
+
+def in_words(limits: dict[str, float]) -> str:
+    """'25', or 'hazards 10, vases_contact 5'; '-' of none."""
+    return ", ".join(f"{name} {most:.9g}".lstrip() for name, most in limits.items()) or "-"
 
 
 def check_names(names: Iterable[str], env: Env) -> None:

@@ -13,10 +13,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from jaxsafe import run_folder, stats
+from jaxsafe.constraints import written
 
 FORMATS = ("png", "svg")
 MARKERS = {"-": "o", "--": "s", ":": "^", "-.": "v"}  # by the kind of line that goes with it
-LIMIT = "algo.cost_limit"  # a column of metrics.csv where the settings differ in it
 PANELS = (("train/return", "return of an episode"), ("train/cost", "cost of an episode"))
 
 
@@ -44,8 +44,15 @@ def curves(
     Settings trained side by side have a colour each, and their own limits where those differ. Named
     costs with limits of their own have panels instead of a limit on the sum.
     """
-    named = {f"train/cost_{name}": limit for name, limit in own_limits.items()}
-    panels = (*PANELS, *((name, f"{name.removeprefix('train/cost_')} of an episode") for name in named))
+    # with each limit its column of metrics.csv, which is there where the settings differ in it
+    limits = {
+        f"train/cost_{name}": (limit, f"algo.cost_limits.{name}") for name, limit in own_limits.items()
+    }
+    panels = (
+        *PANELS,
+        *((name, f"{name.removeprefix('train/cost_')} of an episode") for name in limits),
+    )
+    limits = limits or {"train/cost": (cost_limit, "algo.cost_limit")}
     figure = Figure(figsize=(5 * len(panels), 4), layout="constrained")
     FigureCanvasAgg(figure)
     settings = run_folder.by_setting(metrics)
@@ -53,11 +60,10 @@ def curves(
         for i, (setting, table) in enumerate(settings.items()):
             if name in table and len(table["steps"]):
                 draw(axes, *by_seed(table, name), f"C{i % 10}", setting)
-        if name in named:
-            axes.axhline(named[name], color="C3", ls="--", lw=1, label=f"limit {named[name]:g}")
-        if name == "train/cost" and not named:
-            own = {t[LIMIT][0]: i for i, t in enumerate(settings.values()) if LIMIT in t}
-            for limit, i in (own or {cost_limit: 3}).items():
+        if name in limits:
+            common, column = limits[name]
+            own = {t[column][0]: i for i, t in enumerate(settings.values()) if column in t}
+            for limit, i in (own or {common: 3}).items():
                 axes.axhline(limit, color=f"C{i % 10}", ls="--", lw=1, label=f"limit {limit:g}")
         axes.set(xlabel="environment steps", ylabel=label)
         if axes.get_legend_handles_labels()[0]:
@@ -87,22 +93,25 @@ def band(axes: Axes, steps: np.ndarray, values: np.ndarray, label: str, **style:
 def trade_off(
     rows: Sequence[Any], title: str, published: Mapping[tuple[str, str], Any] = MappingProxyType({})
 ) -> Figure:
-    """Return against cost of each row of a comparison, an environment a panel.
+    """Return against cost of each row of a comparison: a panel an environment or, where named costs
+    have limits of their own, each of these.
 
     A point is the mean over seeds with its 95 % interval, each limit a dashed line: grey, or in the
     colour of the one setting it belongs to. The grey steps are the Pareto front of the means. A hollow
     diamond is the mean that was published, by environment and name.
     """
-    envs = sorted({row.env for row in rows})
-    figure, panels = grid(len(envs), size=(4.6, 4))
+    places = sorted({(row.env, name) for row in rows for name in row.limits or [""]})
+    figure, panels = grid(len(places), size=(4.6, 4))
     looks = styles(rows)
-    for axes, env in zip(panels, envs, strict=True):
+    for axes, (env, name) in zip(panels, places, strict=True):
         shown = [row for row in rows if row.env == env]
-        limits = [row.cost_limit for row in shown]
+        limits = [row.limits.get(name, np.nan) for row in shown]
+        means = []
         for i, row in enumerate(shown):
             color, marker = looks[row.name]["color"], MARKERS[looks[row.name]["ls"]]
-            axes.plot(row.costs, row.returns, ".", color=color, ms=4, alpha=0.5)
-            ret, cost = row.ret, row.cost
+            axes.plot(row.values(written(name)), row.returns, ".", color=color, ms=4, alpha=0.5)
+            ret, cost = row.ret, row.estimate(written(name))
+            means.append((cost.mean, ret.mean))
             axes.errorbar(
                 cost.mean,
                 ret.mean,
@@ -112,13 +121,13 @@ def trade_off(
                 color=color,
                 label=row.name,
             )
-            if (known := published.get((env, row.name))) is not None:
+            if not name and (known := published.get((env, row.name))) is not None:
                 axes.plot(known.cost[0], known.ret[0], "D", mfc="none", ms=7, color=color)
-            if row.cost_limit not in limits[:i]:
-                line = color if limits.count(row.cost_limit) == 1 and len(set(limits)) > 1 else "0.5"
-                axes.axvline(row.cost_limit, color=line, ls="--", lw=1)
-        axes.plot(*front([(r.cost.mean, r.ret.mean) for r in shown]), color="0.6", lw=1, zorder=0)
-        axes.set(title=env, xlabel=PANELS[1][1], ylabel=PANELS[0][1])
+            if (limit := limits[i]) not in limits[:i]:
+                line = color if limits.count(limit) == 1 and len(set(limits)) > 1 else "0.5"
+                axes.axvline(limit, color=line, ls="--", lw=1)
+        axes.plot(*front(means), color="0.6", lw=1, zorder=0)
+        axes.set(title=env, xlabel=f"{name or 'cost'} of an episode", ylabel=PANELS[0][1])
     legend(figure, panels, looks)
     figure.suptitle(title + ("; hollow: published" if any(published.values()) else ""))
     return figure

@@ -20,7 +20,7 @@ import numpy as np
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
 from jaxsafe import checkpoint, distributed, run_folder
-from jaxsafe.config import ConfigError
+from jaxsafe.config import ConfigError, flat
 from jaxsafe.constraints import own_limits
 from jaxsafe.interrupts import Interrupts
 from jaxsafe.progress import Report
@@ -83,11 +83,11 @@ class Member(NamedTuple):
 
 def members(configs: Sequence[Any], settings: TrainConfig) -> list[Member]:
     """Every setting with every seed, seeds fastest."""
-    plain = [dataclasses.asdict(c) for c in configs]
+    plain = [flat({"algo": dataclasses.asdict(c)}) for c in configs]
     swept = [name for name, value in plain[0].items() if any(c[name] != value for c in plain)]
     return [
-        Member(cfg, settings.seed + i, {f"algo.{name}": getattr(cfg, name) for name in swept})
-        for cfg in configs
+        Member(cfg, settings.seed + i, {name: values[name] for name in swept})
+        for cfg, values in zip(configs, plain, strict=True)
         for i in range(settings.num_seeds)
     ]
 

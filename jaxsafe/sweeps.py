@@ -16,6 +16,7 @@ import hashlib
 import io
 import itertools
 import json
+import math
 import re
 import shlex
 import shutil
@@ -38,9 +39,10 @@ from jaxsafe import (
     runner,
     tables,
 )
-from jaxsafe.command import Settings, compose, flat, guarded, one_line, parse
+from jaxsafe.command import Settings, compose, guarded, one_line, parse
 from jaxsafe.compare import Group
-from jaxsafe.config import ConfigError, float_fields
+from jaxsafe.config import ConfigError, flat, is_float
+from jaxsafe.constraints import in_words, written
 from jaxsafe.interrupts import Interrupts
 from jaxsafe.progress import Report
 from jaxsafe.tables import Table
@@ -93,13 +95,17 @@ def read(texts: list[str], envs: Any, algos: Any) -> Sweep:
         )
     single = {o.key_or_group: str(o.value()) for o in given if not o.is_sweep_override()}
     algo = several.get("algo", [single.get("algo", command.DEFAULT["algo"])])[0]
-    floats = [f"algo.{f}" for f in float_fields(algos.ALGOS[algo].config)]
-    lists = {k: v for k, v in several.items() if k in floats}
+    kind = algos.ALGOS[algo].config
+    lists = {
+        k: v
+        for k, v in several.items()
+        if k.startswith("algo.") and is_float(kind, k.removeprefix("algo."))
+    }
     grid = list(zip(*itertools.product(*lists.values()), strict=True))
     side_by_side = [f"{k}=[{','.join(v)}]" for k, v in zip(lists, grid, strict=True)]
     fixed = [o.input_line for o in given if not o.is_sweep_override()]
     groups = {}
-    apart = {k: v for k, v in several.items() if k not in floats}
+    apart = {k: v for k, v in several.items() if k not in lists}
     for i, values in enumerate(itertools.product(*apart.values())):
         texts = [f"{k}={v}" for k, v in zip(apart, values, strict=True)]
         settings = compose([*fixed, *side_by_side, *texts], envs, algos)
@@ -159,11 +165,8 @@ def open_folder(sweep: Sweep) -> dict[str, int]:
     if [*asked] != [*saved["groups"]]:
         raise ConfigError(f"{other}, of {', '.join(saved['groups'])}; choose another run_dir")
     for name, settings in asked.items():
-        for key, value in settings.items():
-            if (old := saved["groups"][name].get(key)) != value:
-                raise ConfigError(
-                    f"{other}: {key} is {old} there, {value} here; choose another run_dir"
-                )
+        for key, (here, there) in command.differences(settings, flat(saved["groups"][name])).items():
+            raise ConfigError(f"{other}: {key} is {there} there, {here} here; choose another run_dir")
     return saved["parallel"]
 
 
@@ -307,13 +310,19 @@ def columns(rows: list[Group]) -> list[str]:
     return [name.removesuffix(".name") for name in rows[0].by] if rows else []
 
 
+def limited(rows: list[Group]) -> list[str]:
+    """The cost, as '', and those that have limits of their own."""
+    return sorted({"", *(name for r in rows for name in r.limits)})
+
+
 def markdown(rows: list[Group]) -> str:
-    header = [*columns(rows), "seeds", "steps", "return", "cost", "limit", "limit held"]
+    costs = limited(rows)
+    header = [*columns(rows), "seeds", "steps", "return", *map(written, costs), "limit", "limit held"]
     lines = [
         [
             *(tables.number(v) if isinstance(v, float) else str(v) for v in r.by.values()),
-            str(len(r.costs)), f"{r.steps:,}", tables.cell(r.ret), tables.cell(r.cost),
-            tables.number(r.cost_limit), r.held,
+            str(len(r.costs)), f"{r.steps:,}", tables.cell(r.ret),
+            *(tables.cell(r.estimate(written(name))) for name in costs), in_words(r.limits), r.held,
         ]
         for r in rows
     ]  # fmt: skip
@@ -323,11 +332,15 @@ def markdown(rows: list[Group]) -> str:
 def as_csv(rows: list[Group]) -> str:
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    bounds = [f"{name}{end}" for name in ("return", "cost") for end in ("", "_low", "_high")]
-    writer.writerow([*columns(rows), "seeds", "steps", *bounds, "cost_limit", "held"])
+    costs = limited(rows)
+    measured = ["return", *map(written, costs)]
+    bounds = [f"{m.replace(' ', '_')}{end}" for m in measured for end in ("", "_low", "_high")]
+    limits = [f"cost_limit_{name}" if name else "cost_limit" for name in costs]
+    writer.writerow([*columns(rows), "seeds", "steps", *bounds, *limits, "held"])
     for r in rows:
         head = [*r.by.values(), len(r.costs), r.steps]
-        writer.writerow([*head, *r.ret, *r.cost, r.cost_limit, r.held])
+        found = [x for m in measured for x in r.estimate(m)]
+        writer.writerow([*head, *found, *(r.limits.get(name, math.nan) for name in costs), r.held])
     return out.getvalue()
 
 

@@ -304,8 +304,13 @@ def test_a_sweep_takes_lists_for_values_and_tuples_for_lists():
         "env=point_goal1", "algo=ppo_lag,Priced", "algo.cost_limit=5,10", "algo.hidden=[8,8],[4,4]",
         "seed=0,1", "max_parallel=4", "num_envs=4",
     ]  # fmt: skip
+    limits = {"cost_limits": {"hazards": [5, 10], "vases_contact": 25}}
+    assert api.texts(known, limits, swept=True)[2:] == [
+        "algo.cost_limits.hazards=5,10", "algo.cost_limits.vases_contact=25",
+    ]  # fmt: skip
     for options, message in (
         ({"cost_limit": []}, "expected values to sweep"),
+        ({"cost_limits": {"hazards": []}}, "cost_limits.hazards=[]: expected values to sweep"),
         ({"cost_limit": 5}, "nothing to sweep"),
         ({"max_paralel": 5}, "did you mean 'max_parallel'?"),
     ):

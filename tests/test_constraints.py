@@ -360,6 +360,10 @@ BAD = {
     "algo.cost_limits={hazards: many}": "expected names with a number each",
     "algo.cost_limits=[5,10]": "expected names with a number each",
     "algo.cost_limits=5": "expected names with a number each",
+    "env=point_goal2 algo.cost_limits.hazard=5": "unknown cost 'hazard'; did you mean 'hazards'?",
+    "algo.cost_limits.hazards=-1": "algo.cost_limits.hazards=-1.0: expected at least 0",
+    "algo=ppo algo.cost_limits.hazards=5": "ppo takes one limit",
+    "algo.clip.hazards=5": "unknown option algo.clip.hazards",
     "algo=p3o algo.cost_limits={hazards: 5}": "takes one limit, algo.cost_limit; several are for cpo,",
     "algo=ppo algo.cost_limits={hazards: 5}": "ppo takes one limit",
     "env=point_goal0 algo.cost_limits={hazards: 5}": "the environment has none",
@@ -369,8 +373,8 @@ BAD = {
 @pytest.mark.parametrize("arguments", BAD)
 def test_bad_limits_are_one_line_and_status_2(arguments, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    head, _, value = arguments.rpartition("algo.cost_limits=")
-    monkeypatch.setattr(sys, "argv", ["train.py", *head.split(), f"algo.cost_limits={value}"])
+    head, option, value = arguments.rpartition("algo.c")
+    monkeypatch.setattr(sys, "argv", ["train.py", *head.split(), option + value])
     monkeypatch.setattr(runner, "train", lambda *a, **k: pytest.fail("it went on to train"))
     try:
         status = command.train_main(envs, algos)

@@ -83,7 +83,7 @@ def commands(page: Path) -> list[list[str]]:
 def test_the_commands_of_a_page_run(page):
     for line in commands(page):
         script = [sys.executable, str(ROOT / line[1]), *line[2:]]
-        if line[1] == "scripts/train.py":
+        if line[1] in ("scripts/train.py", "scripts/sweep.py"):
             script += SMALL if "resume" not in str(line) else ["total_steps=256"]
         done = subprocess.run(script, capture_output=True, text=True)
         assert done.returncode == 0, (line, done.stderr)

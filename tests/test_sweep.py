@@ -109,6 +109,78 @@ def test_a_grid_is_floats_side_by_side_and_a_group_of_each_other_value():
     assert names[1] == "001-point_goal1-ppo_lag-algo.hidden=_4_" and len({*names}) == 4
 
 
+def test_a_grid_over_named_limits_is_side_by_side_too():
+    limits = ["algo.cost_limits.vases_contact=25", "algo.cost_limits.hazards=5,10"]
+    asked = sweeps.read(
+        ["env=point_goal2", "algo=ppo_lag", "algo.clip=0.1,0.2", *limits, "num_seeds=2"], envs, algos
+    )
+    ((name, settings),) = asked.groups.items()
+    assert name == "000-point_goal2-ppo_lag"
+    assert asked.swept == ["algo.clip", "algo.cost_limits.hazards"]
+    assert [(c.clip, c.cost_limits) for c in settings.configs] == [
+        (clip, {"hazards": limit, "vases_contact": 25.0})
+        for clip in (0.1, 0.2)
+        for limit in (5.0, 10.0)
+    ]
+    members = runner.members(settings.configs, settings.train)
+    assert members[2].setting == "algo.clip=0.1, algo.cost_limits.hazards=10"
+    plain = settings.plain()
+    assert plain["algo"]["cost_limits"] == {"hazards": [5.0, 10.0, 5.0, 10.0], "vases_contact": 25.0}
+    assert command.settle(plain, envs, algos) == settings
+    one = command.compose(
+        ["env=point_goal2", "algo.cost_limits.hazards=5", "algo.cost_limits={vases_contact: 3}"],
+        envs,
+        algos,
+    )
+    assert one.algo.cost_limits == {"hazards": 5.0, "vases_contact": 3.0}
+
+
+def test_a_sweep_over_a_named_limit_from_training_to_summary(tmp_path, capsys):
+    folder = tmp_path / "sweep"
+    limits = ["algo.cost_limits.wall=0.5,50", "num_seeds=2"]
+    train(folder, *limits, "eval_episodes=2")
+    assert "algo.cost_limits.wall=50: return" in capsys.readouterr().out
+    (run,) = folder.glob("0*")
+    tables = run_folder.by_setting(run_folder.read_metrics(run))
+    assert [*tables] == ["algo.cost_limits.wall=0.5", "algo.cost_limits.wall=50"]
+    tight, loose = (table["train/lam_wall"][-2:] for table in tables.values())
+    assert (tight > loose).all()
+    rows = sweeps.rows_of(folder, TOYS, algos)
+    assert [r.limits for r in rows] == [{"wall": 0.5}, {"wall": 50.0}]
+    assert [r.held for r in rows] == ["no", "yes"]
+    text = (folder / "summary.md").read_text().splitlines()
+    assert text[0] == (
+        "| algo.cost_limits.wall | seeds | steps | return | cost | cost wall | limit | limit held |"
+    )
+    assert text[2].startswith("| 0.5 | 2 | 192 |") and text[2].endswith("| wall 0.5 | no |")
+    with (folder / "summary.csv").open() as file:
+        assert [row["cost_limit_wall"] for row in csv.DictReader(file)] == ["0.5", "50.0"]
+    settings = command.settle(run_folder.read_config(run), TOYS, algos)
+    algo, ts = command.policy_of(settings, command.make_env(settings, TOYS), algos, run)
+    found = command.evaluate(settings, algo, ts, 2, 0, run)
+    assert [s.limits for s in found] == [{"wall": 0.5}, {"wall": 50.0}]
+    assert "wall over 50" in found[1].rows
+    for other in (["algo.clip=0.1,0.2", "num_seeds=2"], ["algo.cost_limits.wall=1,50", "num_seeds=2"]):
+        with pytest.raises(ConfigError, match="belongs to another sweep: algo"):
+            sweeps.open_folder(
+                sweeps.read([*SMALL, *other, "eval_episodes=2", f"run_dir={folder}"], TOYS, algos)
+            )
+
+
+def test_limits_of_named_costs_swept_have_lines_of_their_own(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(
+        plots.Axes, "axhline", lambda self, y, **style: drawn.append((y, style["color"]))
+    )
+    metrics = {
+        "steps": np.repeat([1.0, 2.0], 2), "seed": np.zeros(4),
+        "algo.cost_limits.a": np.tile([5.0, 10.0], 2), "train/cost": np.arange(4.0),
+        "train/cost_a": np.arange(4.0), "train/cost_b": np.arange(4.0),
+    }  # fmt: skip
+    plots.curves(metrics, tmp_path / "curves.png", "title", 25.0, {"a": 5.0, "b": 3.0})
+    assert drawn == [(5.0, "C0"), (10.0, "C1"), (3.0, "C3")]
+
+
 def test_parts_are_whole_settings_or_seeds_of_one_and_of_equal_size():
     asked = sweeps.read(["algo.cost_limit=1,2,3,4", "num_seeds=8"], envs, algos)
     (settings,) = asked.groups.values()
@@ -308,6 +380,11 @@ BAD = {
     "algo.cost_limit=": "nothing to sweep",
     "algo.cost_limit=5": "nothing to sweep",
     "algo.hidden=[8,8]": "nothing to sweep",
+    "env=point_goal2 algo.cost_limits.hazard=5,10": "unknown cost 'hazard'; did you mean 'hazards'?",
+    "env=point_goal2 algo.cost_limits.hazards=5,-1": "algo.cost_limits.hazards=-1.0: expected at least",
+    "env=point_goal2 algo.cost_limits.hazards=5,wide": "expected names with a number each",
+    "env=point_goal2 algo=p3o algo.cost_limits.hazards=5,10": "p3o takes one limit, algo.cost_limit;",
+    "algo.cost_limit.hazards=5,10": "did you mean 'cost_limits'?",
     "algo=ppo_lag,cop": "did you mean 'cpo'?",
     "env=point_goal1,car_gaol1": "did you mean 'car_goal1'?",
     "algo.minibatches=8,7": "minibatches=7",
