@@ -247,10 +247,12 @@ class Levers:
 
 
 LIMITS = {"paint": 3.75, "noise": 5.0}  # per episode, of 10 steps
-QUICK = {"lr": 1e-2, "lr_decay": False, "target_kl": 0.1, "epochs": 8}
+# A policy whose standard deviation has collapsed answers a price only after a hundred iterations, in
+# which multipliers swing from 0 to far too much; the entropy keeps it faster than they are.
+QUICK = {"lr": 1e-2, "lr_decay": False, "target_kl": 0.1, "epochs": 8, "entropy_coef": 5e-3}
 LEARN = {
     "cpo": {},
-    "cppo_pid": QUICK | {"lam_init": 0.8, "pid_kp": 0.05, "pid_ki": 0.005, "pid_smoothing": 0.5},
+    "cppo_pid": QUICK | {"lam_init": 0.8, "pid_kp": 0.1, "pid_ki": 0.05, "pid_smoothing": 0.5},
     "ppo_lag": QUICK | {"dual_lr": 0.05},
 }
 
@@ -282,14 +284,14 @@ def test_the_best_policy_within_both_limits_is_found(name):
     cfg = ALGOS[name].config(**sizes, cost_limits=LIMITS, **LEARN[name])
 
     def train(key):
-        return jax.lax.scan(lambda ts, _: algo.update(ts), algo.init(key, cfg), None, 200)
+        return jax.lax.scan(lambda ts, _: algo.update(ts), algo.init(key, cfg), None, 300)
 
     _, metrics = jax.jit(jax.vmap(train))(jax.random.split(jax.random.key(0), 2))
-    late = {k: np.asarray(x)[:, -100:].mean(1) for k, x in metrics.items()}
+    late = {k: np.asarray(x)[:, -200:].mean(1) for k, x in metrics.items()}
     for cost, most in LIMITS.items():
-        assert (late[f"train/cost_{cost}"] < 1.15 * most).all()  # Adam's multipliers swing
-    assert (late["train/return"] > 0.9 * best_return(LIMITS)).all()
-    assert (late["train/return"] < 1.05 * best_return(LIMITS)).all()
+        assert (late[f"train/cost_{cost}"] < 1.05 * most).all()
+    assert (late["train/return"] > 0.93 * best_return(LIMITS)).all()
+    assert (late["train/return"] < 1.03 * best_return(LIMITS)).all()
 
 
 TINY = {"num_envs": 8, "horizon": 25, "minibatches": 2, "hidden": (8,)}
