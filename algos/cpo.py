@@ -41,7 +41,7 @@ from jaxsafe.constraints import LimitsConfig, limit, named
 from jaxsafe.halfspaces import dot, furthest_point
 from jaxsafe.networks import policy
 from jaxsafe.on_policy import Algorithm, on_policy_pair
-from jaxsafe.steps import Objective, Step, mean_kl
+from jaxsafe.steps import Objective, Step, mean_kl, own_trunk
 from jaxsafe.surrogates import plain
 from jaxsafe.trust_region import conjugate_gradient, fisher_product, line_search
 from jaxsafe.types import Env, Metrics, PyTree
@@ -178,6 +178,7 @@ def step_by(rule: Rule) -> Step:
     """A trust-region step where `rule` says, shortened until it keeps what it promised."""
 
     def init(actor: PyTree, cfg: Any) -> Margin:
+        own_trunk(actor, cfg)
         return Margin(jnp.zeros(jnp.shape(limit(cfg, named(cfg)))))
 
     return Step(init, partial(update, rule))

@@ -4,7 +4,8 @@
 
 Source: Schulman et al. (2017), "Proximal Policy Optimization Algorithms", arXiv:1707.06347.
 Differs from it: passes stop once KL(old || new) > target_kl, as in safety-starter-agents and
-OmniSafe; the value function is a network of its own. A cost critic is trained for its metrics alone.
+OmniSafe; the value function is a network of its own, unless `trunk` is shared. A cost critic is trained
+for its metrics alone.
 """
 
 from typing import Any

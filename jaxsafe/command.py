@@ -69,6 +69,7 @@ BOUNDS = {
     "saute_discount": (0.01, 1.0),
     "budget_init": (0.0, 1.0),
     "simmer_window": (1, math.inf),
+    "value_coef": (0.0, math.inf),
 }
 
 
@@ -564,7 +565,14 @@ def warm_start(
     options = [k for k in here if k.startswith("env.") and saved.env_name == settings.env_name]
     differ = [
         f"{name} is {there.get(name)} there, {here[name]} here"
-        for name in ("env.name", "algo.hidden", "algo.std", "algo.obs_normalize", *options)
+        for name in (
+            "env.name",
+            "algo.hidden",
+            "algo.trunk",
+            "algo.std",
+            "algo.obs_normalize",
+            *options,
+        )
         if there.get(name) != here[name]
     ]
     like = jax.eval_shape(program.init, program.start)

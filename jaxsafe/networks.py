@@ -1,4 +1,7 @@
-"""The on-policy networks: a Gaussian policy, and a critic each for reward and for cost."""
+"""The on-policy networks: a Gaussian policy, and a critic each for reward and for cost.
+
+They are networks of their own or, with `trunk` 'shared', one: hidden layers and the outputs of all.
+"""
 
 import math
 from collections.abc import Callable
@@ -75,10 +78,39 @@ def init_params(key: jax.Array, obs_size: int, action_size: int, cfg: Any) -> di
     return {"actor": actor, "critic_r": critic_r, "critic_c": critic_c}
 
 
+def stack(of_reward: jax.Array, of_cost: jax.Array) -> jax.Array:
+    """[1 + K, ...] of [...] and [K, ...]; or [2, ...] of two alike."""
+    return jnp.concatenate([of_reward[None], of_cost.reshape(-1, *of_reward.shape)])
+
+
+def stack_critics(params: dict[str, PyTree]) -> PyTree:
+    """All critics in one tree, [2, ...] or [1 + K, ...], so that they train in one program."""
+    return jax.tree.map(stack, params["critic_r"], params["critic_c"])
+
+
+def share_trunk(params: dict[str, PyTree], cfg: Any) -> dict[str, PyTree]:
+    """{'actor'} alone: the policy's hidden layers, with the critics' outputs after its own."""
+    layers, last = params["actor"]["mean"]["params"], f"Dense_{len(cfg.hidden)}"
+    joined = jax.tree.map(
+        lambda own, critics: jnp.concatenate([own, jnp.moveaxis(critics[..., 0], 0, -1)], -1),
+        layers[last],
+        stack_critics(params)["params"][last],
+    )
+    return {"actor": params["actor"] | {"mean": {"params": layers | {last: joined}}}}
+
+
+def outputs(actor: PyTree, obs: jax.Array, cfg: Any) -> tuple[jax.Array, jax.Array]:
+    """What the actor's network gives: the policy's outputs and, of a shared trunk, the critics' values
+    of reward and of each cost, float [..., 1 + K]."""
+    size = policy_outputs(actor["log_std"].shape[-1], cfg)
+    last = actor["mean"]["params"][f"Dense_{len(cfg.hidden)}"]
+    out: Any = mlp(cfg, last["bias"].shape[-1]).apply(actor["mean"], obs)
+    return out[..., :size], out[..., size:]
+
+
 def policy(actor: PyTree, obs: jax.Array, cfg: Any) -> Gaussian:
     """The policy's action distribution for `obs` [..., O]; its mean and log std are [..., A]."""
-    size = actor["log_std"].shape[-1]
-    out: Any = mlp(cfg, policy_outputs(size, cfg)).apply(actor["mean"], obs)
+    out, _ = outputs(actor, obs, cfg)
     if cfg.std == "state":
         mean, change = jnp.split(out, 2, axis=-1)
         return Gaussian(mean, jnp.clip(actor["log_std"] + change, *LOG_STD))
@@ -89,3 +121,10 @@ def value(critic: PyTree, obs: jax.Array, cfg: Any) -> jax.Array:
     """A critic's estimate for `obs` [..., O], float [...], in units of reward or of cost."""
     out: Any = mlp(cfg, 1).apply(critic, obs)
     return out[..., 0]
+
+
+def values(params: dict[str, PyTree], obs: jax.Array, cfg: Any) -> jax.Array:
+    """The values of reward and of each cost, float [..., 1 + K], whatever the trunk."""
+    if cfg.trunk == "shared":
+        return outputs(params["actor"], obs, cfg)[1]
+    return jax.vmap(lambda critic: value(critic, obs, cfg), out_axes=-1)(stack_critics(params))

@@ -21,7 +21,7 @@ from jaxsafe.batch import all_finite, batch_mean, centre, masked_mean, psum, sel
 from jaxsafe.config import ConfigError, config
 from jaxsafe.constraints import Names, check_names, each, limit, signal, spread, unnamed
 from jaxsafe.gaussian import Gaussian, entropy, log_prob, sample
-from jaxsafe.networks import init_params, policy, value
+from jaxsafe.networks import init_params, policy, share_trunk, stack, stack_critics, values
 from jaxsafe.normalise import init_normaliser, merge, normalise
 from jaxsafe.returns import Estimator, advantages, mean_length
 from jaxsafe.rollout import RolloutState, Trajectory, collect, init_rollout
@@ -40,6 +40,8 @@ class OnPolicyConfig:
     stagger: bool = True  # spread the first episodes' ends over time
     total_iterations: float = float("inf")  # where what decays reaches 0; inf: total_steps' end
     hidden: tuple[int, ...] = (64, 64)  # units of each network [O]
+    trunk: Literal["separate", "shared"] = "separate"  # networks of their own [O, S], or one for all
+    value_coef: float = 0.5  # of each critic's squared error in the loss of a shared trunk; SB3
     activation: Literal["tanh", "relu"] = "tanh"  # [O, S]
     init: Literal["orthogonal", "torch"] = "orthogonal"  # weights; [O] torch, its kaiming_uniform
     init_log_std: float = -0.5  # of the actions' standard deviation [S]
@@ -79,7 +81,8 @@ class TrainState:
 
     config: the algorithm's, with its floats as arrays.
     params: {'actor', 'critic_r', 'critic_c'}; of several constraints critic_c is stacked, [K, ...].
-    opt_state: {'actor': the step's own, 'critics': Adam's for all critics, stacked}.
+        With a shared trunk {'actor'}, see networks.share_trunk.
+    opt_state: {'actor': the step's own, 'critics': Adam's for all critics, stacked, or ()}.
     dual: the treatment's state.
     normaliser: Normaliser, or () without `obs_normalize`.
     signals: Normaliser of [reward, costs ...], or () without `reward_normalize` and `cost_normalize`.
@@ -237,13 +240,13 @@ def loop(
             keys = jax.random.split(params_key, len(names))
             critics = jax.vmap(lambda key: init_params(key, *sizes, cfg)["critic_c"])(keys)
             params |= {"critic_c": critics}
+        opt_critics = jax.vmap(adam(cfg.critic_lr, cfg).init)(stack_critics(params))
+        if cfg.trunk == "shared":
+            params, opt_critics = share_trunk(params, cfg), ()
         return TrainState(
             config=cfg,
             params=params,
-            opt_state={
-                "actor": init_step(params["actor"], cfg),
-                "critics": jax.vmap(adam(cfg.critic_lr, cfg).init)(stack_critics(params)),
-            },
+            opt_state={"actor": init_step(params["actor"], cfg), "critics": opt_critics},
             dual=dual,
             normaliser=init_normaliser(env.obs_size) if cfg.obs_normalize else (),
             signals=init_signals(cfg, len(named(cfg)) or 1),
@@ -283,10 +286,10 @@ def loop(
         episode_cost = batch_mean(charged, axis_name, (0, 1)) * length
 
         actor, opt_actor, dual, metrics = improve(ts, batch, episode_cost, length, step_key)
-        fit = partial(fit_critic, obs=batch.obs, key=critic_key, cfg=cfg, axis_name=axis_name)
-        critics, opt_critics, errors, skipped = jax.vmap(lambda c, o, y: fit(c, o, target=y))(
-            stack_critics(ts.params), ts.opt_state["critics"], stack(batch.ret_r, batch.ret_c.T)
-        )
+        critics, opt_critics, skipped = {}, (), 0
+        if cfg.trunk == "separate":
+            critics, opt_critics, skipped, fitted = fit_critics(ts, batch, critic_key, axis_name)
+            metrics |= fitted
         seen = traj.obs[..., : env.obs_size]
         normaliser = merge(ts.normaliser, seen, axis_name) if cfg.obs_normalize else ()
         # parameters are guarded step by step; what is not a step of a gradient is guarded here
@@ -296,22 +299,18 @@ def loop(
             (dual, normaliser, signals, length),
             (ts.dual, ts.normaliser, ts.signals, ts.episode_length),
         )
-        critic_r = jax.tree.map(operator.itemgetter(0), critics)
-        critic_c = jax.tree.map(lambda x, c: x[1:].reshape(c.shape), critics, ts.params["critic_c"])
-        loss_c = errors[1:] if names else errors[1]
-        metrics |= explained | {"train/cost_estimate": episode_cost, "train/value_loss_c": loss_c}
+        metrics |= explained | {"train/cost_estimate": episode_cost}
         metrics = spread(metrics, names) | episode_metrics(env, traj, axis_name)
         metrics |= {
             "train/cost_rate": cost_rate,  # per environment step
             "train/cost_estimate": cost_rate * length,  # J_c, what a constraint on `cost` sees
             "train/return_estimate": batch_mean(traj.reward, axis_name) * length,  # likewise
             "train/entropy": batch_mean(entropy(policy(actor, batch.obs, cfg)), axis_name),
-            "train/value_loss_r": errors[0],
-            "train/nonfinite": metrics["train/nonfinite"] + skipped.sum() + ~finite,
+            "train/nonfinite": metrics["train/nonfinite"] + skipped + ~finite,
         }
         ts = dataclasses.replace(
             ts,
-            params={"actor": actor, "critic_r": critic_r, "critic_c": critic_c},
+            params={"actor": actor, **critics},
             opt_state={"actor": opt_actor, "critics": opt_critics},
             dual=dual,
             normaliser=normaliser,
@@ -330,14 +329,24 @@ def loop(
     return Algorithm(init, update, act, task)
 
 
-def stack_critics(params: dict[str, PyTree]) -> PyTree:
-    """All critics in one tree, [2, ...] or [1 + K, ...], so that they train in one program."""
-    return jax.tree.map(stack, params["critic_r"], params["critic_c"])
-
-
-def stack(of_reward: jax.Array, of_cost: jax.Array) -> jax.Array:
-    """[1 + K, ...] of [...] and [K, ...]; or [2, ...] of two alike."""
-    return jnp.concatenate([of_reward[None], of_cost.reshape(-1, *of_reward.shape)])
+def fit_critics(
+    ts: TrainState, batch: Batch, key: jax.Array, axis_name: str | None
+) -> tuple[dict[str, PyTree], PyTree, jax.Array, Metrics]:
+    """All critics fitted to their targets at once: {'critic_r', 'critic_c'}, opt_state, the number of
+    steps skipped, and metrics."""
+    fit = partial(fit_critic, obs=batch.obs, key=key, cfg=ts.config, axis_name=axis_name)
+    critics, opt_state, errors, skipped = jax.vmap(lambda c, o, y: fit(c, o, target=y))(
+        stack_critics(ts.params), ts.opt_state["critics"], stack(batch.ret_r, batch.ret_c.T)
+    )
+    params = {
+        "critic_r": jax.tree.map(operator.itemgetter(0), critics),
+        "critic_c": jax.tree.map(lambda x, c: x[1:].reshape(c.shape), critics, ts.params["critic_c"]),
+    }
+    metrics = {
+        "train/value_loss_r": errors[0],
+        "train/value_loss_c": errors[1:].reshape(batch.ret_c.shape[1:]),
+    }
+    return params, opt_state, skipped.sum(), metrics
 
 
 def own(key: jax.Array, axis_name: str | None) -> jax.Array:
@@ -408,18 +417,19 @@ def estimate(
     old = policy(ts.params["actor"], obs, cfg)
     ratio = jnp.exp(log_prob(old, traj.action) - traj.log_prob)  # 1: the policy is still the same
 
-    def both(critic: PyTree, signal: jax.Array, discount: jax.Array, decay: jax.Array):
-        v = value(critic, obs, cfg)
-        next_v = value(critic, next_obs, cfg)
+    v, next_v = values(ts.params, obs, cfg), values(ts.params, next_obs, cfg)
+    v_c, next_v_c = (x[..., 1:].reshape(cost.shape) for x in (v, next_v))
+
+    def both(v: jax.Array, next_v: jax.Array, signal: jax.Array, discount: Any, decay: Any):
         ends = traj.terminated, traj.done
         adv, error = advantages(
             cfg.estimator, signal, v, next_v, *ends, ratio, discount=discount, decay=decay
         )
         return adv, error, error + v
 
-    adv_r, error_r, ret_r = both(ts.params["critic_r"], reward, cfg.discount, cfg.gae_lambda)
-    of_cost = jax.vmap(both, (0, -1, None, None), -1) if names else both
-    adv_c, error_c, ret_c = of_cost(ts.params["critic_c"], cost, cfg.cost_discount, cfg.cost_gae_lambda)
+    adv_r, error_r, ret_r = both(v[..., 0], next_v[..., 0], reward, cfg.discount, cfg.gae_lambda)
+    of_cost = jax.vmap(both, (-1, -1, -1, None, None), -1) if names else both
+    adv_c, error_c, ret_c = of_cost(v_c, next_v_c, cost, cfg.cost_discount, cfg.cost_gae_lambda)
     batch = Batch(
         obs=obs,
         action=traj.action,

@@ -1,7 +1,8 @@
 """First-order steps: epochs of Adam on minibatches, for policies and for critics.
 
 Policy and critics have loops of their own, so that stopping the policy early leaves the critics'
-passes alone. OmniSafe alternates them on each minibatch and stops all three together.
+passes alone. OmniSafe alternates them on each minibatch and stops all three together. On a shared
+trunk they are one network, and their loss is one.
 """
 
 from collections.abc import Callable
@@ -12,8 +13,9 @@ import jax.numpy as jnp
 import optax
 
 from jaxsafe.batch import batch_mean, pmean, select
+from jaxsafe.config import ConfigError
 from jaxsafe.gaussian import Gaussian, kl
-from jaxsafe.networks import policy, value
+from jaxsafe.networks import outputs, policy, stack, value
 from jaxsafe.types import Metrics, PyTree
 
 # (actor, batch) -> (this device's mean of what to maximise, metrics)
@@ -25,6 +27,9 @@ class Step(NamedTuple):
 
     init(actor, cfg) -> opt_state
     update(actor, opt_state, objective, batch, key, cfg, axis_name) -> (actor, opt_state, metrics)
+
+    On a shared trunk `update` trains the critics too (`with_values`), or else `init` refuses it
+    (`own_trunk`).
     """
 
     init: Callable[[PyTree, Any], PyTree]
@@ -95,6 +100,7 @@ def update_adam(
     The KL is the mean over the whole batch, taken after each pass; there is no way back. The
     learning rate falls linearly to 0 at `cfg.total_iterations`, if `cfg.lr_decay`.
     """
+    objective = with_values(objective, cfg) if cfg.trunk == "shared" else objective
     left = remaining(opt_state.iteration, cfg) if cfg.lr_decay else 1.0
     optimiser = adam(cfg.lr * left, cfg)
 
@@ -130,6 +136,37 @@ def update_adam(
 
 
 adam_epochs = Step(init=init_adam, update=update_adam)
+
+
+def with_values(objective: Objective, cfg: Any) -> Objective:
+    """`objective` - value_coef sum_i E[(V_i - target_i)^2], over reward and costs, on a shared trunk.
+
+    Source: Schulman et al. (2017), "Proximal Policy Optimization Algorithms", equation 9.
+    """
+
+    def joint(actor: PyTree, batch: Any) -> tuple[jax.Array, Metrics]:
+        gain, metrics = objective(actor, batch)
+        targets = stack(batch.ret_r, batch.ret_c.T)
+        errors = jnp.mean((outputs(actor, batch.obs, cfg)[1] - targets.T) ** 2, axis=0)
+        of_cost = errors[1:].reshape(batch.ret_c.shape[1:])
+        metrics = metrics | {"train/value_loss_r": errors[0], "train/value_loss_c": of_cost}
+        return gain - cfg.value_coef * errors.sum(), metrics
+
+    return joint
+
+
+def own_trunk(actor: PyTree, cfg: Any) -> tuple[()]:
+    """The empty state of a step that moves the policy alone.
+
+    Raises:
+        ConfigError: a shared trunk, which such a step would leave without critics.
+    """
+    if cfg.trunk == "shared":
+        raise ConfigError(
+            "trunk=shared: expected separate, for a step by natural gradients moves the policy alone; "
+            "policy and critics share a trunk where Adam takes the steps, as in ppo_lag or focops"
+        )
+    return ()
 
 
 def fit_critic(

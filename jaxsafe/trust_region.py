@@ -14,7 +14,7 @@ from jax.flatten_util import ravel_pytree
 from jaxsafe.batch import all_finite, pmean
 from jaxsafe.gaussian import Gaussian, kl
 from jaxsafe.networks import policy
-from jaxsafe.steps import Objective, Step, mean_kl
+from jaxsafe.steps import Objective, Step, mean_kl, own_trunk
 from jaxsafe.types import Metrics, PyTree
 
 Matvec = Callable[[jax.Array], jax.Array]
@@ -145,6 +145,6 @@ def update_natural(
 
 
 # Kakade (2001), "A Natural Policy Gradient", with the step's length from the trust region
-natural_gradient = Step(lambda actor, cfg: (), partial(update_natural, search=False))
+natural_gradient = Step(own_trunk, partial(update_natural, search=False))
 # Schulman et al. (2015), "Trust Region Policy Optimization", arXiv:1502.05477, appendix C
-trust_region = Step(lambda actor, cfg: (), partial(update_natural, search=True))
+trust_region = Step(own_trunk, partial(update_natural, search=True))

@@ -360,6 +360,7 @@ def test_each_seed_starts_from_the_same_seed_where_there_is_one(finished, tmp_pa
         ((), {"hidden": [4]}, ("is [8], expected [4]; algo.hidden is [8, 8] there, [4] here",)),
         ((), {"obs_normalize": False}, ("expected absent", "algo.obs_normalize is True there")),
         ((), {"activation": "relu"}, ("algo.activation is tanh there, relu here",)),
+        ((), {"trunk": "shared"}, ("algo.trunk is separate there, shared here",)),
         ((), {"std": "state"}, ("is [2], expected [4]; algo.std is free there, state here",)),
         (
             ("env={name: point_goal1, num_steps: 40}",), {},

@@ -284,10 +284,10 @@ def split(fn):
     return jax.jit(sharded, compiler_options=FAST)
 
 for name in sys.argv[2:]:
-    entry = ALGOS[name]
+    entry, trunk = ALGOS[name.split(":")[0]], name.partition(":")[2] or "separate"
     algo = entry.make(Corridor(), "devices")
     sizes = dict(num_envs=4, horizon=10, minibatches=2, hidden=(4,), critic_epochs=2)
-    cfg = entry.config(**sizes, reward_normalize=True)
+    cfg = entry.config(**sizes, reward_normalize=True, trunk=trunk)
     keys = jnp.stack([jax.random.key(0)] * 2)
     ts = split(lambda key: algo.init(key, cfg))(keys)
     update = split(algo.update)
@@ -315,7 +315,9 @@ print("learned ok")
 """
 
 
-@pytest.mark.parametrize("names", [ONE_OF_EACH_STEP, pytest.param(OTHERS, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "names", [[*ONE_OF_EACH_STEP, "p3o:shared"], pytest.param(OTHERS, marks=pytest.mark.slow)]
+)
 def test_two_devices_keep_the_same_parameters(names):
     env = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
     here = os.path.dirname(__file__)
