@@ -94,24 +94,20 @@ def by_algorithm(groups: Sequence[compare.Group]) -> str:
 
 
 def throughput(path: Path) -> None:
-    """Environment steps a second, random actions, against the number of environments; those of settled
-    environments are stars."""
+    """Environment steps a second, random actions, against the number of environments; on the GPU those
+    of settled environments."""
     figure, axes = plt.subplots(figsize=(7, 4.5))
     for file, style in (("benchmark_h200.jsonl", "o-"), ("benchmark_cpu.jsonl", "s--")):
         found: dict[str, dict[int, float]] = {}
         for line in (HERE / file).read_text().splitlines():
             row = json.loads(line)
-            if row["algo"] is None:
+            if row["algo"] is None and ("peer" in row or row.get("warmup") or "cpu" in file):
                 what = f"{row['peer']}: {row['env']}" if "peer" in row else row["env"]
-                if row.get("warmup"):
-                    axes.loglog(row["num_envs"], row["env_steps_per_s"], "k*", markersize=9, zorder=3)
-                    continue
                 best = found.setdefault(what, {})
                 best[row["num_envs"]] = max(best.get(row["num_envs"], 0), row["env_steps_per_s"])
         device = "H200" if "h200" in file else "2 CPU cores"
         for env, points in sorted(found.items()):
             axes.loglog(*zip(*sorted(points.items()), strict=True), style, label=f"{env}, {device}")
-    axes.loglog([], [], "k*", label="after 200 steps")
     axes.set_xlabel("environments")
     axes.set_ylabel("environment steps / s")
     axes.grid(True, which="both", alpha=0.3)
