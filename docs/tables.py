@@ -59,10 +59,10 @@ TABLES = {
 }
 
 
-def replaced(text: str, written: Mapping[str, str]) -> str:
+def replaced(text: str, written: Mapping[str, str], mark: str = "table") -> str:
     """`text` with what stands between the marks of these tables."""
     for name, table in written.items():
-        begin, end = f"<!-- table: {name} -->\n", "\n<!-- end -->"
+        begin, end = f"<!-- {mark}: {name} -->\n", "\n<!-- end -->"
         before, found, rest = text.partition(begin)
         if not found:
             raise ValueError(f"no {begin.strip()}")

@@ -132,7 +132,7 @@ def main() -> None:
         (HERE / "README.md", "runs", all_runs()),
         (HERE.parent.parent / "README.md", "results", by_algorithm(groups)),
     ):
-        path.write_text(marked.replaced(path.read_text(), {name: table}))
+        path.write_text(marked.replaced(path.read_text(), {name: table}, "measured"))
     for path in sorted((HERE / "ablations").glob("*.csv.xz")):
         print(row(path.name.removesuffix(".csv.xz"), run_folder.read_table(path)))
 

@@ -1,0 +1,111 @@
+"""Train what the results lack: python docs/results/run.py --gpus 0 1 --at-once 4
+
+Every task with every algorithm, 5 seeds and 10 million steps each, several commands on a GPU (start
+NVIDIA's multi-process service first, see ../performance.md). A run that is done comes here with its
+metrics compressed; one that is stopped, by Ctrl-C or after --minutes, continues the next time. Then
+`python docs/results/make.py` draws curves and writes tables.
+"""
+
+import argparse
+import lzma
+import os
+import queue
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+HERE = Path(__file__).parent
+ROOT = HERE.parent.parent
+TASKS = [f"{robot}_{task}{level}" for task in ("goal", "push", "button") for level in (1, 2)
+         for robot in ("point", "car")]  # fmt: skip
+ALGOS = ["ppo", "ppo_lag", "trpo_lag", "cppo_pid", "cpo", "pcpo", "focops", "cup"]
+
+
+def keep(run: Path, name: str) -> None:
+    """Copy what a finished run leaves here, as if it had been trained in runs/."""
+    (HERE / name).mkdir(exist_ok=True)
+    for file in ("config.yaml", "versions.json", "evaluation.json"):
+        if (run / file).exists():
+            text = (run / file).read_text().replace(str(run), f"runs/{name}").replace(f"{ROOT}/", "")
+            (HERE / name / file).write_text(text)
+    with (
+        (run / "metrics.csv").open("rb") as plain,
+        lzma.open(HERE / name / "metrics.csv.xz", "wb", preset=9) as packed,
+    ):
+        shutil.copyfileobj(plain, packed)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("options", nargs="*", metavar="key=value", help="further options of train.py")
+    parser.add_argument("--tasks", nargs="+", default=TASKS)
+    parser.add_argument("--algos", nargs="+", default=ALGOS)
+    parser.add_argument("--gpus", nargs="+", default=["0"])
+    parser.add_argument("--at-once", type=int, default=1, help="commands on each GPU")
+    parser.add_argument("--minutes", type=float, default=float("inf"), help="then stop")
+    parser.add_argument("--runs", type=Path, default=ROOT / "runs" / "results")
+    args = parser.parse_args()
+
+    end = time.monotonic() + 60 * args.minutes
+    names = [(f"{task}-{algo}", task, algo) for task in args.tasks for algo in args.algos]
+    todo: queue.SimpleQueue = queue.SimpleQueue()
+    missing = [job for job in names if not (HERE / job[0] / "metrics.csv.xz").exists()]
+    for job in sorted(missing, key=lambda job: not (args.runs / job[0]).exists()):  # those begun first
+        todo.put(job)
+    failed, stopping = [], threading.Event()
+
+    def work(gpu: str) -> None:
+        while not stopping.is_set() and time.monotonic() < end:
+            try:
+                name, task, algo = todo.get_nowait()
+            except queue.Empty:
+                return
+            run = args.runs / name
+            run.parent.mkdir(parents=True, exist_ok=True)
+            command = [
+                sys.executable, str(ROOT / "scripts" / "train.py"), f"env={task}", f"algo={algo}",
+                "num_seeds=5", "total_steps=1e7", "video=false", f"run_dir={run}", "resume=true",
+                *args.options,
+            ]  # fmt: skip
+            own = {"CUDA_VISIBLE_DEVICES": gpu, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
+            begun = time.monotonic()
+            with run.with_suffix(".log").open("a") as log:
+                process = subprocess.Popen(
+                    command,
+                    stdout=log,
+                    stderr=subprocess.STDOUT,
+                    env=os.environ | own,
+                    start_new_session=True,  # Ctrl-C is passed on once, below
+                )
+                while process.poll() is None:
+                    if stopping.wait(1) or time.monotonic() >= end:
+                        process.send_signal(signal.SIGINT)
+                        process.wait()
+            status = process.returncode
+            if status == 0:
+                keep(run, name)
+            elif status != 130:
+                failed.append(name)
+            what = {0: "done", 130: "stopped"}.get(status, f"failed, see {run.with_suffix('.log')}")
+            print(f"{name}: {what}, {(time.monotonic() - begun) / 60:.1f} minutes", flush=True)
+
+    workers = [threading.Thread(target=work, args=(gpu,)) for gpu in args.gpus * args.at_once]
+    print(f"{todo.qsize()} of {len(names)} runs to do", flush=True)
+    for worker in workers:
+        worker.start()
+    while any(worker.is_alive() for worker in workers):
+        try:
+            time.sleep(0.5)  # not join, which an interrupt breaks
+        except KeyboardInterrupt:
+            stopping.set()
+    if stopping.is_set():
+        return 130
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
