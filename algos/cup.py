@@ -9,7 +9,8 @@ gae_lambda are `cost_discount` and `cost_gae_lambda`.
 
 Source: Yang et al. (2022), "Constrained Update Projection Approach to Safe Policy Optimization",
 arXiv:2209.07089, algorithm 1 and equation 22.
-Differs from it, as OmniSafe does: Adam on lam; A_c is centred; each step stops at target_kl.
+Differs from it, as OmniSafe does: Adam on lam; A_c is centred; each step stops at target_kl. On a
+shared trunk both steps train the values, too.
 """
 
 import dataclasses

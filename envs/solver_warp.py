@@ -10,6 +10,7 @@ Source: Todorov (2014), "Convex and analytically-invertible dynamics with contac
 MuJoCo's documentation, Computation. MuJoCo Warp launches ten kernels an iteration for all worlds, until
 the last one has converged; here a block of threads stays with one world until that has. A thread has a
 degree of freedom and every 32nd row; on Warp's CPU device one thread has them all.
+It does not write `efc.state`, and sets the flag of a solve that is cut short without printing it.
 
 Models that the kernel is not for (`ours`) get MuJoCo Warp's own.
 """
@@ -41,7 +42,7 @@ def sync(): ...
 def eliminate(n: int) -> str:
     """C++ that solves H d = -g; H is positive definite and needs no pivots.
 
-    Each thread of the block's first warp has a row.
+    Each thread of the block, which is one warp, has a row.
     """
     return f"""
 #if defined(__CUDA_ARCH__)
@@ -298,7 +299,7 @@ def newton_kernel(nv: int) -> Any:
                 decrement = wp.tile_reduce(wp.add, wp.tile(descent))[0]
                 if steps > 0 and not (scale * 0.5 * decrement >= tolerance):  # also NaN
                     done = True
-                if steps == iterations:
+                if not done and steps == iterations:
                     overflow[world] = overflow[world] | wp.static(int(types.OverflowType.ITERATIONS))
                     done = True
 

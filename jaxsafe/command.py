@@ -232,7 +232,7 @@ def check_key(
     elif head not in groups:
         raise ConfigError(f"unknown option {key}{nearest(head, groups)}")
     else:
-        option = NAMED.partition(".")[2] if key.startswith(f"{NAMED}.") else option
+        option = NAMED.partition(".")[2] if key.rpartition(".")[0] == NAMED else option
         for name in chosen[head]:
             options = [o for o in groups[head][name] if o != "name"]
             if option not in options:

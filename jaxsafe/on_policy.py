@@ -41,7 +41,9 @@ class OnPolicyConfig:
     total_iterations: float = float("inf")  # where what decays reaches 0; inf: total_steps' end
     hidden: tuple[int, ...] = (64, 64)  # units of each network [O]
     trunk: Literal["separate", "shared"] = "separate"  # networks of their own [O, S], or one for all
-    value_coef: float = 0.5  # of each critic's squared error in the loss of a shared trunk; SB3
+    value_coef: float = (
+        0.5  # of each critic's squared error in the loss of a shared trunk; else unused; SB3
+    )
     activation: Literal["tanh", "relu"] = "tanh"  # [O, S]
     init: Literal["orthogonal", "torch"] = "orthogonal"  # weights; [O] torch, its kaiming_uniform
     init_log_std: float = -0.5  # of the actions' standard deviation [S]
@@ -58,7 +60,7 @@ class OnPolicyConfig:
     cost_gae_lambda: float = 0.95  # [O]
     cost_limit: float = 25.0  # undiscounted cost per episode [O, S]; without constraint only a mark
     minibatches: int = 8  # a pass over the batch, for policy and critics
-    critic_lr: float = 1e-3  # [S]; Adam
+    critic_lr: float = 1e-3  # [S]; Adam; unused with a shared trunk, as are the next two
     critic_epochs: int = 10  # passes of each critic; with 8 minibatches the 80 steps of [S]
     critic_norm_coef: float = 1e-3  # times the sum of squared parameters [O]
     max_grad_norm: float = 40.0  # of each network's gradient [O]

@@ -124,7 +124,8 @@ def trade_off(
             if not name and (known := published.get((env, row.name))) is not None:
                 axes.plot(known.cost[0], known.ret[0], "D", mfc="none", ms=7, color=color)
             if (limit := limits[i]) not in limits[:i]:
-                line = color if limits.count(limit) == 1 and len(set(limits)) > 1 else "0.5"
+                alone = limits.count(limit) == 1 and len({x for x in limits if not np.isnan(x)}) > 1
+                line = color if alone else "0.5"
                 axes.axvline(limit, color=line, ls="--", lw=1)
         axes.plot(*front(means), color="0.6", lw=1, zorder=0)
         axes.set(title=env, xlabel=f"{name or 'cost'} of an episode", ylabel=PANELS[0][1])

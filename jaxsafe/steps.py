@@ -150,6 +150,7 @@ def with_values(objective: Objective, cfg: Any) -> Objective:
         errors = jnp.mean((outputs(actor, batch.obs, cfg)[1] - targets.T) ** 2, axis=0)
         of_cost = errors[1:].reshape(batch.ret_c.shape[1:])
         metrics = metrics | {"train/value_loss_r": errors[0], "train/value_loss_c": of_cost}
+        metrics |= {"train/objective": gain}
         return gain - cfg.value_coef * errors.sum(), metrics
 
     return joint

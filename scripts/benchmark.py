@@ -21,7 +21,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
-from jaxsafe import algos, envs, runner
+from jaxsafe import algos, envs, run_folder, runner
 from jaxsafe.config import ConfigError
 from jaxsafe.rollout import collect, init_rollout
 from jaxsafe.runner import device_name, use_compilation_cache
@@ -188,7 +188,8 @@ def main() -> int:
         if args.json:
             with args.json.open("a") as file:
                 command = "python " + " ".join(sys.argv)
-                file.write(json.dumps(row | {"command": command, **about}) + "\n")
+                row = row | {"command": command, "commit": run_folder.commit(), **about}
+                file.write(json.dumps(row) + "\n")
 
     try:
         for name in args.envs:

@@ -1,5 +1,7 @@
+import json
 import lzma
 import math
+import sys
 
 import jax
 import numpy as np
@@ -134,3 +136,11 @@ def test_unconstrained_ppo_scores_one_and_a_safe_policy_violates_by_zero():
 
 def test_progress_reads_the_newest_manifest(tmp_path):
     assert run_folder.progress(tmp_path) is None
+
+
+def test_the_command_of_a_run_is_recorded_as_it_was_typed(tmp_path, monkeypatch):
+    # `command.read_arguments` puts ++ before a named limit, which the command line does not take
+    monkeypatch.setattr(sys, "argv", ["train.py", "algo=cpo", "++algo.cost_limits.hazards=5"])
+    run_folder.append_versions(tmp_path, "cpu", None)
+    (start,) = json.loads((tmp_path / "versions.json").read_text())
+    assert start["command"].endswith(" train.py algo=cpo algo.cost_limits.hazards=5")

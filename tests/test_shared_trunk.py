@@ -104,7 +104,8 @@ def test_the_joint_objective_by_hand():
     gain, metrics = with_values(lambda actor, batch: (jnp.float32(7.0), {"a": jnp.float32(1)}), CFG)(
         actor, batch
     )
-    assert metrics == {"a": 1.0, "train/value_loss_r": 2.0, "train/value_loss_c": 4.5}
+    losses = {"train/value_loss_r": 2.0, "train/value_loss_c": 4.5}
+    assert metrics == {"a": 1.0, "train/objective": 7.0, **losses}
     np.testing.assert_allclose(gain, 7 - 0.3 * (2 + 4.5), rtol=1e-6)
 
 

@@ -1,9 +1,10 @@
-"""Train what the results lack: python docs/results/run.py --gpus 0 1 --at-once 4
+"""Train what the results lack: python docs/results/run.py --gpus 0,1 --at-once 4
 
 Every task with every algorithm, 5 seeds and 10 million steps each, several commands on a GPU (start
 NVIDIA's multi-process service first, see ../performance.md). A run that is done comes here with its
-metrics compressed; one that is stopped, by Ctrl-C or after --minutes, continues the next time. Then
-`python docs/results/make.py` draws curves and writes tables.
+metrics compressed; one that is stopped, by Ctrl-C or after --minutes, continues the next time. With
+options of train.py it is a trial, which stays in --runs. Then `python docs/results/make.py` draws
+curves and writes tables. Exit status: 0 if nothing is left to do, 130 if stopped, 1 if a run failed.
 """
 
 import argparse
@@ -28,23 +29,22 @@ ALGOS = ["ppo", "ppo_lag", "trpo_lag", "cppo_pid", "cpo", "pcpo", "focops", "cup
 def keep(run: Path, name: str) -> None:
     """Copy what a finished run leaves here, as if it had been trained in runs/."""
     (HERE / name).mkdir(exist_ok=True)
+    part = HERE / name / "metrics.csv.xz.part"
+    with (run / "metrics.csv").open("rb") as plain, lzma.open(part, "wb", preset=9) as packed:
+        shutil.copyfileobj(plain, packed)
     for file in ("config.yaml", "versions.json", "evaluation.json"):
         if (run / file).exists():
             text = (run / file).read_text().replace(str(run), f"runs/{name}").replace(f"{ROOT}/", "")
             (HERE / name / file).write_text(text)
-    with (
-        (run / "metrics.csv").open("rb") as plain,
-        lzma.open(HERE / name / "metrics.csv.xz", "wb", preset=9) as packed,
-    ):
-        shutil.copyfileobj(plain, packed)
+    part.replace(HERE / name / "metrics.csv.xz")  # last: with it the run is done
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("options", nargs="*", metavar="key=value", help="further options of train.py")
+    parser.add_argument("options", nargs="*", metavar="key=value", help="of train.py, for a trial")
     parser.add_argument("--tasks", nargs="+", default=TASKS)
     parser.add_argument("--algos", nargs="+", default=ALGOS)
-    parser.add_argument("--gpus", nargs="+", default=["0"])
+    parser.add_argument("--gpus", default="0", help="their indices, with commas between")
     parser.add_argument("--at-once", type=int, default=1, help="commands on each GPU")
     parser.add_argument("--minutes", type=float, default=float("inf"), help="then stop")
     parser.add_argument("--runs", type=Path, default=ROOT / "runs" / "results")
@@ -56,55 +56,69 @@ def main() -> int:
     missing = [job for job in names if not (HERE / job[0] / "metrics.csv.xz").exists()]
     for job in sorted(missing, key=lambda job: not (args.runs / job[0]).exists()):  # those begun first
         todo.put(job)
-    failed, stopping = [], threading.Event()
+    failed, left, stopping = [], [], threading.Event()
 
     def work(gpu: str) -> None:
-        while not stopping.is_set() and time.monotonic() < end:
+        while True:
             try:
-                name, task, algo = todo.get_nowait()
+                job = todo.get_nowait()
             except queue.Empty:
                 return
-            run = args.runs / name
-            run.parent.mkdir(parents=True, exist_ok=True)
-            command = [
-                sys.executable, str(ROOT / "scripts" / "train.py"), f"env={task}", f"algo={algo}",
-                "num_seeds=5", "total_steps=1e7", "video=false", f"run_dir={run}", "resume=true",
-                *args.options,
-            ]  # fmt: skip
-            own = {"CUDA_VISIBLE_DEVICES": gpu, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
-            begun = time.monotonic()
-            with run.with_suffix(".log").open("a") as log:
-                process = subprocess.Popen(
-                    command,
-                    stdout=log,
-                    stderr=subprocess.STDOUT,
-                    env=os.environ | own,
-                    start_new_session=True,  # Ctrl-C is passed on once, below
-                )
-                while process.poll() is None:
-                    if stopping.wait(1) or time.monotonic() >= end:
-                        process.send_signal(signal.SIGINT)
-                        process.wait()
-            status = process.returncode
-            if status == 0:
-                keep(run, name)
-            elif status != 130:
-                failed.append(name)
-            what = {0: "done", 130: "stopped"}.get(status, f"failed, see {run.with_suffix('.log')}")
-            print(f"{name}: {what}, {(time.monotonic() - begun) / 60:.1f} minutes", flush=True)
+            try:
+                train(*job, gpu)
+            except Exception as error:
+                failed.append(job[0])
+                print(f"{job[0]}: {error!r}", flush=True)
 
-    workers = [threading.Thread(target=work, args=(gpu,)) for gpu in args.gpus * args.at_once]
+    def train(name: str, task: str, algo: str, gpu: str) -> None:
+        if stopping.is_set() or time.monotonic() >= end:
+            left.append(name)
+            return
+        run = args.runs / name
+        run.parent.mkdir(parents=True, exist_ok=True)
+        command = [
+            sys.executable, str(ROOT / "scripts" / "train.py"), f"env={task}", f"algo={algo}",
+            "num_seeds=5", "total_steps=1e7", "video=false", f"run_dir={run}", "resume=true",
+            *args.options,
+        ]  # fmt: skip
+        own = {"CUDA_VISIBLE_DEVICES": gpu, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
+        begun = time.monotonic()
+        with run.with_suffix(".log").open("a") as log:
+            process = subprocess.Popen(
+                command,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env=os.environ | own,
+                start_new_session=True,  # Ctrl-C is passed on once, below
+            )
+            while process.poll() is None:
+                if stopping.wait(1) or time.monotonic() >= end:
+                    process.send_signal(signal.SIGINT)
+                    process.wait()
+        if process.returncode == 0:
+            what = "done"
+            if not args.options:
+                keep(run, name)
+        elif process.returncode in (130, -signal.SIGINT):
+            what = "stopped"
+            left.append(name)
+        else:
+            what = f"failed, see {run.with_suffix('.log')}"
+            failed.append(name)
+        print(f"{name}: {what}, {(time.monotonic() - begun) / 60:.1f} minutes", flush=True)
+
+    for ending in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT):
+        signal.signal(ending, lambda *_: stopping.set())
+    workers = [
+        threading.Thread(target=work, args=(gpu,)) for gpu in args.gpus.split(",") * args.at_once
+    ]
     print(f"{todo.qsize()} of {len(names)} runs to do", flush=True)
     for worker in workers:
         worker.start()
-    while any(worker.is_alive() for worker in workers):
-        try:
-            time.sleep(0.5)  # not join, which an interrupt breaks
-        except KeyboardInterrupt:
-            stopping.set()
-    if stopping.is_set():
-        return 130
-    return 1 if failed else 0
+    for worker in workers:
+        worker.join()
+    print(f"left to do: {', '.join(left + failed) or 'nothing'}")
+    return 1 if failed else 130 if left else 0
 
 
 if __name__ == "__main__":
