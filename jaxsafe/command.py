@@ -38,7 +38,7 @@ from rich.console import Console
 import jaxsafe
 from jaxsafe import checkpoint, distributed, evaluation, plots, run_folder, runner, stats
 from jaxsafe.config import ConfigError, flat, from_dict, is_float, nearest
-from jaxsafe.constraints import check_names, in_words, own_limits
+from jaxsafe.constraints import check_names, in_words, limits_of, own_limits
 from jaxsafe.on_policy import Algorithm
 from jaxsafe.progress import Report
 from jaxsafe.types import Env, PyTree
@@ -598,7 +598,6 @@ class Scores(NamedTuple):
     """What evaluation found for one setting."""
 
     name: str  # '' where there is but one
-    cost_limit: float
     limits: dict[str, float]  # of named costs, where those have their own; else of '', the cost
     episodes: int  # of all its seeds
     rows: dict[str, stats.Estimate]
@@ -618,12 +617,11 @@ def evaluate(
     seeds, scores = settings.train.num_seeds, []
     for i, member in enumerate(runner.members(settings.configs, settings.train)[::seeds]):
         own = evaluation.Episodes(*(x[i * seeds : (i + 1) * seeds] for x in episodes))
-        limit, metrics = float(member.algo.cost_limit), tables[i] if i < len(tables) else {}
-        limits = own_limits(member.algo) or {"": limit}
+        limits, metrics = limits_of(member.algo), tables[i] if i < len(tables) else {}
         found = evaluation.measures(own, cost_names, limits)
-        rows = evaluation.summary(settings.env_name, found, limit, metrics)
+        rows = evaluation.summary(settings.env_name, found, float(member.algo.cost_limit), metrics)
         by_seed = {name: values.mean(1).tolist() for name, values in found.items()}
-        scores.append(Scores(member.setting, limit, limits, own.ret.size, rows, by_seed))
+        scores.append(Scores(member.setting, limits, own.ret.size, rows, by_seed))
     return scores
 
 
@@ -643,7 +641,7 @@ def finish(settings: Settings, env: Env, envs: Any, algos: Any, folder: Path, re
         tables = {s.name: evaluation.as_json(s.rows) | {"seeds": s.seeds} for s in found}
         text = json.dumps({"episodes": train.eval_episodes, **tables.get("", tables)}, indent=1)
         run_folder.replace_text(folder / "evaluation.json", text)
-        for name, _, limits, episodes, rows, _ in found:
+        for name, limits, episodes, rows, _ in found:
             ret, cost, rate = rows["return"], rows["cost"], rows["violation rate"]
             report.line(
                 f"final policy{name and ', ' + name}: return {ret.mean:.4g} [{ret.low:.4g}, "
@@ -861,8 +859,8 @@ def evaluate_main(envs: Any, algos: Any) -> int:
         print(
             f"{settings.env_name} | {settings.algo_name} | "
             f"{settings.train.num_seeds} x {args.episodes} episodes, deterministic policy"
-            + f" | cost limit {settings.algo.cost_limit:g}"
-            * (alone and not own_limits(settings.algo)),
+            + f" | cost limit {in_words(limits_of(settings.algo))}"
+            * alone,
             flush=True,
         )
         for s in evaluate(settings, algo, ts, args.episodes, args.seed, args.run):

@@ -29,7 +29,7 @@ import numpy as np
 import jaxsafe
 from jaxsafe import command, evaluation, plots, run_folder, runner, scores, stats, tables
 from jaxsafe.config import ConfigError, flat, nearest
-from jaxsafe.constraints import in_words, own_limits, written
+from jaxsafe.constraints import in_words, limits_of, written
 from jaxsafe.stats import Estimate
 from jaxsafe.tables import Table
 
@@ -207,8 +207,7 @@ def read_one(folder: Path, envs: Any, algos: Any) -> list[Run]:
     parts = run_folder.by_setting(metrics).values()
     names = [m.setting for m in runner.members(saved.configs, saved.train)[:: saved.train.num_seeds]]
     for cfg, name, table in zip(saved.configs, names, parts, strict=False):
-        own = own_limits(cfg)
-        limits = own or {"": float(cfg.cost_limit)}
+        limits = limits_of(cfg)
         fields = flat(saved._replace(configs=(cfg,)).plain()) | {"run_dir": str(folder)}
         values, seeds = measured(saved.env_name, table, limits), np.unique(table["seed"])
         for what, final in run_folder.read_evaluation(folder, name).items():

@@ -47,6 +47,11 @@ def own_limits(cfg: Any) -> dict[str, float]:
     return dict(sorted((dataclasses.asdict(cfg).get("cost_limits") or {}).items()))
 
 
+def limits_of(cfg: Any) -> dict[str, float]:
+    """Every limit in force, by name; '' is the name of `cost`."""
+    return own_limits(cfg) or {"": float(cfg.cost_limit)}
+
+
 def written(name: str) -> str:
     """What tables call a cost; '' is the name of `cost`."""
     return f"cost {name}" if name else "cost"

@@ -306,8 +306,8 @@ def test_the_policies_of_a_group_are_evaluated_setting_by_setting(finished):
     env = command.make_env(settings, TOYS)
     algo, ts = command.policy_of(settings, env, algos, folder)
     found = command.evaluate(settings, algo, ts, 3, 0, folder)
-    assert [(s.name, s.cost_limit, s.episodes) for s in found] == [
-        (f"algo.cost_limit={limit:g}, algo.dual_lr={rate:g}", limit, 6)
+    assert [(s.name, s.limits, s.episodes) for s in found] == [
+        (f"algo.cost_limit={limit:g}, algo.dual_lr={rate:g}", {"": limit}, 6)
         for limit in (0.5, 5.0)
         for rate in (0.01, 1.0)
     ]
