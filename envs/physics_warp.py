@@ -22,12 +22,13 @@ from mujoco.mjx.third_party import mujoco_warp
 from mujoco.mjx.third_party.mujoco_warp._src import (
     collision_primitive,
     collision_primitive_core,
+    constraint,
     solver,
 )
 
 from jaxsafe.envs.physics import STATE, columns, widths
 from jaxsafe.envs.scene import Scene
-from jaxsafe.envs.solver_warp import solve
+from jaxsafe.envs.solver_warp import adopt, make_constraint, solve
 
 wp.config.log_level = wp.LOG_WARNING  # a line for every kernel otherwise
 
@@ -67,7 +68,7 @@ def plane_capsule(
 
 # For all users of MuJoCo Warp in the process; before Warp compiles the kernels that name the function.
 collision_primitive.plane_capsule = plane_capsule
-solver.solve = solve
+constraint.make_constraint, solver.solve = make_constraint, solve  # ours for data that was `adopt`ed
 
 
 @wp.kernel
@@ -165,13 +166,15 @@ def warp_engine(
     def prepare(worlds: int) -> Worlds:
         m = mujoco_warp.put_model(model)
         m.opt.warn_overflow = 0  # returned instead
+        data = mujoco_warp.make_data(
+            model, nworld=worlds, naconmax=contacts * worlds + FEW_WORLDS, njmax=rows
+        )
+        adopt(model, m, data)
         sensors_off = m.opt.disableflags | mujoco.mjtDisableBit.mjDSBL_SENSOR.value
         return Worlds(
             model=m,
             blind=dataclasses.replace(m, opt=dataclasses.replace(m.opt, disableflags=sensors_off)),
-            data=mujoco_warp.make_data(
-                model, nworld=worlds, naconmax=contacts * worlds + FEW_WORLDS, njmax=rows
-            ),
+            data=data,
             travel=wp.array(scene.orbit, dtype=float),
             into=wp.zeros((worlds, sum(inputs.values())), dtype=float),
             out=wp.zeros((worlds, sum(results.values())), dtype=float),

@@ -6,420 +6,271 @@ x: accelerations, x0: those without constraints, s_r: the cost of row r, convex 
 An iteration solves H d = -g with the gradient g and the Hessian H = M + J' diag(s'') J, and goes along
 d to where the slope vanishes. It ends where g' H^-1 g, what the next one would gain, is small.
 
-Source: Todorov (2014), "Convex and analytically-invertible dynamics with contacts and constraints", and
-MuJoCo's documentation, Computation. MuJoCo Warp launches ten kernels an iteration for all worlds, until
-the last one has converged; here a block of threads stays with one world until that has. A thread has a
-degree of freedom and every 32nd row; on Warp's CPU device one thread has them all.
-It does not write `efc.state`, and sets the flag of a solve that is cut short without printing it.
+A contact has up to 10 rows, but all are linear in 6 numbers, the relative motion (*twist*) of its two
+bodies at one point; and a box on the floor has 20 contacts. So the rows of contacts are never formed. A
+*pair* of touching bodies has 6 rows, E, a contact a small matrix C and the curvature S of its cost, and
 
-Models that the kernel is not for (`ours`) get MuJoCo Warp's own.
+    H = M + sum over pairs of E' (sum over its contacts of C' S C) E
+
+and likewise forces and slopes. Limits, equalities and dry friction, the *plain* rows, are as MuJoCo
+Warp makes them. That writes all of J and launches ten kernels an iteration for all worlds until the
+last has converged; here a warp of threads stays with one world until that has.
+
+Of a contact's rows `efc.force` alone is written, `efc.state` is not, and the flag of a solve that is
+cut short is set without a printed line.
+
+Source: Todorov (2014), "Convex and analytically-invertible dynamics with contacts and constraints",
+and MuJoCo's documentation, Computation.
 """
 # Kernels are Warp's language in Python's syntax, which no type checker of Python knows:
 # pyright: reportIndexIssue=false, reportAssignmentType=false, reportGeneralTypeIssues=false
 # pyright: reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false
 # pyright: reportReturnType=false, reportInvalidTypeForm=false
 
+import dataclasses
 import functools
+from pathlib import Path
 from typing import Any
 
+import mujoco
 import warp as wp
-from mujoco.mjx.third_party.mujoco_warp._src import solver, types
+from mujoco.mjx.third_party.mujoco_warp._src import constraint, solver, types
 
 THREADS = 32  # of a block: a warp
-REGISTERS = 168  # of a thread, for 12 blocks a multiprocessor
-CHUNK = wp.constant(32)  # rows of J in shared memory
-# Degrees of freedom. With the 31 of doggo_goal2 MuJoCo Warp's solver is faster; beyond 32 J is sparse.
-MOST = 24
-ROUNDING = 8 * 1.1920929e-07  # of a sum of float32, relative to its largest terms
+REGISTERS = 128  # of a thread, for 16 blocks a multiprocessor
+MOST = 32  # degrees of freedom: beyond them MuJoCo Warp's J is sparse
 
 theirs = solver.solve
+their_constraints = constraint.make_constraint
+vec5 = wp.types.vector(length=5, dtype=float)
+SOURCE = Path(__file__).with_name("newton.cu").read_text()
 
 
-@wp.func_native("WP_TILE_SYNC();")
-def sync(): ...
+@wp.kernel(enable_backward=False)
+def assign(
+    disableflags: int,
+    timestep: wp.array[float],
+    impratio_invsqrt: wp.array[float],
+    body_invweight0: wp.array2d[wp.vec2],
+    geom_bodyid: wp.array[int],
+    nacon: wp.array[int],
+    kind: wp.array[int],
+    geom: wp.array[wp.vec2i],
+    dim: wp.array[int],
+    dist: wp.array[float],
+    margin: wp.array[float],
+    friction: wp.array[vec5],
+    solref: wp.array[wp.vec2],
+    solimp: wp.array[vec5],
+    world_of: wp.array[int],
+    room: int,  # for rows
+    nefc: wp.array[int],
+    address: wp.array2d[int],
+    count: wp.array[int],
+    listed: wp.array2d[int],
+    soft: wp.array[wp.vec3],
+):
+    """Give each contact its rows, each world the list of its contacts, and say how soft they are:
+    stiffness D of a row, its part of -aref from the depth, and damping, all as in MuJoCo."""
+    i = wp.tid()
+    if i >= nacon[0]:
+        return
+    if (kind[i] & wp.static(int(types.ContactType.CONSTRAINT))) == 0 or dist[i] >= margin[i]:
+        return
+    world = world_of[i]
+    rows = wp.max(1, 2 * (dim[i] - 1))
+    first = wp.atomic_add(nefc, world, rows)
+    fits = first + rows <= room
+    if fits:
+        listed[world, wp.atomic_add(count, world, 1)] = i
+    for r in range(rows):
+        address[i, r] = wp.where(fits, first + r, -1)
+    depth = dist[i] - margin[i]
+    kbi = constraint._contact_kbimp(disableflags, timestep[0], solref[i], solimp[i], depth, False)
+    of = world % body_invweight0.shape[0]
+    weight = float(0.0)
+    for k in range(2):
+        weight += body_invweight0[of, geom_bodyid[geom[i][k]]][0]
+    if dim[i] > 1:
+        ratio = friction[i][0] * friction[i][0]
+        weight = (weight + ratio * weight) * 2.0 * ratio * impratio_invsqrt[0] * impratio_invsqrt[0]
+    soft[i] = wp.vec3(constraint._efc_D(weight, kbi[2]), kbi[0] * kbi[2] * depth, kbi[1])
 
 
-def eliminate(n: int) -> str:
-    """C++ that solves H d = -g; H is positive definite and needs no pivots.
-
-    Each thread of the block, which is one warp, has a row.
-    """
-    return f"""
-#if defined(__CUDA_ARCH__)
-    const unsigned all = 0xffffffff;
-    const int row = threadIdx.x;
-    if (row < 32) {{
-        const int own = min(row, {n - 1});
-        float a[{n}], pivot[{n}];  // the pivots' inverses
-        float b = -wp::load(wp::address(g, own)), x = 0.0f;
-        #pragma unroll
-        for (int j = 0; j < {n}; ++j) a[j] = wp::load(wp::address(H, j, own));
-        #pragma unroll
-        for (int k = 0; k < {n}; ++k) {{
-            pivot[k] = __frcp_rn(__shfl_sync(all, a[k], k));
-            const float factor = row > k ? a[k] * pivot[k] : 0.0f;
-            #pragma unroll
-            for (int j = k + 1; j < {n}; ++j) a[j] -= factor * __shfl_sync(all, a[j], k);
-            b -= factor * __shfl_sync(all, b, k);
-        }}
-        #pragma unroll
-        for (int k = {n} - 1; k >= 0; --k) {{
-            const float last = __shfl_sync(all, b, k) * pivot[k];
-            if (row == k) x = last;
-            if (row < k) b -= a[k] * last;
-        }}
-        if (row < {n}) wp::store(wp::address(d, row), x);
-    }}
-#else
-    float a[{n}][{n}], b[{n}];
-    for (int i = 0; i < {n}; ++i) {{
-        b[i] = -wp::load(wp::address(g, i));
-        for (int j = 0; j < {n}; ++j) a[i][j] = wp::load(wp::address(H, i, j));
-    }}
-    for (int k = 0; k < {n}; ++k)
-        for (int i = k + 1; i < {n}; ++i) {{
-            const float factor = a[i][k] / a[k][k];
-            for (int j = k + 1; j < {n}; ++j) a[i][j] -= factor * a[k][j];
-            b[i] -= factor * b[k];
-        }}
-    for (int k = {n} - 1; k >= 0; --k) {{
-        for (int j = k + 1; j < {n}; ++j) b[k] -= a[k][j] * b[j];
-        b[k] /= a[k][k];
-        wp::store(wp::address(d, k), b[k]);
-    }}
-#endif
-    """
-
-
-@wp.func
-def pull(row: int, ne: int, nf: int, x: float, stiffness: float, loss: float) -> wp.vec2:
-    """Force -s'(x) and curvature s''(x) of a row: equalities come first, then dry friction, then what
-    only pushes."""
-    linear = False
-    if row >= ne + nf:
-        if x >= 0.0:
-            return wp.vec2(0.0, 0.0)
-    elif row >= ne:
-        linear = wp.abs(x) * stiffness >= loss
-    if linear:
-        return wp.vec2(-wp.sign(x) * loss, 0.0)
-    return wp.vec2(-stiffness * x, stiffness)
-
-
-@wp.func
-def pick(a: wp.vec4, part: int) -> float:
-    return wp.where(part < 2, wp.where(part == 0, a[0], a[1]), wp.where(part == 2, a[2], a[3]))
+@wp.struct
+class Problem:
+    iterations: int
+    ls_iterations: int
+    tolerance: wp.array[float]
+    ls_tolerance: wp.array[float]
+    full: int  # the flag of a solve that is cut short
+    begin: wp.array[int]  # where each row of M begins in `column` and `place`
+    column: wp.array[int]
+    place: wp.array[int]  # in M
+    body_rootid: wp.array[int]
+    body_isdofancestor: wp.array2d[int]
+    dof_bodyid: wp.array[int]
+    geom_bodyid: wp.array[int]
+    M: wp.array2d[float]
+    qvel: wp.array2d[float]
+    qacc_warmstart: wp.array2d[float]
+    qacc_smooth: wp.array2d[float]
+    qfrc_smooth: wp.array2d[float]
+    subtree_com: wp.array2d[wp.vec3]
+    cdof: wp.array2d[wp.spatial_vector]
+    ne: wp.array[int]
+    nf: wp.array[int]
+    nl: wp.array[int]
+    room: int  # for rows
+    J: wp.array3d[float]
+    aref: wp.array2d[float]
+    D: wp.array2d[float]
+    loss: wp.array2d[float]
+    residual: wp.array2d[float]  # of plain rows, J x - aref
+    slope: wp.array2d[float]  # J d
+    curvature: wp.array2d[float]
+    count: wp.array[int]  # of contacts
+    listed: wp.array2d[int]
+    soft: wp.array[wp.vec3]
+    geom: wp.array[wp.vec2i]
+    dim: wp.array[int]
+    pos: wp.array[wp.vec3]
+    frame: wp.array[wp.mat33]
+    friction: wp.array[vec5]
+    address: wp.array2d[int]
+    scratch: wp.array2d[float]
+    qacc: wp.array2d[float]
+    Ma: wp.array2d[float]
+    force: wp.array2d[float]
+    qfrc_constraint: wp.array2d[float]
+    niter: wp.array[int]
+    overflow: wp.array[int]
 
 
 @functools.cache
-def newton_kernel(nv: int) -> Any:
-    quads = -(-nv // 4)  # of a row of J, whose columns beyond nv are 0
-    Vector = wp.types.vector(length=4 * quads, dtype=float)
+def newton_kernel(nv: int, room: int) -> Any:
+    @wp.func_native(f"constexpr int NV = {nv}, ROOM = {room};\n{SOURCE}")
+    def newton(p: Problem, world: int, lane: int): ...
 
-    @wp.func_native(eliminate(nv))
-    def solve_together(H: wp.array2d[float], g: wp.array[float], d: wp.array[float]): ...
+    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=REGISTERS)
+    def kernel(p: Problem):
+        world, lane = wp.tid()
+        newton(p, world, lane)
 
-    @wp.func
-    def read(row: wp.array[float]) -> Vector:
-        v = Vector()
-        for i in range(wp.static(nv)):
-            v[i] = row[i]
-        return v
-
-    @wp.func
-    def dot(row: wp.array[wp.vec4], v: Vector) -> float:
-        total = float(0.0)
-        for q in range(wp.static(quads)):
-            a = row[q]
-            total += a[0] * v[4 * q] + a[1] * v[4 * q + 1] + a[2] * v[4 * q + 2] + a[3] * v[4 * q + 3]
-        return total
-
-    @wp.func
-    def product(
-        i: int,
-        begin: wp.array[int],
-        column: wp.array[int],
-        place: wp.array[int],
-        M: wp.array[float],
-        v: wp.array[float],
-    ) -> float:
-        """(M v)_i."""
-        total = float(0.0)
-        for k in range(begin[i], begin[i + 1]):
-            total += M[place[k]] * v[column[k]]
-        return total
-
-    @wp.kernel(
-        module="unique",
-        enable_backward=False,
-        cuda_max_registers=REGISTERS,
-        module_options={"max_unroll": MOST},
-    )
-    def newton(
-        iterations: int,
-        ls_iterations: int,
-        tolerances: wp.array[float],
-        ls_tolerances: wp.array[float],
-        begin: wp.array[int],  # where each row of M begins in `column` and `place`
-        column: wp.array[int],
-        place: wp.array[int],  # in M
-        M: wp.array2d[float],
-        qacc_warmstart: wp.array2d[float],
-        qacc_smooth: wp.array2d[float],
-        qfrc_smooth: wp.array2d[float],
-        ne: wp.array[int],
-        nf: wp.array[int],
-        nefc: wp.array[int],
-        room: int,  # for rows
-        J: wp.array3d[wp.vec4],  # four columns at a time
-        aref: wp.array2d[float],
-        stiffness: wp.array2d[float],
-        loss: wp.array2d[float],
-        residual: wp.array2d[float],  # J x - aref
-        slope: wp.array2d[float],  # J d
-        curvature: wp.array2d[float],
-        change: wp.array2d[float],  # of the curvature, since H was made
-        H: wp.array3d[float],
-        g: wp.array2d[float],
-        d: wp.array2d[float],
-        Md: wp.array2d[float],
-        x: wp.array2d[float],
-        Mx: wp.array2d[float],
-        force: wp.array2d[float],
-        qfrc_constraint: wp.array2d[float],
-        niter: wp.array[int],
-        overflow: wp.array[int],
-    ):
-        world, thread = wp.tid()
-        threads = wp.block_dim()
-        rows = wp.min(nefc[world], room)
-        equal, dry = ne[world], nf[world]
-
-        trace = float(0.0)
-        for i in range(thread, nv, threads):
-            x[world, i] = wp.where(rows > 0, qacc_warmstart[world, i], qacc_smooth[world, i])
-            for j in range(nv):
-                H[world, i, j] = 0.0
-            for k in range(begin[i], begin[i + 1]):
-                H[world, i, column[k]] = M[world, place[k]]
-            trace += H[world, i, i]
-        scale = 1.0 / wp.max(types.MJ_MINVAL, wp.tile_reduce(wp.add, wp.tile(trace))[0])
-        tolerance = tolerances[0]
-        sync()
-        for i in range(thread, nv, threads):
-            Mx[world, i] = product(i, begin, column, place, M[world], x[world])
-            g[world, i] = Mx[world, i] - qfrc_smooth[world, i]
-        start = read(x[world])
-        for row in range(thread, rows, threads):
-            residual[world, row] = dot(J[world, row], start) - aref[world, row]
-            slope[world, row] = 0.0
-            curvature[world, row] = 0.0
-
-        steps = int(0)
-        done = bool(rows == 0)
-        alpha = float(0.0)
-        decrement = float(0.0)  # g' H^-1 g
-        while not done:
-            # where the last step has led
-            changes = int(dry)  # the two linear pieces of dry friction have the same curvature
-            for row in range(thread, rows, threads):
-                at = residual[world, row] + alpha * slope[world, row]
-                here = pull(row, equal, dry, at, stiffness[world, row], loss[world, row])
-                changed = here[1] - curvature[world, row]
-                residual[world, row] = at
-                force[world, row] = here[0]
-                change[world, row] = changed
-                curvature[world, row] = here[1]
-                if changed != 0.0:
-                    changes += 1
-            changes = wp.tile_reduce(wp.add, wp.tile(changes))[0]
-
-            left = 1.0 - alpha
-            if changes == 0 and scale * 0.5 * decrement * left * left < tolerance and steps > 0:
-                for i in range(thread, nv, threads):  # all of the step was quadratic
-                    g[world, i] = left * g[world, i]
-                done = True
-            else:
-                own = Vector()
-                for row in range(thread, rows, threads):
-                    pushes = force[world, row]
-                    if pushes != 0.0:
-                        for q in range(wp.static(quads)):
-                            a = J[world, row, q]
-                            own[4 * q] += pushes * a[0]
-                            own[4 * q + 1] += pushes * a[1]
-                            own[4 * q + 2] += pushes * a[2]
-                            own[4 * q + 3] += pushes * a[3]
-                pulled = wp.tile_reduce(wp.add, wp.tile(own, preserve_type=True))[0]
-                for i in range(wp.static(nv)):
-                    if i % threads == thread:
-                        g[world, i] = Mx[world, i] - qfrc_smooth[world, i] - pulled[i]
-                if changes > 0:
-                    for turn in range((nv + threads - 1) / threads):
-                        mine = wp.min(turn * threads + thread, nv - 1)
-                        quad = mine / 4
-                        part = mine % 4
-                        h = read(H[world, mine])
-                        for first in range(0, rows, CHUNK):
-                            end = wp.min(first + CHUNK, rows)
-                            busy = int(0)
-                            for row in range(first + thread, end, threads):
-                                if change[world, row] != 0.0:
-                                    busy = 1
-                            if wp.tile_reduce(wp.add, wp.tile(busy))[0] > 0:
-                                weights = wp.tile_load(
-                                    change[world], shape=CHUNK, offset=first, storage="shared"
-                                )
-                                some = wp.tile_load(
-                                    J[world],
-                                    shape=(CHUNK, wp.static(quads)),
-                                    offset=(first, 0),
-                                    storage="shared",
-                                )
-                                for r in range(end - first):
-                                    weight = weights[r]
-                                    if weight != 0.0:
-                                        weight *= pick(some[r, quad], part)
-                                        for q in range(wp.static(quads)):
-                                            a = some[r, q]
-                                            h[4 * q] += weight * a[0]
-                                            h[4 * q + 1] += weight * a[1]
-                                            h[4 * q + 2] += weight * a[2]
-                                            h[4 * q + 3] += weight * a[3]
-                                sync()
-                        if turn * threads + thread < nv:
-                            for i in range(wp.static(nv)):
-                                H[world, mine, i] = h[i]
-                sync()
-                solve_together(H[world], g[world], d[world])
-                sync()
-                descent = float(0.0)
-                for i in range(thread, nv, threads):
-                    descent -= g[world, i] * d[world, i]
-                decrement = wp.tile_reduce(wp.add, wp.tile(descent))[0]
-                if steps > 0 and not (scale * 0.5 * decrement >= tolerance):  # also NaN
-                    done = True
-                if not done and steps == iterations:
-                    overflow[world] = overflow[world] | wp.static(int(types.OverflowType.ITERATIONS))
-                    done = True
-
-            if not done:
-                sums = wp.vec3()  # of the smooth cost along d: slope at 0, curvature; and |d|^2
-                for i in range(thread, nv, threads):
-                    along = d[world, i]
-                    Md[world, i] = product(i, begin, column, place, M[world], d[world])
-                    sums += wp.vec3(
-                        along * (Mx[world, i] - qfrc_smooth[world, i]),
-                        along * Md[world, i],
-                        along * along,
-                    )
-                direction = read(d[world])
-                for row in range(thread, rows, threads):
-                    slope[world, row] = dot(J[world, row], direction)
-                smooth = wp.tile_reduce(wp.add, wp.tile(sums, preserve_type=True))[0]
-                flat = tolerance * ls_tolerances[0] * wp.sqrt(smooth[2]) / scale
-
-                alpha = float(1.0)
-                low = float(0.0)
-                high = float(wp.inf)
-                for _ in range(ls_iterations):
-                    sums = wp.vec3()  # of the rows: slope, curvature, size of what the slope sums
-                    for row in range(thread, rows, threads):
-                        rate = slope[world, row]
-                        at = residual[world, row] + alpha * rate
-                        here = pull(row, equal, dry, at, stiffness[world, row], loss[world, row])
-                        rise = -here[0] * rate
-                        sums += wp.vec3(rise, here[1] * rate * rate, wp.abs(rise))
-                    bent = wp.tile_reduce(wp.add, wp.tile(sums, preserve_type=True))[0]
-                    rise = smooth[0] + alpha * smooth[1] + bent[0]
-                    size = wp.abs(smooth[0]) + alpha * smooth[1] + bent[2]
-                    if not (wp.abs(rise) > wp.max(flat, ROUNDING * size)):
-                        break
-                    if rise < 0.0:
-                        low = alpha
-                    else:
-                        high = alpha
-                    other = alpha - rise / (smooth[1] + bent[1])
-                    if other == alpha:
-                        break
-                    if other <= low or other >= high:
-                        other = 0.5 * (low + high)
-                    alpha = other
-
-                if alpha < ROUNDING:
-                    done = True  # downhill is lost in rounding
-                else:
-                    steps += 1
-                    for i in range(thread, nv, threads):
-                        x[world, i] += alpha * d[world, i]
-                        Mx[world, i] += alpha * Md[world, i]
-
-        for i in range(thread, nv, threads):
-            qfrc_constraint[world, i] = Mx[world, i] - qfrc_smooth[world, i] - g[world, i]
-        if thread == 0:
-            niter[world] = steps
-
-    return newton
+    return kernel
 
 
-def ours(m: Any, d: Any) -> bool:
-    """Whether the kernel is for a model: dense, pyramidal cones, no other algorithm of MuJoCo's."""
-    opt = m.opt
-    return (
+@dataclasses.dataclass
+class Workspace:
+    """Of the worlds of one `Data`."""
+
+    count: wp.array  # [worlds] contacts
+    listed: wp.array  # [worlds, room] their indices
+    soft: wp.array  # [contacts, 3], of `assign`
+    by_row: list[wp.array]  # each [worlds, rows]
+    scratch: wp.array
+
+
+def adopt(model: mujoco.MjModel, m: Any, d: Any) -> bool:
+    """Have the worlds of `d` solved here, if the kernel is for their model; others keep MuJoCo Warp's.
+
+    Args:
+        model: what `m` and `d` were made of.
+    """
+    opt, worlds = m.opt, d.nworld
+    if not (
         0 < m.nv <= MOST
         and d.njmax > 0
         and not m.is_sparse
+        and m.nflex == 0
+        and not m.flg_adhesion
+        and not m.flg_surfacevel
         and opt.solver == types.SolverType.NEWTON
         and opt.cone == types.ConeType.PYRAMIDAL
         and opt.integrator != types.IntegratorType.DISCRETE
         and opt.noslip_iterations == 0
         and not opt.disableflags & types.DisableBit.WARMSTART
         and not opt.enableflags & types.EnableBit.SLEEP
-        and opt.tolerance.shape[0] == opt.ls_tolerance.shape[0] == 1
+        and opt.tolerance.shape[0] == opt.ls_tolerance.shape[0] == opt.timestep.shape[0] == 1
+        and opt.impratio_invsqrt.shape[0] == 1
+    ):
+        return False
+    fewest = max(1, 2 * (min([*model.geom_condim, *model.pair_dim]) - 1))  # rows of a contact
+    room = -(-d.njmax // fewest // 32) * 32  # few kernels for many scenes
+    width = -(-m.nv // 4) * 4
+    of_contact, of_pair = 19 + 6 + 6 + 5, 6 * width + 28 + 6
+    d.newton = Workspace(
+        count=wp.zeros(worlds, dtype=int),
+        listed=wp.zeros((worlds, room), dtype=int),
+        soft=wp.zeros(d.naconmax, dtype=wp.vec3),
+        by_row=[wp.zeros((worlds, d.njmax), dtype=float) for _ in range(3)],
+        scratch=wp.zeros((worlds, room * (of_contact + of_pair) + (m.nv + 1) * width), dtype=float),
+    )
+    return True
+
+
+def make_constraint(m: Any, d: Any) -> None:
+    """In place of MuJoCo Warp's: plain rows as it has them, and the lists of contacts."""
+    work = getattr(d, "newton", None)
+    if work is None:
+        their_constraints(m, d)
+        return
+    off = types.DisableBit.CONTACT
+    opt = dataclasses.replace(m.opt, disableflags=m.opt.disableflags | off)
+    their_constraints(dataclasses.replace(m, opt=opt), d)
+    work.count.zero_()
+    if m.opt.disableflags & (off | types.DisableBit.CONSTRAINT):
+        return
+    contact = d.contact
+    wp.launch(
+        assign,
+        dim=d.naconmax,
+        inputs=[
+            m.opt.disableflags,
+            m.opt.timestep,
+            m.opt.impratio_invsqrt,
+            m.body_invweight0,
+            m.geom_bodyid,
+            d.nacon,
+            contact.type,
+            contact.geom,
+            contact.dim,
+            contact.dist,
+            contact.includemargin,
+            contact.friction,
+            contact.solref,
+            contact.solimp,
+            contact.worldid,
+            d.njmax,
+        ],
+        outputs=[d.nefc, contact.efc_address, work.count, work.listed, work.soft],
     )
 
 
 def solve(m: Any, d: Any) -> None:
     """In place of MuJoCo Warp's `solver.solve`."""
-    if not ours(m, d):
+    work = getattr(d, "newton", None)
+    if work is None:
         theirs(m, d)
         return
-    efc, worlds = d.efc, d.nworld
-    J = wp.array(
-        ptr=efc.J.ptr,
-        dtype=wp.vec4,
-        shape=(*efc.J.shape[:2], efc.J.shape[2] // 4),
-        device=efc.J.device,
-    )
-    by_row = [wp.empty((worlds, d.njmax), dtype=float) for _ in range(4)]
-    by_dof = [wp.empty((worlds, m.nv), dtype=float) for _ in range(3)]
-    wp.launch_tiled(
-        newton_kernel(m.nv),
-        dim=worlds,
-        inputs=[
-            m.opt.iterations,
-            m.opt.ls_iterations,
-            m.opt.tolerance,
-            m.opt.ls_tolerance,
-            m.M_mulm_rowadr,
-            m.M_mulm_col,
-            m.M_mulm_madr,
-            d.M,
-            d.qacc_warmstart,
-            d.qacc_smooth,
-            d.qfrc_smooth,
-            d.ne,
-            d.nf,
-            d.nefc,
-            d.njmax,
-            J,
-            efc.aref,
-            efc.D,
-            efc.frictionloss,
-            *by_row,
-            wp.empty((worlds, m.nv, m.nv), dtype=float),
-            *by_dof,
-        ],
-        outputs=[d.qacc, efc.Ma, efc.force, d.qfrc_constraint, d.solver_niter, d.overflow],
-        block_dim=THREADS,
-    )
+    efc, contact = d.efc, d.contact
+    p = Problem()
+    p.iterations, p.ls_iterations = m.opt.iterations, m.opt.ls_iterations
+    p.tolerance, p.ls_tolerance = m.opt.tolerance, m.opt.ls_tolerance
+    p.full = int(types.OverflowType.ITERATIONS)
+    p.begin, p.column, p.place = m.M_mulm_rowadr, m.M_mulm_col, m.M_mulm_madr
+    for name in ("body_rootid", "body_isdofancestor", "dof_bodyid", "geom_bodyid"):
+        setattr(p, name, getattr(m, name))
+    for name in ("M", "qvel", "qacc_warmstart", "qacc_smooth", "qfrc_smooth", "subtree_com", "cdof"):
+        setattr(p, name, getattr(d, name))
+    p.ne, p.nf, p.nl = d.ne, d.nf, d.nl
+    p.room, p.J, p.aref, p.D, p.loss = d.njmax, efc.J, efc.aref, efc.D, efc.frictionloss
+    p.residual, p.slope, p.curvature = work.by_row
+    p.count, p.listed, p.soft, p.scratch = work.count, work.listed, work.soft, work.scratch
+    for name in ("geom", "dim", "pos", "frame", "friction"):
+        setattr(p, name, getattr(contact, name))
+    p.address = contact.efc_address
+    p.qacc, p.Ma, p.force, p.qfrc_constraint = d.qacc, efc.Ma, efc.force, d.qfrc_constraint
+    p.niter, p.overflow = d.solver_niter, d.overflow
+    kernel = newton_kernel(m.nv, work.listed.shape[1])
+    wp.launch_tiled(kernel, dim=d.nworld, inputs=[p], block_dim=THREADS)

@@ -74,6 +74,8 @@ def main() -> int:
     import warp as wp
     from mujoco.mjx.third_party import mujoco_warp
 
+    from jaxsafe.envs import solver_warp
+
     worlds = args.num_envs
     small = scenes.build(sleeping.small_config(env.config, sleeping.awake(env.config, "warp")))
     start = states(env, small, worlds)
@@ -91,7 +93,9 @@ def main() -> int:
             "naconmax": int(contacts * less_contacts) * worlds + 128,
             "njmax": int(rows * less_rows),
         }
-        return model, blind, mujoco_warp.make_data(small.model, nworld=worlds, **room)
+        data = mujoco_warp.make_data(small.model, nworld=worlds, **room)
+        solver_warp.adopt(small.model, model, data)
+        return model, blind, data
 
     def load(data) -> None:
         for name, x in start.items():

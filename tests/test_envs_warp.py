@@ -73,6 +73,12 @@ ROOM = """
     <body pos="0 0 .1">
       <freejoint/><geom type="box" size=".1 .1 .1" condim="6" friction="1 .01 .01"/>
     </body>
+    <body pos=".03 .02 .32">
+      <freejoint/><geom type="box" size=".1 .1 .1" condim="4"/>
+    </body>
+    <body pos="0 1 .1">
+      <freejoint/><geom type="sphere" size=".1" condim="1" priority="1"/>
+    </body>
     <body pos="1 0 1">
       <joint name="a" axis="0 1 0" frictionloss=".5" limited="true" range="-20 20"/>
       <geom type="capsule" fromto="0 0 0 .5 0 0" size=".05"/>
@@ -97,22 +103,32 @@ def test_the_solver_finds_what_mujocos_finds():
     from jaxsafe.envs import physics_warp, solver_warp
 
     assert physics_warp.solver.solve is solver_warp.solve
+    assert physics_warp.constraint.make_constraint is solver_warp.make_constraint
     model = mujoco.MjSpec.from_string(ROOM).compile()  # type: ignore[attr-defined]
     m, worlds = mujoco_warp.put_model(model), 16
-    d = mujoco_warp.make_data(model, nworld=worlds, nconmax=20, njmax=80)
-    assert solver_warp.ours(m, d)
+    d = mujoco_warp.make_data(model, nworld=worlds, nconmax=40, njmax=160)
+    assert solver_warp.adopt(model, m, d)
     rng = np.random.default_rng(0)
-    d.qpos.assign(np.tile(model.qpos0, (worlds, 1)) + np.r_[0, 0, 0.05, np.zeros(4), 0.3, 0.3, 0.3])
+    d.qpos.assign(np.tile(model.qpos0, (worlds, 1)) + np.r_[0, 0, 0.05, np.zeros(18), 0.3, 0.3, 0.3])
     d.qvel.assign(rng.normal(size=(worlds, model.nv)))
     kinds, most = set(), 0
     for _ in range(30):
         mujoco_warp.step(m, d)
         mujoco_warp.forward(m, d)
-        kinds |= {
-            int(k) for row, n in zip(d.efc.type.numpy(), d.nefc.numpy(), strict=True) for k in row[:n]
-        }
         found = {}
-        for solve in (solver_warp.theirs, solver_warp.solve):
+        for make, solve in (
+            (solver_warp.their_constraints, solver_warp.theirs),
+            (solver_warp.make_constraint, solver_warp.solve),
+        ):
+            make(m, d)
+            if solve is solver_warp.theirs:
+                kinds |= {
+                    int(k)
+                    for row, n in zip(d.efc.type.numpy(), d.nefc.numpy(), strict=True)
+                    for k in row[:n]
+                }
+                rows = d.nefc.numpy().copy()
+            np.testing.assert_array_equal(d.nefc.numpy(), rows)
             solve(m, d)
             for name, x in (("qacc", d.qacc), ("qfrc", d.qfrc_constraint), ("Ma", d.efc.Ma)):
                 found.setdefault(name, []).append(x.numpy().copy())
@@ -126,7 +142,21 @@ def test_the_solver_finds_what_mujocos_finds():
             else:
                 scale = np.abs(theirs).max(axis=1, keepdims=True)
                 assert (np.abs(ours - theirs) < 2e-4 * (1 + scale)).all(), name
-    assert len(kinds) >= 4 and most > 2, (kinds, most)
+    assert len(kinds) == 5 and most > 2, (kinds, most)
+
+
+def test_models_that_the_solver_is_not_for_keep_mujocos():
+    from mujoco.mjx.third_party import mujoco_warp
+
+    from jaxsafe.envs import solver_warp
+
+    spec = mujoco.MjSpec.from_string(ROOM)  # type: ignore[attr-defined]
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC  # type: ignore[attr-defined]
+    model = spec.compile()
+    m, d = mujoco_warp.put_model(model), mujoco_warp.make_data(model, nconmax=40, njmax=160)
+    assert not solver_warp.adopt(model, m, d)
+    mujoco_warp.forward(m, d)
+    assert np.isfinite(d.qacc.numpy()).all() and d.solver_niter.numpy()[0] > 0
 
 
 def test_the_solver_stops_where_numbers_have_ended():
@@ -135,7 +165,8 @@ def test_the_solver_stops_where_numbers_have_ended():
     from jaxsafe.envs import solver_warp
 
     model = mujoco.MjSpec.from_string(ROOM).compile()  # type: ignore[attr-defined]
-    m, d = mujoco_warp.put_model(model), mujoco_warp.make_data(model, nworld=2, nconmax=20, njmax=80)
+    m, d = mujoco_warp.put_model(model), mujoco_warp.make_data(model, nworld=2, nconmax=40, njmax=160)
+    assert solver_warp.adopt(model, m, d)
     mujoco_warp.forward(m, d)
     right = d.qacc.numpy().copy()
     d.qfrc_smooth.assign(np.stack([np.full(model.nv, np.nan), d.qfrc_smooth.numpy()[1]]))
