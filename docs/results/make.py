@@ -93,18 +93,61 @@ def by_algorithm(groups: Sequence[compare.Group]) -> str:
     return "\n".join(lines)
 
 
+def benchmark_rows(file: str) -> list[dict]:
+    return [json.loads(line) for line in (HERE / file).read_text().splitlines()]
+
+
+def latest(rows: Sequence[dict], *keys: str) -> dict[tuple, dict]:
+    """Of rows that were measured again, the last, by the values of `keys`."""
+    return {tuple(row[key] for key in keys): row for row in rows if all(key in row for key in keys)}
+
+
+def throughput_table() -> str:
+    """Thousands of environment steps a second on one H200, by task and number of environments."""
+    rows = [r for r in benchmark_rows("benchmark_h200.jsonl") if r["algo"] is None and r.get("warmup")]
+    found = latest([r for r in rows if "peer" not in r], "env", "num_envs")
+    sizes = sorted({size for _, size in found})
+    lines = ["| environments |" + "".join(f" {size:,} |" for size in sizes)]
+    lines.append("|---|" + "---:|" * len(sizes))
+    for env in sorted({env for env, _ in found}):
+        cells = (found.get((env, size)) for size in sizes)
+        texts = (f"{row['env_steps_per_s'] / 1e3:,.0f}" if row else "" for row in cells)
+        lines.append(f"| {env} | {' | '.join(texts)} |")
+    memory = (found.get((env, sizes[-1])) for env in sorted({env for env, _ in found}))
+    most = {row["env"]: row["memory_bytes"] / 2**30 for row in memory if row}
+    lines += [
+        "",
+        f"Memory with {sizes[-1]:,}, GiB: {', '.join(f'{k} {v:.1f}' for k, v in most.items())}.",
+    ]
+    return "\n".join(lines)
+
+
+def algorithm_speeds() -> str:
+    """Environment steps a second of every algorithm's training, 16 seeds, and of PPO-Lagrangian's."""
+    rows = [r for r in benchmark_rows("benchmark_h200.jsonl") if r["algo"] and "peer" not in r]
+    shape = {"env": "point_goal1", "num_seeds": 16, "num_envs": 512, "horizon": 40}
+    rows = [r for r in rows if r.get("warmup") and all(r[k] == v for k, v in shape.items())]
+    found = latest(rows, "algo")
+    beside = found[("ppo_lag",)]["env_steps_per_s"]
+    lines = ["| | steps/s | slowest, fastest run | of `ppo_lag` |", "|---|---:|---:|---:|"]
+    for (algo,), r in sorted(found.items()):
+        rate = r["env_steps_per_s"]
+        ends = f"{r['slowest']:,.0f}, {r['fastest']:,.0f}"
+        lines.append(f"| `{algo}` | {rate:,.0f} | {ends} | {rate / beside:.2f} |")
+    return "\n".join(lines)
+
+
 def throughput(path: Path) -> None:
     """Environment steps a second, random actions, against the number of environments; on the GPU those
     of settled environments."""
     figure, axes = plt.subplots(figsize=(7, 4.5))
     for file, style in (("benchmark_h200.jsonl", "o-"), ("benchmark_cpu.jsonl", "s--")):
         found: dict[str, dict[int, float]] = {}
-        for line in (HERE / file).read_text().splitlines():
-            row = json.loads(line)
+        for row in benchmark_rows(file):
             if row["algo"] is None and ("peer" in row or row.get("warmup") or "cpu" in file):
                 what = f"{row['peer']}: {row['env']}" if "peer" in row else row["env"]
-                best = found.setdefault(what, {})
-                best[row["num_envs"]] = max(best.get(row["num_envs"], 0), row["env_steps_per_s"])
+                points = found.setdefault(what, {})
+                points[row["num_envs"]] = row["env_steps_per_s"]  # the last, if measured again
         device = "H200" if "h200" in file else "2 CPU cores"
         for env, points in sorted(found.items()):
             axes.loglog(*zip(*sorted(points.items()), strict=True), style, label=f"{env}, {device}")
@@ -130,6 +173,8 @@ def main() -> None:
     figures(groups)
     for path, name, table in (
         (HERE / "README.md", "runs", all_runs()),
+        (HERE / "README.md", "speeds", algorithm_speeds()),
+        (HERE.parent / "performance.md", "throughput", throughput_table()),
         (HERE.parent.parent / "README.md", "results", by_algorithm(groups)),
     ):
         path.write_text(marked.replaced(path.read_text(), {name: table}, "measured"))
