@@ -100,11 +100,13 @@ class Report:
             {k: v for k, v in (("ret", ret), ("cost", cost), ("lam", lam)) if math.isfinite(v)}
         )
         rate = (steps - self.begun_at) / max(now - self.begun, 1e-9)  # of one seed
+        lam = self.last["lam"]  # of algorithms that have one multiplier
         text = (
             f"{count(steps)}/{count(self.total)} steps  {count(rate * num_members)} steps/s  "
             f"return {short(self.last['ret'])}  "
             f"cost {short(self.last['cost'])}{self.limits}  "
-            f"lam {short(self.last['lam'])}  left {clock((self.total - steps) / max(rate, 1e-9))}"
+            f"{f'lam {short(lam)}  ' if math.isfinite(lam) else ''}"
+            f"left {clock((self.total - steps) / max(rate, 1e-9))}"
         )
         if self.live:
             self.live.update(self.task, completed=steps, text=text)
