@@ -23,7 +23,7 @@ from jaxsafe.envs.physics import Engine, Physics, Readings, Run
 from jaxsafe.envs.scene import Scene
 
 SLEEPERS = ("vases", "gremlins")
-MOVING = 1e-4  # m/s; from here on Safety Gym charges for a vase's speed, so it must not fall asleep
+MOVING = 1e-4  # m/s; a vase that is faster, or is charged for its speed, does not fall asleep
 AWAKE = 2  # on the engines warp and jax
 SETTLE = 1.0  # s after which a gremlin is on its circle; its weld's time constant is 0.02 s
 
@@ -56,10 +56,12 @@ def with_sleepers(engine: Engine, small: Scene, scene: Scene, cfg: SafetyGymConf
     """The engine of `scene` from that of `small`, which differs by having fewer vases and gremlins."""
     shape = (cfg.gremlins_size, cfg.gremlins_density, cfg.gremlins_travel)
     path = undisturbed(*shape, scene.model.opt.timestep)
+    moving = min(MOVING, cfg.vases_velocity_threshold)
 
     def wake(run: Run) -> Run:
         def woken(physics: Physics, ctrl: jax.Array, substeps: jax.Array) -> tuple[Physics, Readings]:
-            at = places(scene, {kind: nearest(physics, scene, small, kind) for kind in SLEEPERS})
+            chosen = {kind: nearest(physics, scene, small, kind, moving) for kind in SLEEPERS}
+            at = places(scene, chosen)
             few = physics.replace(
                 qpos=physics.qpos[at.qpos],
                 qvel=physics.qvel[at.qvel],
@@ -117,14 +119,17 @@ def places(scene: Scene, awake: dict[str, jax.Array]) -> Places:
     )
 
 
-def nearest(physics: Physics, scene: Scene, small: Scene, kind: str) -> jax.Array:
-    """The objects of a kind that are awake, int [k], in their order: moving vases, then the nearest."""
+def nearest(
+    physics: Physics, scene: Scene, small: Scene, kind: str, moving: float = MOVING
+) -> jax.Array:
+    """The objects of a kind that are awake, int [k], in their order: vases at least as fast as `moving`
+    (m/s), then the nearest."""
     pose = physics.qpos[scene.qpos_slice(kind)].reshape(-1, 7)
     distance = jnp.linalg.norm(pose[:, :2] - physics.qpos[:2], axis=1)
     if kind == "vases":
         velocity = physics.qvel[scene.qvel_slice(kind)].reshape(-1, 6)[:, :3]
-        moving = jnp.linalg.norm(velocity, axis=1) >= MOVING
-        distance = jnp.where(moving, distance / (1 + distance) - 1, distance)  # below 0, in order
+        fast = jnp.linalg.norm(velocity, axis=1) >= moving
+        distance = jnp.where(fast, distance / (1 + distance) - 1, distance)  # below 0, in order
     return jnp.sort(jnp.argsort(distance)[: small.frees[kind]])
 
 

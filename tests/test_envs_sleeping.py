@@ -72,6 +72,16 @@ def test_a_moving_vase_stays_awake_and_the_others_rest():
     np.testing.assert_array_equal(resting, 0)
 
 
+def test_a_vase_whose_speed_is_charged_stays_awake():
+    options = HERE | {"vases_num": 6, "hazards_num": 0, "vases_velocity_threshold": 1e-5}
+    t = task("point_goal1", awake=2, **options)
+    state = beside_the_robot(t, 4)
+    at = t.env.scene.qvel_slice("vases").start + 12  # vase 2
+    state = change(state, {"qvel": state.physics.physics.qvel.at[:, at].set(5e-5)})
+    after = t.idle(state).physics.physics
+    assert (after.qvel[:, at] != 0).all()  # asleep, it would rest
+
+
 def test_of_too_many_moving_vases_the_nearest_stay_awake():
     t = task("point_goal1", awake=2, **(HERE | {"vases_num": 6, "hazards_num": 0}))
     state = beside_the_robot(t, 4)
