@@ -62,11 +62,12 @@ TABLES = {
 def replaced(text: str, written: Mapping[str, str], mark: str = "table") -> str:
     """`text` with what stands between the marks of these tables."""
     for name, table in written.items():
-        begin, end = f"<!-- {mark}: {name} -->\n", "\n<!-- end -->"
-        before, found, rest = text.partition(begin)
-        if not found:
-            raise ValueError(f"no {begin.strip()}")
-        text = before + begin + table + end + rest.partition(end)[2]
+        begin, end = f"<!-- {mark}: {name} -->\n", "<!-- end -->"
+        before, begun, rest = text.partition(begin)
+        _, ended, after = rest.partition(end)
+        if not (begun and ended):
+            raise ValueError(f"no {begin.strip()} with {end} after it")
+        text = before + begin + table + "\n" + end + after
     return text
 
 

@@ -1,7 +1,7 @@
 // MuJoCo's Newton solver for one world: the body of a function in solver_warp.py, which says what is
-// solved and how. NV and ROOM (for contacts) are constants there, p, world and lane its arguments. On a
-// GPU a warp works together, a lane with a degree of freedom and every 32nd row and contact; on a CPU
-// there is one lane, which has them all.
+// solved and how. NV, ROOM (for contacts) and LANES are constants there; p, world and lane arguments.
+// The lanes work together: each has a degree of freedom, or none and then zeros, and every 32nd row and
+// contact. On a GPU they are a warp, on a CPU there is one, or in tests 32 that take turns.
 //
 // In C++ because indexing Warp's arrays took most of the instructions: this is five times as fast.
 
@@ -9,20 +9,27 @@ constexpr int CHUNK = 32;  // contacts whose A and force are added up at a time
 constexpr int WRENCH = 21, SUMS = 28;  // of a pair: lower triangle of A = C' S C, force, 1 unused
 
 #if defined(__CUDA_ARCH__)
-constexpr int LANES = 32;
 __shared__ float part[CHUNK * (SUMS + 1)];
 auto sync = [] { __syncwarp(); };
-auto sum = [](float a) {
+auto from = [](int other, float a) { return __shfl_sync(~0u, a, other); };
+auto plus = [](float a, float b) { return __fadd_rn(a, b); };  // not fused: all lanes find the same
+#else
+static float part[CHUNK * (SUMS + 1)], mail[LANES];
+auto sync = [] { WP_TILE_SYNC(); };
+auto from = [&](int other, float a) {
+    if (LANES == 1) return a;
+    sync();
+    mail[lane] = a;
+    sync();
+    return mail[other];
+};
+auto plus = [](float a, float b) { return a + b; };
+#endif
+auto sum = [&](float a) {
     #pragma unroll
-    for (int k = 16; k > 0; k /= 2) a += __shfl_xor_sync(~0u, a, k);
+    for (int k = LANES / 2; k > 0; k /= 2) a = plus(a, from(lane ^ k, a));
     return a;
 };
-#else
-constexpr int LANES = 1;
-float part[CHUNK * (SUMS + 1)];
-auto sync = [] {};
-auto sum = [](float a) { return a; };
-#endif
 
 constexpr int OWN = (NV + LANES - 1) / LANES;  // degrees of freedom of a lane
 constexpr int N = (NV + 3) / 4 * 4;  // columns of J and E, those beyond NV are 0
@@ -74,7 +81,8 @@ int* contact = (int*)(rate + 6 * ROOM);  // [ROOM], those of a pair side by side
 int* key = contact + ROOM;  // [ROOM], which bodies
 int* pair = key + ROOM;  // [ROOM]
 int* lead = pair + ROOM;  // [pair] its first contact
-int* pushes = lead + ROOM;  // [ROOM], which rows push, as bits; at first the keys as they are listed
+int* pushes = lead + ROOM;  // [ROOM], which rows push, as bits
+int* unsorted = pushes + ROOM;  // [ROOM], the keys as contacts are listed
 
 // contacts in the order of their bodies
 auto bodies_of = [&](int i) {
@@ -85,7 +93,7 @@ const int* listed = row_of(p.listed);
 #pragma unroll 1
 for (int c = lane; c < contacts; c += LANES) {
     const auto bodies = bodies_of(listed[c]);
-    pushes[c] = bodies[0] * p.body_rootid.shape[0] + bodies[1];
+    unsorted[c] = bodies[0] * p.body_rootid.shape[0] + bodies[1];
 }
 sync();
 #pragma unroll 1
@@ -93,9 +101,9 @@ for (int c = lane; c < contacts; c += LANES) {
     int before = 0;
     #pragma unroll 1
     for (int e = 0; e < contacts; ++e)
-        before += pushes[e] < pushes[c] || (pushes[e] == pushes[c] && e < c);
+        before += unsorted[e] < unsorted[c] || (unsorted[e] == unsorted[c] && e < c);
     contact[before] = listed[c];
-    key[before] = pushes[c];
+    key[before] = unsorted[c];
 }
 sync();
 int pairs = 0;
@@ -128,7 +136,7 @@ for (int c = 0; c < contacts; ++c) {
     }
 }
 
-// of this lane's degrees of freedom
+// of this lane's degrees of freedom; 0 where it has none
 float x[OWN], Mx[OWN], g[OWN], d[OWN], Md[OWN];
 const bool free = plain == 0 && contacts == 0;
 float trace = 0.0f;
@@ -205,7 +213,8 @@ for (int c = lane; c < contacts; c += LANES) {
     pushes[c] = 0;
 }
 float velocity[OWN];
-for (int s = 0; s < OWN; ++s) velocity[s] = row_of(p.qvel)[wp::min(lane + s * LANES, NV - 1)];
+for (int s = 0; s < OWN; ++s)
+    velocity[s] = lane + s * LANES < NV ? row_of(p.qvel)[lane + s * LANES] : 0.0f;
 share(velocity);
 twists();
 #pragma unroll 1
@@ -234,7 +243,7 @@ int steps = 0;
 float alpha = 0.0f, decrement = 0.0f;  // g' H^-1 g
 while (!free) {
     // where the last step has led
-    float changes = dry;  // the two linear pieces of dry friction have the same curvature
+    float changes = dry;  // always some: the two linear pieces of dry friction have the same curvature
     #pragma unroll 1
     for (int row = lane; row < plain; row += LANES) {
         const float at = residual[row] + alpha * slope[row];
@@ -365,20 +374,18 @@ while (!free) {
         if (lane + s * LANES >= NV) g[s] = 0.0f;
     }
     // H d = -g by elimination; H is positive definite and needs no pivots
-#if defined(__CUDA_ARCH__)
-    auto of = [](const float* a, int row) { return __shfl_sync(~0u, a[0], row); };
-    auto entry = [&](int row, int i) { return __shfl_sync(~0u, H[0][i], row); };
-#else
-    auto of = [](const float* a, int row) { return a[row]; };
-    auto entry = [&](int row, int i) { return H[row][i]; };
-#endif
+    auto entry = [&](int row, int i) { return from(row % LANES, H[row / LANES][i]); };
+    auto of = [&](const float* a, int row) { return from(row % LANES, a[row / LANES]); };
     float pivot[NV];  // their inverses
     for (int s = 0; s < OWN; ++s) d[s] = -g[s];
     #pragma unroll
     for (int k = 0; k < NV; ++k) {
         pivot[k] = 1.0f / entry(k, k);
         float factor[OWN];
-        for (int s = 0; s < OWN; ++s) factor[s] = lane + s * LANES > k ? H[s][k] * pivot[k] : 0.0f;
+        for (int s = 0; s < OWN; ++s) {
+            const int row = lane + s * LANES;
+            factor[s] = row > k && row < NV ? H[s][k] * pivot[k] : 0.0f;
+        }
         #pragma unroll
         for (int i = k + 1; i < NV; ++i) {
             const float above = entry(k, i);
@@ -431,7 +438,7 @@ while (!free) {
     // to where the slope along d vanishes
     float low = 0.0f, high = INFINITY;
     alpha = 1.0f;
-    for (int turn = 0; turn < p.ls_iterations; ++turn) {
+    for (int trial = 0; trial < p.ls_iterations; ++trial) {
         float rise = 0.0f, bent = 0.0f, size = 0.0f;  // slope, curvature, size of what the slope sums
         #pragma unroll 1
         for (int row = lane; row < plain; row += LANES) {
@@ -454,10 +461,10 @@ while (!free) {
                 const float side = friction * off[k * ROOM + c] + alpha * along;
                 #pragma unroll
                 for (int sign = -1; sign < 2; sign += 2) {
-                    const float row = wp::min(0.0f, at + sign * side), way = change + sign * along;
-                    rise += stiffness * row * way;
-                    size += stiffness * wp::abs(row * way);
-                    if (row < 0.0f) bent += stiffness * way * way;
+                    const float depth = wp::min(0.0f, at + sign * side), way = change + sign * along;
+                    rise += stiffness * depth * way;
+                    size += stiffness * wp::abs(depth * way);
+                    if (depth < 0.0f) bent += stiffness * way * way;
                 }
             }
         }
@@ -485,7 +492,7 @@ for (int s = 0; s < OWN; ++s) {
     if (j >= NV) continue;
     row_of(p.qacc)[j] = x[s];
     row_of(p.Ma)[j] = Mx[s];
-    row_of(p.qfrc_constraint)[j] = Mx[s] - smooth[j] - g[s];
+    row_of(p.qfrc_constraint)[j] = free ? 0.0f : Mx[s] - smooth[j] - g[s];
 }
 #pragma unroll 1
 for (int c = lane; c < contacts; c += LANES) {

@@ -148,8 +148,8 @@ class Problem:
 
 
 @functools.cache
-def newton_kernel(nv: int, room: int) -> Any:
-    @wp.func_native(f"constexpr int NV = {nv}, ROOM = {room};\n{SOURCE}")
+def newton_kernel(nv: int, room: int, lanes: int) -> Any:
+    @wp.func_native(f"constexpr int NV = {nv}, ROOM = {room}, LANES = {lanes};\n{SOURCE}")
     def newton(p: Problem, world: int, lane: int): ...
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=REGISTERS)
@@ -174,6 +174,10 @@ class Workspace:
 def adopt(model: mujoco.MjModel, m: Any, d: Any) -> bool:
     """Have the worlds of `d` solved here, if the kernel is for their model; others keep MuJoCo Warp's.
 
+    It looks at the options of `m` as they are now. MuJoCo Warp's inverse dynamics and adhesion, which
+    read the rows of contacts, are not for data that was adopted. A contact whose rows do not all fit
+    into `njmax` is left out, and the world flagged as MuJoCo Warp does.
+
     Args:
         model: what `m` and `d` were made of.
     """
@@ -185,6 +189,7 @@ def adopt(model: mujoco.MjModel, m: Any, d: Any) -> bool:
         and m.nflex == 0
         and not m.flg_adhesion
         and not m.flg_surfacevel
+        and m.actuator_trntype_body_adr.size == 0
         and opt.solver == types.SolverType.NEWTON
         and opt.cone == types.ConeType.PYRAMIDAL
         and opt.integrator != types.IntegratorType.DISCRETE
@@ -195,10 +200,12 @@ def adopt(model: mujoco.MjModel, m: Any, d: Any) -> bool:
         and opt.impratio_invsqrt.shape[0] == 1
     ):
         return False
-    fewest = max(1, 2 * (min([*model.geom_condim, *model.pair_dim]) - 1))  # rows of a contact
+    fewest = max(
+        1, 2 * (min([*model.geom_condim, *model.pair_dim], default=1) - 1)
+    )  # rows of a contact
     room = -(-d.njmax // fewest // 32) * 32  # few kernels for many scenes
     width = -(-m.nv // 4) * 4
-    of_contact, of_pair = 19 + 6 + 6 + 5, 6 * width + 28 + 6
+    of_contact, of_pair = 19 + 6 + 6 + 6, 6 * width + 28 + 6
     d.newton = Workspace(
         count=wp.zeros(worlds, dtype=int),
         listed=wp.zeros((worlds, room), dtype=int),
@@ -272,5 +279,6 @@ def solve(m: Any, d: Any) -> None:
     p.address = contact.efc_address
     p.qacc, p.Ma, p.force, p.qfrc_constraint = d.qacc, efc.Ma, efc.force, d.qfrc_constraint
     p.niter, p.overflow = d.solver_niter, d.overflow
-    kernel = newton_kernel(m.nv, work.listed.shape[1])
-    wp.launch_tiled(kernel, dim=d.nworld, inputs=[p], block_dim=THREADS)
+    lanes = THREADS if d.qacc.device.is_cuda or wp.config.enable_cpu_blocks else 1
+    kernel = newton_kernel(m.nv, work.listed.shape[1], lanes)
+    wp.launch_tiled(kernel, dim=d.nworld, inputs=[p], block_dim=lanes)

@@ -96,7 +96,16 @@ ROOM = """
 """
 
 
-def test_the_solver_finds_what_mujocos_finds():
+@pytest.fixture(params=[1, 32])
+def lanes(request, monkeypatch):
+    """One lane, as on a CPU, or those of a GPU's warp, which take turns."""
+    import warp as wp
+
+    monkeypatch.setattr(wp.config, "enable_cpu_blocks", request.param == 32)
+    return request.param
+
+
+def test_the_solver_finds_what_mujocos_finds(lanes):
     """Contacts, limits, equalities and dry friction, from the states on the way of 30 steps."""
     from mujoco.mjx.third_party import mujoco_warp
 
