@@ -773,7 +773,12 @@ def train_main(envs: Any, algos: Any) -> int:
         register(request)
         sys.argv[1:] = request.argv
         os.environ["HYDRA_FULL_ERROR"] = "1"  # raise, do not print: `guarded` prints
-        hydra.main(version_base="1.3", config_path=None, config_name="train")(job)()
+        try:
+            hydra.main(version_base="1.3", config_path=None, config_name="train")(job)()
+        except ValueError as error:
+            if not str(error).startswith("Only one of --run"):  # Hydra's, of its own flags
+                raise
+            fail(str(error))
         return 0
 
     return guarded(command)

@@ -136,6 +136,8 @@ def test_bad_input_is_one_line_and_status_2(argument, tmp_path, monkeypatch, cap
 def test_a_new_process_reports_bad_input_the_same_way(tmp_path):
     status, out, err = call("train.py", "algo.clip=wide", cwd=tmp_path)
     assert (status, out, err) == (2, "", "error: algo.clip='wide': expected a number\n")
+    status, out, err = call("train.py", "-m", "--cfg", "job", cwd=tmp_path)
+    assert (status, out) == (2, "") and err.startswith("error: Only one of") and err.count("\n") == 1
 
 
 def test_help_and_cfg_show_every_option_with_its_default(tmp_path):

@@ -21,6 +21,20 @@ def test_every_link_of_the_docs_leads_somewhere():
             assert target.startswith("https://") or (page.parent / target).exists(), (page, target)
 
 
+def test_every_anchor_of_the_docs_is_a_heading():
+    def headings(page: Path) -> set[str]:
+        lines = re.findall(r"^#+ (.*)$", page.read_text(), re.M)
+        return {re.sub(r"[^\w\- ]", "", line.lower()).replace(" ", "-") for line in lines}
+
+    found = 0
+    for page in [*PAGES, ROOT / "README.md"]:
+        text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.M | re.S)
+        for target, anchor in re.findall(r"\]\(([^)#:]*)#([^)]+)\)", text):
+            assert anchor in headings(page.parent / target if target else page), (page, target, anchor)
+            found += 1
+    assert found > 5
+
+
 @pytest.mark.parametrize(
     "page", [pytest.param("concepts.md", marks=pytest.mark.slow), "howto/several_constraints.md"]
 )
@@ -75,6 +89,16 @@ def test_pages_take_in_the_readme_and_show_a_link_on_github():
 )  # fmt: skip
 def test_links_of_the_readme_work_on_a_page(link, expected):
     assert hooks.relinked(link, "README.md", "docs/howto/several_gpus.md", DOCS) == expected
+
+
+def test_a_table_replaces_what_stands_between_its_marks_alone():
+    tables = importlib.import_module("tables")
+    for old in ("", "| old |\n", "| old |\n\nmore\n"):
+        text = f"before\n<!-- table: a -->\n{old}<!-- end -->\nafter\n<!-- end -->\n"
+        new = tables.replaced(text, {"a": "| new |"})
+        assert new == "before\n<!-- table: a -->\n| new |\n<!-- end -->\nafter\n<!-- end -->\n"
+    with pytest.raises(ValueError, match="no <!-- table: a -->"):
+        tables.replaced("<!-- table: a -->\n", {"a": "| new |"})
 
 
 def test_files_that_pages_link_to_are_there():
