@@ -1,5 +1,6 @@
 // MuJoCo's Newton solver for one world: the body of a function in solver_warp.py, which says what is
-// solved and how. NV, ROOM (for contacts) and LANES are constants there; p, world and lane arguments.
+// solved and how. NV, ROOM (for contacts), LANES and SCRATCH are constants there, p, world and lane its
+// arguments.
 // The lanes work together: each has a degree of freedom, or none and then zeros, and every 32nd row and
 // contact. On a GPU they are a warp, on a CPU there is one, or in tests 32 that take turns.
 //
@@ -83,6 +84,7 @@ int* pair = key + ROOM;  // [ROOM]
 int* lead = pair + ROOM;  // [pair] its first contact
 int* pushes = lead + ROOM;  // [ROOM], which rows push, as bits
 int* unsorted = pushes + ROOM;  // [ROOM], the keys as contacts are listed
+static_assert((6 * N + SUMS + 6 + FIELDS + 6 + 6 + 6) * ROOM + (NV + 1) * N == SCRATCH, "scratch");
 
 // contacts in the order of their bodies
 auto bodies_of = [&](int i) {

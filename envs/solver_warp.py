@@ -147,9 +147,18 @@ class Problem:
     overflow: wp.array[int]
 
 
+def scratch_size(nv: int, room: int) -> int:
+    """Floats of a world in `scratch`, which newton.cu divides up and holds to this."""
+    width = -(-nv // 4) * 4
+    of_contact, of_pair = 19 + 6 + 6 + 6, 6 * width + 28 + 6
+    return room * (of_contact + of_pair) + (nv + 1) * width
+
+
 @functools.cache
 def newton_kernel(nv: int, room: int, lanes: int) -> Any:
-    @wp.func_native(f"constexpr int NV = {nv}, ROOM = {room}, LANES = {lanes};\n{SOURCE}")
+    sizes = f"NV = {nv}, ROOM = {room}, LANES = {lanes}, SCRATCH = {scratch_size(nv, room)}"
+
+    @wp.func_native(f"constexpr int {sizes};\n{SOURCE}")
     def newton(p: Problem, world: int, lane: int): ...
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=REGISTERS)
@@ -200,18 +209,15 @@ def adopt(model: mujoco.MjModel, m: Any, d: Any) -> bool:
         and opt.impratio_invsqrt.shape[0] == 1
     ):
         return False
-    fewest = max(
-        1, 2 * (min([*model.geom_condim, *model.pair_dim], default=1) - 1)
-    )  # rows of a contact
+    dim = min([*model.geom_condim, *model.pair_dim], default=1)
+    fewest = max(1, 2 * (dim - 1))  # rows of a contact
     room = -(-d.njmax // fewest // 32) * 32  # few kernels for many scenes
-    width = -(-m.nv // 4) * 4
-    of_contact, of_pair = 19 + 6 + 6 + 6, 6 * width + 28 + 6
     d.newton = Workspace(
         count=wp.zeros(worlds, dtype=int),
         listed=wp.zeros((worlds, room), dtype=int),
         soft=wp.zeros(d.naconmax, dtype=wp.vec3),
         by_row=[wp.zeros((worlds, d.njmax), dtype=float) for _ in range(3)],
-        scratch=wp.zeros((worlds, room * (of_contact + of_pair) + (m.nv + 1) * width), dtype=float),
+        scratch=wp.zeros((worlds, scratch_size(m.nv, room)), dtype=float),
     )
     return True
 

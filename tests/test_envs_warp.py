@@ -96,6 +96,10 @@ ROOM = """
 """
 
 
+def compiled(xml: str):
+    return mujoco.MjSpec.from_string(xml).compile()  # type: ignore[attr-defined] # no types in MuJoCo
+
+
 @pytest.fixture(params=[1, 32])
 def lanes(request, monkeypatch):
     """One lane, as on a CPU, or those of a GPU's warp, which take turns."""
@@ -113,7 +117,7 @@ def test_the_solver_finds_what_mujocos_finds(lanes):
 
     assert physics_warp.solver.solve is solver_warp.solve
     assert physics_warp.constraint.make_constraint is solver_warp.make_constraint
-    model = mujoco.MjSpec.from_string(ROOM).compile()  # type: ignore[attr-defined]
+    model = compiled(ROOM)
     m, worlds = mujoco_warp.put_model(model), 16
     d = mujoco_warp.make_data(model, nworld=worlds, nconmax=40, njmax=160)
     assert solver_warp.adopt(model, m, d)
@@ -159,9 +163,7 @@ def test_models_that_the_solver_is_not_for_keep_mujocos():
 
     from jaxsafe.envs import solver_warp
 
-    spec = mujoco.MjSpec.from_string(ROOM)  # type: ignore[attr-defined]
-    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC  # type: ignore[attr-defined]
-    model = spec.compile()
+    model = compiled(ROOM.replace("<option", '<option cone="elliptic"'))
     m, d = mujoco_warp.put_model(model), mujoco_warp.make_data(model, nconmax=40, njmax=160)
     assert not solver_warp.adopt(model, m, d)
     mujoco_warp.forward(m, d)
@@ -173,7 +175,7 @@ def test_the_solver_stops_where_numbers_have_ended():
 
     from jaxsafe.envs import solver_warp
 
-    model = mujoco.MjSpec.from_string(ROOM).compile()  # type: ignore[attr-defined]
+    model = compiled(ROOM)
     m, d = mujoco_warp.put_model(model), mujoco_warp.make_data(model, nworld=2, nconmax=40, njmax=160)
     assert solver_warp.adopt(model, m, d)
     mujoco_warp.forward(m, d)

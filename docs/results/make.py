@@ -113,12 +113,9 @@ def throughput_table() -> str:
         cells = (found.get((env, size)) for size in sizes)
         texts = (f"{row['env_steps_per_s'] / 1e3:,.0f}" if row else "" for row in cells)
         lines.append(f"| {env} | {' | '.join(texts)} |")
-    memory = (found.get((env, sizes[-1])) for env in sorted({env for env, _ in found}))
-    most = {row["env"]: row["memory_bytes"] / 2**30 for row in memory if row}
-    lines += [
-        "",
-        f"Memory with {sizes[-1]:,}, GiB: {', '.join(f'{k} {v:.1f}' for k, v in most.items())}.",
-    ]
+    largest = [row for (_, size), row in sorted(found.items()) if size == sizes[-1]]
+    memory = (f"{row['env']} {row['memory_bytes'] / 2**30:.1f}" for row in largest)
+    lines += ["", f"Memory with {sizes[-1]:,}, GiB: {', '.join(memory)}."]
     return "\n".join(lines)
 
 
