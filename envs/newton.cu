@@ -1,8 +1,6 @@
 // MuJoCo's Newton solver for one world: the body of a function in solver_warp.py, which says what is
-// solved and how. NV, ROOM (for contacts), LANES and SCRATCH are constants there, p, world and lane its
-// arguments.
-// The lanes work together: each has a degree of freedom, or none and then zeros, and every 32nd row and
-// contact. On a GPU they are a warp, on a CPU there is one, or in tests 32 that take turns.
+// solved and how, after lanes.cu. NV, ROOM (for contacts), LANES and SCRATCH are constants there, p,
+// world and lane its arguments. Each lane has a degree of freedom, and every 32nd row and contact.
 //
 // In C++ because indexing Warp's arrays took most of the instructions: this is five times as fast.
 
@@ -11,29 +9,10 @@ constexpr int WRENCH = 21, SUMS = 28;  // of a pair: lower triangle of A = C' S 
 
 #if defined(__CUDA_ARCH__)
 __shared__ float part[CHUNK * (SUMS + 1)];
-auto sync = [] { __syncwarp(); };
-auto from = [](int other, float a) { return __shfl_sync(~0u, a, other); };
-auto plus = [](float a, float b) { return __fadd_rn(a, b); };  // not fused: all lanes find the same
 #else
-static float part[CHUNK * (SUMS + 1)], mail[LANES];
-auto sync = [] { WP_TILE_SYNC(); };
-auto from = [&](int other, float a) {
-    if (LANES == 1) return a;
-    sync();
-    mail[lane] = a;
-    sync();
-    return mail[other];
-};
-auto plus = [](float a, float b) { return a + b; };
+static float part[CHUNK * (SUMS + 1)];
 #endif
-auto sum = [&](float a) {
-    #pragma unroll
-    for (int k = LANES / 2; k > 0; k /= 2) a = plus(a, from(lane ^ k, a));
-    return a;
-};
 
-constexpr int OWN = (NV + LANES - 1) / LANES;  // degrees of freedom of a lane
-constexpr int N = (NV + 3) / 4 * 4;  // columns of J and E, those beyond NV are 0
 constexpr float ROUNDING = 8 * 1.1920929e-07f;  // of a sum of float32, relative to its largest terms
 constexpr int ARM = 9, FRICTION = 12, STIFFNESS = 17, SIDES = 18, FIELDS = 19;  // of `touch`
 
@@ -55,10 +34,6 @@ auto add = [](float* a, float weight, const float* b) {  // a += weight b
         for (int i = 0; i < 4; ++i) a[4 * q + i] += weight * x.at[i];
     }
 };
-auto at_row = [](const auto& a, int row) {
-    return (decltype(a.data))((char*)a.data + (size_t)row * a.strides[0]);
-};
-auto row_of = [&](const auto& a) { return at_row(a, world); };  // of this world
 
 const int equal = p.ne.data[world], dry = p.nf.data[world];
 const int plain = wp::min(equal + dry + p.nl.data[world], p.room);
@@ -150,7 +125,7 @@ for (int s = 0; s < OWN; ++s) {
     for (int k = p.begin.data[j]; k < p.begin.data[j + 1]; ++k)
         M[p.column.data[k] * N + j] = row_of(p.M)[p.place.data[k]];
     trace += M[j * N + j];
-    x[s] = (free ? row_of(p.qacc_smooth) : row_of(p.qacc_warmstart))[j];
+    x[s] = row_of(p.qacc_warmstart)[j];
 }
 const float scale = 1.0f / wp::max(1e-15f, sum(trace));
 const float tolerance = p.tolerance.data[0];
@@ -243,7 +218,7 @@ auto pull = [&](int row, float at, float& bent) {
 
 int steps = 0;
 float alpha = 0.0f, decrement = 0.0f;  // g' H^-1 g
-while (!free) {
+while (steps <= p.iterations) {
     // where the last step has led
     float changes = dry;  // always some: the two linear pieces of dry friction have the same curvature
     #pragma unroll 1
@@ -375,35 +350,8 @@ while (!free) {
         }
         if (lane + s * LANES >= NV) g[s] = 0.0f;
     }
-    // H d = -g by elimination; H is positive definite and needs no pivots
-    auto entry = [&](int row, int i) { return from(row % LANES, H[row / LANES][i]); };
-    auto of = [&](const float* a, int row) { return from(row % LANES, a[row / LANES]); };
-    float pivot[NV];  // their inverses
     for (int s = 0; s < OWN; ++s) d[s] = -g[s];
-    #pragma unroll
-    for (int k = 0; k < NV; ++k) {
-        pivot[k] = 1.0f / entry(k, k);
-        float factor[OWN];
-        for (int s = 0; s < OWN; ++s) {
-            const int row = lane + s * LANES;
-            factor[s] = row > k && row < NV ? H[s][k] * pivot[k] : 0.0f;
-        }
-        #pragma unroll
-        for (int i = k + 1; i < NV; ++i) {
-            const float above = entry(k, i);
-            for (int s = 0; s < OWN; ++s) H[s][i] -= factor[s] * above;
-        }
-        const float above = of(d, k);
-        for (int s = 0; s < OWN; ++s) d[s] -= factor[s] * above;
-    }
-    #pragma unroll
-    for (int k = NV - 1; k >= 0; --k) {
-        const float last = of(d, k) * pivot[k];
-        for (int s = 0; s < OWN; ++s) {
-            if (lane + s * LANES == k) d[s] = last;
-            if (lane + s * LANES < k) d[s] -= H[s][k] * last;
-        }
-    }
+    eliminate(H, d);
     float descent = 0.0f;
     for (int s = 0; s < OWN; ++s) descent -= g[s] * d[s];
     decrement = sum(descent);
@@ -509,4 +457,4 @@ for (int c = lane; c < contacts; c += LANES) {
         if (p.dim.data[i] > 1) force[first + 2 * k - 1] = less;
     }
 }
-if (lane == 0) p.niter.data[world] = steps;
+if (lane == 0) p.niter.data[world] = free ? 0 : steps;  // without constraints one that is exact

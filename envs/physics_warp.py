@@ -1,4 +1,4 @@
-"""Engine `warp`: MuJoCo Warp's kernels, all substeps of a batch in one CUDA graph.
+"""Engine `warp`: MuJoCo Warp's kernels and ours, all substeps of a batch in one CUDA graph.
 
 MJX calls the same kernels one `mjx.step` at a time and passes all of `mjx.Data` through JAX. Here the
 working data stays in Warp: a step copies one packed row per world in, replays the graph, and copies
@@ -26,9 +26,10 @@ from mujoco.mjx.third_party.mujoco_warp._src import (
     solver,
 )
 
+from jaxsafe.envs.dynamics_warp import adopt, forward, step
 from jaxsafe.envs.physics import STATE, columns, widths
 from jaxsafe.envs.scene import Scene
-from jaxsafe.envs.solver_warp import adopt, make_constraint, solve
+from jaxsafe.envs.solver_warp import make_constraint, solve
 
 wp.config.log_level = wp.LOG_WARNING  # a line for every kernel otherwise
 
@@ -207,11 +208,11 @@ def warp_engine(
                         outputs=[data.mocap_pos],
                     )
                 before = {} if alike else {name: wp.clone(getattr(data, name)) for name in STATE}
-                mujoco_warp.step(w.blind, data)
+                step(w.blind, data)
                 for name, old in before.items():
                     new = getattr(data, name)
                     wp.launch(hold, new.shape, inputs=[given["substeps"], k, old], outputs=[new])
-            mujoco_warp.forward(w.model, data)
+            forward(w.model, data)
             full = wanted.pop("overflow")
             wp.launch(
                 flag,

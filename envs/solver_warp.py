@@ -43,7 +43,7 @@ MOST = 32  # degrees of freedom: beyond them MuJoCo Warp's J is sparse
 theirs = solver.solve
 their_constraints = constraint.make_constraint
 vec5 = wp.types.vector(length=5, dtype=float)
-SOURCE = Path(__file__).with_name("newton.cu").read_text()
+SOURCE = "".join(Path(__file__).with_name(name).read_text() for name in ("lanes.cu", "newton.cu"))
 
 
 @wp.kernel(enable_backward=False)
@@ -114,7 +114,6 @@ class Problem:
     M: wp.array2d[float]
     qvel: wp.array2d[float]
     qacc_warmstart: wp.array2d[float]
-    qacc_smooth: wp.array2d[float]
     qfrc_smooth: wp.array2d[float]
     subtree_com: wp.array2d[wp.vec3]
     cdof: wp.array2d[wp.spatial_vector]
@@ -178,6 +177,7 @@ class Workspace:
     soft: wp.array  # [contacts, 3], of `assign`
     by_row: list[wp.array]  # each [worlds, rows]
     scratch: wp.array
+    never: int  # flags that switch off what is not among the plain rows
 
 
 def adopt(model: mujoco.MjModel, m: Any, d: Any) -> bool:
@@ -212,12 +212,19 @@ def adopt(model: mujoco.MjModel, m: Any, d: Any) -> bool:
     dim = min([*model.geom_condim, *model.pair_dim], default=1)
     fewest = max(1, 2 * (dim - 1))  # rows of a contact
     room = -(-d.njmax // fewest // 32) * 32  # few kernels for many scenes
+    off = types.DisableBit
+    some = {
+        off.EQUALITY: model.neq,
+        off.FRICTIONLOSS: model.dof_frictionloss.any() or model.ntendon,
+        off.LIMIT: model.jnt_limited.any() or model.ntendon,
+    }
     d.newton = Workspace(
         count=wp.zeros(worlds, dtype=int),
         listed=wp.zeros((worlds, room), dtype=int),
         soft=wp.zeros(d.naconmax, dtype=wp.vec3),
         by_row=[wp.zeros((worlds, d.njmax), dtype=float) for _ in range(3)],
         scratch=wp.zeros((worlds, scratch_size(m.nv, room)), dtype=float),
+        never=int(off.CONTACT) | sum(int(flag) for flag, present in some.items() if not present),
     )
     return True
 
@@ -228,11 +235,10 @@ def make_constraint(m: Any, d: Any) -> None:
     if work is None:
         their_constraints(m, d)
         return
-    off = types.DisableBit.CONTACT
-    opt = dataclasses.replace(m.opt, disableflags=m.opt.disableflags | off)
+    opt = dataclasses.replace(m.opt, disableflags=m.opt.disableflags | work.never)
     their_constraints(dataclasses.replace(m, opt=opt), d)
     work.count.zero_()
-    if m.opt.disableflags & (off | types.DisableBit.CONSTRAINT):
+    if m.opt.disableflags & (types.DisableBit.CONTACT | types.DisableBit.CONSTRAINT):
         return
     contact = d.contact
     wp.launch(
@@ -274,7 +280,7 @@ def solve(m: Any, d: Any) -> None:
     p.begin, p.column, p.place = m.M_mulm_rowadr, m.M_mulm_col, m.M_mulm_madr
     for name in ("body_rootid", "body_isdofancestor", "dof_bodyid", "geom_bodyid"):
         setattr(p, name, getattr(m, name))
-    for name in ("M", "qvel", "qacc_warmstart", "qacc_smooth", "qfrc_smooth", "subtree_com", "cdof"):
+    for name in ("M", "qvel", "qacc_warmstart", "qfrc_smooth", "subtree_com", "cdof"):
         setattr(p, name, getattr(d, name))
     p.ne, p.nf, p.nl = d.ne, d.nf, d.nl
     p.room, p.J, p.aref, p.D, p.loss = d.njmax, efc.J, efc.aref, efc.D, efc.frictionloss

@@ -74,7 +74,7 @@ def main() -> int:
     import warp as wp
     from mujoco.mjx.third_party import mujoco_warp
 
-    from jaxsafe.envs import solver_warp
+    from jaxsafe.envs import dynamics_warp
 
     worlds = args.num_envs
     small = scenes.build(sleeping.small_config(env.config, sleeping.awake(env.config, "warp")))
@@ -94,7 +94,7 @@ def main() -> int:
             "njmax": int(rows * less_rows),
         }
         data = mujoco_warp.make_data(small.model, nworld=worlds, **room)
-        solver_warp.adopt(small.model, model, data)
+        dynamics_warp.adopt(small.model, model, data)
         return model, blind, data
 
     def load(data) -> None:
@@ -105,11 +105,11 @@ def main() -> int:
         for name, variant in VARIANTS.items():
             model, blind, data = build(*variant)
             load(data)
-            mujoco_warp.step(blind, data)  # compiles
+            dynamics_warp.step(blind, data)  # compiles
             with wp.ScopedCapture() as capture:
                 for _ in range(10):
-                    mujoco_warp.step(blind, data)
-                mujoco_warp.forward(model, data)
+                    dynamics_warp.step(blind, data)
+                dynamics_warp.forward(model, data)
             graph: Any = capture.graph
             seconds = []
             for _ in range(7):
@@ -125,14 +125,14 @@ def main() -> int:
         _, blind, data = build({}, 1.0, 1.0)
         load(data)
         for _ in range(3):
-            mujoco_warp.step(blind, data)
+            dynamics_warp.step(blind, data)
         for name, x in (("rows", data.nefc), ("solver iterations", data.solver_niter)):
             x = x.numpy()
             print(f"{name}: mean {x.mean():.1f}, 99.9% {np.quantile(x, 0.999):.0f}, most {x.max()}")
         steps, spent = 3, collections.defaultdict(list)
         wp.timing_begin(cuda_filter=wp.TIMING_ALL)
         for _ in range(steps):
-            mujoco_warp.step(blind, data)
+            dynamics_warp.step(blind, data)
         for kernel in wp.timing_end():
             spent[kernel.name].append(kernel.elapsed)
         total = sum(map(sum, spent.values())) / steps

@@ -8,6 +8,7 @@ import pytest
 from tasks import task
 
 from jaxsafe import envs
+from jaxsafe.envs import physics, scene, sleeping, suite
 
 
 def errors(name: str, steps: int = 4, **options) -> dict[str, float]:
@@ -156,6 +157,103 @@ def test_the_solver_finds_what_mujocos_finds(lanes):
                 scale = np.abs(theirs).max(axis=1, keepdims=True)
                 assert (np.abs(ours - theirs) < 2e-4 * (1 + scale)).all(), name
     assert len(kinds) == 5 and most > 2, (kinds, most)
+
+
+def simulated(name: str, worlds: int, **options):
+    """Model and working data of a task's scene, its sleepers but two left out."""
+    from mujoco.mjx.third_party import mujoco_warp
+
+    env = task(name, **options).env
+    small = scene.build(sleeping.small_config(env.config, 2))
+    m = mujoco_warp.put_model(small.model)
+    contacts, rows = physics.contact_budget(small)
+    data = [
+        mujoco_warp.make_data(small.model, nworld=worlds, naconmax=contacts * worlds, njmax=rows)
+        for _ in range(2)
+    ]
+    return small.model, m, *data
+
+
+WRITTEN = (  # by the dynamics, for what comes after them
+    "xpos", "xquat", "xmat", "geom_xpos", "geom_xmat", "site_xpos", "site_xmat", "cinert", "cvel",
+    "cdof", "cdof_dot", "M", "qfrc_smooth", "subtree_com",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["point_push1", "car_goal1", "doggo_button2"])
+def test_the_dynamics_are_mujocos(name, lanes):
+    """All that the dynamics write, and steps, from states on the way of one that tumbles."""
+    from mujoco.mjx.third_party import mujoco_warp
+    from mujoco.mjx.third_party.mujoco_warp._src.forward import euler
+
+    from jaxsafe.envs import dynamics_warp
+
+    worlds = 9  # not a multiple of those that share a block
+    model, m, theirs, ours = simulated(name, worlds)
+    assert dynamics_warp.adopt(model, m, ours) and dynamics_warp.solver_warp.adopt(model, m, theirs)
+    rng = np.random.default_rng(0)
+    theirs.qvel.assign(rng.normal(size=(worlds, model.nv)))
+    roots = np.unique(model.body_rootid[1:])
+    for _ in range(6):
+        theirs.ctrl.assign(rng.uniform(-1.5, 1.5, size=(worlds, model.nu)))
+        if model.nmocap:
+            theirs.mocap_pos.assign(rng.normal(size=(worlds, model.nmocap, 3)))
+        for k in ("qpos", "qvel", "qacc_warmstart", "ctrl", "mocap_pos"):
+            getattr(ours, k).assign(getattr(theirs, k).numpy().copy())
+        mujoco_warp.forward(m, theirs)
+        dynamics_warp.forward(m, ours)
+        for k in WRITTEN:
+            a, b = getattr(ours, k).numpy(), getattr(theirs, k).numpy()
+            if k in ("cinert", "cvel", "subtree_com"):  # others' are read by nobody
+                a, b = (x[:, roots if k == "subtree_com" else slice(1, None)] for x in (a, b))
+            assert np.abs(a - b).max() < 2e-6 * np.abs(b).max(), k
+        assert np.abs(ours.sensordata.numpy() - theirs.sensordata.numpy()).max() < 0.01 * (
+            1 + np.abs(theirs.sensordata.numpy()).max()
+        )
+        # Euler's step from the same accelerations
+        for k in ("qacc", "qfrc_constraint"):
+            getattr(ours, k).assign(getattr(theirs, k).numpy().copy())
+        ours.efc.Ma.assign(theirs.efc.Ma.numpy().copy())
+        euler(m, theirs)
+        dynamics_warp.advance(m, ours)
+        for k in ("qpos", "qvel", "qacc_warmstart", "time"):
+            a, b = getattr(ours, k).numpy(), getattr(theirs, k).numpy()
+            assert np.abs(a - b).max() < 2e-6 * np.abs(b).max(), k
+
+
+def test_the_dynamics_are_for_every_task():
+    from jaxsafe.envs import dynamics_warp
+
+    for name in (f"{robot}_{kind}2" for robot in suite.ROBOTS for kind in ("goal", "button", "push")):
+        model, m, ours, _ = simulated(name, 1)
+        assert dynamics_warp.adopt(model, m, ours), name
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        ('timestep="0.01"', 'timestep="0.01" integrator="implicitfast"'),
+        ('timestep="0.01"', 'timestep="0.01" density="1000"'),
+        ('<joint name="b" axis="0 1 0"/>', '<joint name="b" type="ball" stiffness="1"/>'),
+        ("</mujoco>", '<actuator><muscle joint="a" lengthrange="0 1"/></actuator></mujoco>'),
+        ("</mujoco>", '<actuator><intvelocity joint="a" actrange="-1 1"/></actuator></mujoco>'),
+    ],
+)
+def test_models_that_the_dynamics_are_not_for_keep_mujocos(change):
+    from mujoco.mjx.third_party import mujoco_warp
+
+    from jaxsafe.envs import dynamics_warp
+
+    xml = ROOM.replace("<equality>", "<!--").replace("</equality>", "-->").replace(*change)
+    xml = xml.replace('<joint joint1="b"', '<skip joint1="b"')
+    model = compiled(xml)
+    m = mujoco_warp.put_model(model)
+    ours, theirs = (mujoco_warp.make_data(model, nconmax=40, njmax=160) for _ in range(2))
+    assert not dynamics_warp.adopt(model, m, ours)
+    for _ in range(3):
+        dynamics_warp.step(m, ours)
+        mujoco_warp.step(m, theirs)
+    np.testing.assert_allclose(ours.qpos.numpy(), theirs.qpos.numpy(), atol=1e-4)
 
 
 def test_models_that_the_solver_is_not_for_keep_mujocos():
