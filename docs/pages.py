@@ -90,7 +90,9 @@ def measured(name: str) -> str:
             continue
         metrics = run_folder.read_metrics(folder)
         ret, cost = (results.last_tenth(metrics, f"train/{k}") for k in ("return", "cost"))
-        how = f"`{env}`, preset {preset[0] if preset else 'fast'}, {len(set(metrics['seed']))} seeds"
+        rules = ", `env.rules=safety_gymnasium`" if "button" in env else ""  # as results/run.py has it
+        which, seeds = preset[0] if preset else "fast", len(set(metrics["seed"]))
+        how = f"`{env}`{rules}, preset {which}, {seeds} seeds"
         rows.append(f"| {how} | {ret} | {cost} | {results.published(env, algo)} |")
     if not rows:
         return "Not run at length yet; it learns the small exact problem of tests/test_on_policy.py."

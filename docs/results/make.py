@@ -22,6 +22,7 @@ sys.path.insert(0, str(HERE.parent))
 marked = importlib.import_module("tables")
 # OmniSafe: evaluated policies. We know of no constrained table of Push.
 PUBLISHED = compare.read_published(HERE / "published.csv")
+SWEEP = "jaxsafe"  # `solver` of the rows that are compared with each other
 # Where a run's evaluation.json was not kept: what its command printed.
 PRINTED = {
     "point_goal1-ppo_lag": "19.21 [15.68, 21.97], cost 22.91 [18.99, 27.05]",
@@ -76,19 +77,17 @@ def all_runs() -> str:
 
 
 def by_algorithm(groups: Sequence[compare.Group]) -> str:
-    """Return and cost of each algorithm on each task, beside what is published."""
+    """Return and cost of each algorithm on each task, and below them what is published."""
     tasks = sorted({g.env for g in groups})
     found = {(g.env, g.name): g for g in groups}
-    known = [env for env in tasks if any(env == other for other, _ in PUBLISHED)]
-    header = [c for env in tasks for c in (f"`{env}`", *(["OmniSafe"] * (env in known)))]
-    lines = [f"| | {' | '.join(header)} |", "|---|" + "---:|" * len(header)]
+    lines = [f"| | {' | '.join(f'`{env}`' for env in tasks)} |", "|---|" + "---:|" * len(tasks)]
     for algo in sorted({g.name for g in groups}):
         cells = []
         for env in tasks:
             g, theirs = found.get((env, algo)), PUBLISHED.get((env, algo))
-            cells.append(f"{g.ret.mean:.1f}, {g.cost.mean:.1f}" if g else "")
-            if env in known:
-                cells.append(f"{theirs.ret[0]:.1f}, {theirs.cost[0]:.1f}" if theirs else "")
+            figures = [f"{g.ret.mean:.1f}, {g.cost.mean:.1f}"] if g else [""]
+            figures += [f"*{theirs.ret[0]:.1f}, {theirs.cost[0]:.1f}*"] if theirs else []
+            cells.append("<br>".join(figures))
         lines.append(f"| `{algo}` | {' | '.join(cells)} |")
     return "\n".join(lines)
 
@@ -102,10 +101,15 @@ def latest(rows: Sequence[dict], *keys: str) -> dict[tuple, dict]:
     return {tuple(row[key] for key in keys): row for row in rows if all(key in row for key in keys)}
 
 
+def whole_sweep(row: dict) -> bool:
+    """Of settled environments with random actions on one H200, from when all sizes were measured."""
+    return row["algo"] is None and bool(row.get("warmup")) and row.get("solver") == SWEEP
+
+
 def throughput_table() -> str:
     """Thousands of environment steps a second on one H200, by task and number of environments."""
-    rows = [r for r in benchmark_rows("benchmark_h200.jsonl") if r["algo"] is None and r.get("warmup")]
-    found = latest([r for r in rows if "peer" not in r], "env", "num_envs")
+    rows = filter(whole_sweep, benchmark_rows("benchmark_h200.jsonl"))
+    found = latest(list(rows), "env", "num_envs")
     sizes = sorted({size for _, size in found})
     lines = ["| environments |" + "".join(f" {size:,} |" for size in sizes)]
     lines.append("|---|" + "---:|" * len(sizes))
@@ -141,7 +145,7 @@ def throughput(path: Path) -> None:
     for file, style in (("benchmark_h200.jsonl", "o-"), ("benchmark_cpu.jsonl", "s--")):
         found: dict[str, dict[int, float]] = {}
         for row in benchmark_rows(file):
-            if row["algo"] is None and ("peer" in row or row.get("warmup") or "cpu" in file):
+            if row["algo"] is None and ("peer" in row or "cpu" in file or whole_sweep(row)):
                 what = f"{row['peer']}: {row['env']}" if "peer" in row else row["env"]
                 points = found.setdefault(what, {})
                 points[row["num_envs"]] = row["env_steps_per_s"]  # the last, if measured again

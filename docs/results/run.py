@@ -1,10 +1,13 @@
 """Train what the results lack: python docs/results/run.py --gpus 0,1 --at-once 4
 
 Every task with every algorithm, 5 seeds and 10 million steps each, several commands on a GPU (start
-NVIDIA's multi-process service first, see ../performance.md). A run that is done comes here with its
-metrics compressed; one that is stopped, by Ctrl-C or after --minutes, continues the next time. With
-options of train.py it is a trial, which stays in --runs. Then `python docs/results/make.py` draws
-curves and writes tables. Exit status: 0 if nothing is left to do, 130 if stopped, 1 if a run failed.
+NVIDIA's multi-process service first, see ../performance.md). Button has Safety-Gymnasium's rules, those
+of the published figures; Goal's are the same in both, and of Push none are published.
+
+A run that is done comes here with its metrics compressed; one that is stopped, by Ctrl-C or after
+--minutes, continues the next time. With options of train.py it is a trial, which stays in --runs. Then
+`python docs/results/make.py` draws curves and writes tables. Exit status: 0 if nothing is left to do,
+130 if stopped, 1 if a run failed.
 """
 
 import argparse
@@ -21,9 +24,14 @@ from pathlib import Path
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent.parent
-TASKS = [f"{robot}_{task}{level}" for task in ("goal", "push", "button") for level in (1, 2)
+TASKS = [f"{robot}_{task}" for task in ("goal1", "goal2", "push1", "button1", "button2")
          for robot in ("point", "car")]  # fmt: skip
-ALGOS = ["ppo", "ppo_lag", "trpo_lag", "cppo_pid", "cpo", "pcpo", "focops", "cup"]
+RULES = {task: "safety_gymnasium" for task in TASKS if "button" in task}
+MAIN = ["ppo", "ppo_lag", "trpo_lag", "cppo_pid", "cpo", "pcpo", "focops", "cup"]  # first
+ALGOS = [
+    *MAIN, "pg", "npg", "trpo", "rcpo", "p3o", "trpo_pid", "ppo_saute", "trpo_saute", "ppo_simmer_pid",
+    "trpo_simmer_pid", "ppo_early_terminated", "trpo_early_terminated",
+]  # fmt: skip
 
 
 def keep(run: Path, name: str) -> None:
@@ -52,6 +60,7 @@ def main() -> int:
 
     end = time.monotonic() + 60 * args.minutes
     names = [(f"{task}-{algo}", task, algo) for task in args.tasks for algo in args.algos]
+    names.sort(key=lambda job: job[2] not in MAIN)
     todo: queue.SimpleQueue = queue.SimpleQueue()
     missing = [job for job in names if not (HERE / job[0] / "metrics.csv.xz").exists()]
     for job in sorted(missing, key=lambda job: not (args.runs / job[0]).exists()):  # those begun first
@@ -78,7 +87,8 @@ def main() -> int:
         run.parent.mkdir(parents=True, exist_ok=True)
         command = [
             sys.executable, str(ROOT / "scripts" / "train.py"), f"env={task}", f"algo={algo}",
-            "num_seeds=5", "total_steps=1e7", "video=false", f"run_dir={run}", "resume=true",
+            f"env.rules={RULES.get(task, 'safety_gym')}", "num_seeds=5", "total_steps=1e7",
+            "video=false", f"run_dir={run}", "resume=true",
             *args.options,
         ]  # fmt: skip
         own = {"CUDA_VISIBLE_DEVICES": gpu, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
