@@ -21,9 +21,9 @@ for (int s = 0; s < OWN; ++s) {
 }
 if (DAMPED) {  // (M + h damping) change = M qacc
     for (int s = 0; s < OWN; ++s) {
-        const int j = wp::min(lane + s * LANES, NV - 1);
+        const int j = lane + s * LANES;
         #pragma unroll
-        for (int i = 0; i < N; ++i) H[s][i] = i < NV ? M[i * N + j] : 0.0f;
+        for (int i = 0; i < N; ++i) H[s][i] = i < NV && j < NV ? M[i * N + j] : 0.0f;
     }
     eliminate(H, change);
 }
@@ -63,7 +63,7 @@ for (int j = lane; j < p.jnt_type.shape[0]; j += LANES) {
 }
 if (lane == 0) {
     p.time.data[world] += h;
-    if (p.nefc.data[world] > p.rows) p.overflow.data[world] |= p.no_rows;
-    if (p.ncollision.data[0] > p.contacts) p.overflow.data[world] |= p.no_pairs;
-    if (p.nacon.data[0] > p.contacts) p.overflow.data[world] |= p.no_contacts;
+    if (p.nefc.data[world] > p.rows) p.overflow.data[world] |= NO_NEFC;
+    if (p.ncollision.data[0] > p.contacts) p.overflow.data[world] |= NO_BROADPHASE;
+    if (p.nacon.data[0] > p.contacts) p.overflow.data[world] |= NO_NARROWPHASE;
 }

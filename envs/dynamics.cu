@@ -1,6 +1,7 @@
 // All that a state says before contacts: poses, inertia, velocities, forces without constraints. The
-// body of a function in dynamics_warp.py; BODIES, JOINTS, DOFS, LANES and WORLDS (of a block) are
-// constants there, p, for_sensors, block and thread its arguments. LANES threads share a world.
+// body of a function in dynamics_warp.py; BODIES, JOINTS, DOFS, ACTUATORS, LANES, WORLDS (of a block)
+// and SHARED are constants there, p, for_sensors, block and thread its arguments. LANES threads share a
+// world.
 
 #if defined(__CUDA_ARCH__)
 __shared__ float memory[WORLDS][SHARED];
@@ -12,7 +13,7 @@ auto sync = [] { WP_TILE_SYNC(); };
 #endif
 
 const int lane = thread % LANES, world = block * WORLDS + thread / LANES;
-if (world >= p.worlds) return;
+if (world >= p.qpos.shape[0]) return;
 
 struct Quat { float w, x, y, z; };
 struct Motion { wp::vec3 turn, move; };  // also a force: torque, force
@@ -150,12 +151,12 @@ auto place = [&](int b, const float* offset, const float* spin, float* to, float
     put(to, vec(pos + 3 * b) + rotate(vec(offset), q));
     matrix(times(q, quat(spin)), to_matrix);
 };
-for (int g = lane; g < p.geoms; g += LANES)
+for (int g = lane; g < p.geom_bodyid.shape[0]; g += LANES)
     if (p.geom_moves.data[g])
         place(
             p.geom_bodyid.data[g], (float*)p.geom_pos.data + 3 * g, (float*)p.geom_quat.data + 4 * g,
             at(p.geom_xpos) + 3 * g, at(p.geom_xmat) + 9 * g);
-for (int s = lane; s < p.sites; s += LANES)
+for (int s = lane; s < p.site_bodyid.shape[0]; s += LANES)
     place(
         p.site_bodyid.data[s], (float*)p.site_pos.data + 3 * s, (float*)p.site_quat.data + 4 * s,
         at(p.site_xpos) + 3 * s, at(p.site_xmat) + 9 * s);
@@ -209,14 +210,12 @@ auto velocity = [&](int i) {  // due to a degree of freedom and those before it
 };
 for (int i = lane; i < DOFS; i += LANES) {
     const Motion own = motion(S + 6 * i), base = velocity(p.dof_before.data[i]);
-    Motion rate{};
-    if (p.dof_rotates.data[i])
-        rate = Motion{
-            wp::cross(base.turn, own.turn),
-            wp::cross(base.move, own.turn) + wp::cross(base.turn, own.move)};
+    const Motion rate{
+        wp::cross(base.turn, own.turn),
+        wp::cross(base.move, own.turn) + wp::cross(base.turn, own.move)};
     put_motion(dS + 6 * i, rate);
     put_motion(at(p.cdof) + 6 * i, own);
-    if (for_sensors) put_motion(at(p.cdof_dot) + 6 * i, rate);
+    put_motion(at(p.cdof_dot) + 6 * i, rate);
 }
 for (int b = 1 + lane; b < BODIES; b += LANES)
     for (int e = 0; e < 10; ++e) {
@@ -231,7 +230,7 @@ for (int a = lane; a < ACTUATORS; a += LANES) {
     float force = at(p.ctrl)[a];
     if (p.actuator_ctrllimited.data[a]) force = wp::clamp(force, range[0], range[1]);
     force *= gain[0];
-    if (p.actuator_trntype.data[a] != ON_SITE) {
+    if (p.actuator_biastype.data[a] == AFFINE) {  // on a joint
         const int j = p.actuator_trnid.data[a][0];
         force += bias[0] + bias[1] * gear * qpos[p.jnt_qposadr.data[j]]
             + bias[2] * gear * v[p.jnt_dofadr.data[j]];
@@ -257,7 +256,8 @@ for (int b = 1 + lane; b < BODIES; b += LANES) {
     if (for_sensors)
         for (int e = 0; e < 10; ++e) at(p.cinert)[10 * b + e] = inert[10 * b + e];
 }
-// M, a row a degree of freedom: with itself and those before it, if they are not all independent
+// M, a row a degree of freedom: with itself and those before it, or where they do not depend on each other
+// with itself alone
 for (int i = lane; i < DOFS; i += LANES) {
     const Motion along = momentum(whole + 10 * p.dof_bodyid.data[i], motion(S + 6 * i));
     float* row = at(p.M) + p.M_rowadr.data[i];

@@ -5,9 +5,11 @@ forces without constraints, for robots of 4 to 30 bodies. Here that is one kerne
 threads share a world and keep what they compute in shared memory, and one more moves the state on.
 Between them collisions are MuJoCo Warp's, plain constraint rows too, and the solver is `solver_warp`.
 
-Of `Data` only what later kernels, sensors and this project read is written: no `qacc_smooth`, no parts
-of `qfrc_smooth`, no cameras, lights or energy. Forces are those of gravity, springs, dampers and
-actuators: `xfrc_applied` and `qfrc_applied` count nothing.
+Of `Data` only what later kernels and this project read is written: no `qacc_smooth`, no parts of
+`qfrc_smooth`, no inertial frames, cameras, lights or energy. A pass whose sensors read more is MuJoCo
+Warp's. Forces are those of gravity, springs, dampers and actuators: `xfrc_applied` and `qfrc_applied`
+count nothing. The rates of axes in equalities are those of the state, as in MuJoCo; MuJoCo Warp's are
+of the state before.
 
 Source: MuJoCo's documentation, Computation; Featherstone (2008), Rigid Body Dynamics Algorithms.
 """
@@ -30,23 +32,32 @@ from mujoco.mjx.third_party.mujoco_warp._src import collision_driver, sensor, sm
 from jaxsafe.envs import solver_warp
 
 THREADS = 32  # of a block: a warp
-SHARED_MEMORY = 48 * 1024  # bytes of a block
+SHARED_MEMORY = 47 * 1024  # bytes of a block; Warp takes one more KiB
 vec10 = types.vec10
 HERE = Path(__file__)
 DYNAMICS, LANES, ADVANCE = (
     HERE.with_name(f"{name}.cu").read_text() for name in ("dynamics", "lanes", "advance")
 )
 KINDS = ", ".join(f"{kind.name} = {int(kind)}" for kind in types.JointType)
-ENUMS = f"constexpr int {KINDS}, ON_SITE = {int(types.TrnType.SITE)};\n"
+FULL = ", ".join(f"NO_{kind.name} = {int(kind)}" for kind in types.OverflowType)
+ENUMS = (
+    f"constexpr int {KINDS}, {FULL}, "
+    f"ON_SITE = {int(types.TrnType.SITE)}, AFFINE = {int(types.BiasType.AFFINE)};\n"
+)
+READABLE = [  # sensors that need nothing which is not written
+    getattr(types.SensorType, name)
+    for name in (
+        "TOUCH", "ACCELEROMETER", "VELOCIMETER", "GYRO", "FORCE", "TORQUE", "MAGNETOMETER",
+        "RANGEFINDER", "JOINTPOS", "JOINTVEL", "BALLQUAT", "BALLANGVEL", "JOINTLIMITPOS",
+        "JOINTLIMITVEL", "JOINTLIMITFRC", "GEOMDIST", "GEOMNORMAL", "GEOMFROMTO", "CONTACT", "CLOCK",
+    )
+]  # fmt: skip
 
 
 @wp.struct
 class System:
-    worlds: int
     # the model
     levels: int
-    geoms: int
-    sites: int
     body_level: wp.array[int]  # ours: how far from the world
     body_end: wp.array[int]  # ours: after the last body that it carries
     body_deepest: wp.array[int]  # ours: the last degree of freedom that moves it, or -1
@@ -71,7 +82,6 @@ class System:
     qpos0: wp.array2d[float]
     qpos_spring: wp.array2d[float]
     dof_before: wp.array[int]  # ours: the last degree of freedom that moves its axis, or -1
-    dof_rotates: wp.array[int]  # ours: whether its axis turns with them
     dof_bodyid: wp.array[int]
     dof_jntid: wp.array[int]
     dof_parentid: wp.array[int]
@@ -93,6 +103,7 @@ class System:
     actuator_trnid: wp.array[wp.vec2i]
     actuator_gear: wp.array2d[wp.spatial_vector]
     actuator_gainprm: wp.array2d[vec10]
+    actuator_biastype: wp.array[int]
     actuator_biasprm: wp.array2d[vec10]
     actuator_ctrllimited: wp.array[bool]
     actuator_ctrlrange: wp.array2d[wp.vec2]
@@ -130,9 +141,6 @@ class System:
     overflow: wp.array[int]
     rows: int
     contacts: int
-    no_rows: int  # flags of an overflow
-    no_pairs: int
-    no_contacts: int
 
 
 def shared_size(bodies: int, joints: int, dofs: int, actuators: int) -> int:
@@ -180,6 +188,7 @@ class Plan:
     system: Any
     sizes: tuple[int, int, int, int]  # bodies, joints, degrees of freedom, actuators
     damped: bool
+    readable: bool  # whether its sensors need nothing else
 
 
 def tree(model: mujoco.MjModel) -> dict[str, np.ndarray]:
@@ -204,7 +213,6 @@ def tree(model: mujoco.MjModel) -> dict[str, np.ndarray]:
         "body_end": end,
         "body_deepest": deepest,
         "dof_before": np.where(straight, -1, before),
-        "dof_rotates": ~straight,
         "geom_moves": moves,
     }
 
@@ -212,6 +220,9 @@ def tree(model: mujoco.MjModel) -> dict[str, np.ndarray]:
 def adopt(model: mujoco.MjModel, m: Any, d: Any) -> bool:
     """Have `step` and `forward` run `d` here, if the kernels are for its model: Euler's integrator,
     motors on joints and sites, linear springs and dampers, and the solver's own conditions.
+
+    The arrays of `m` and `d` are bound now, and options looked at: later only what is written into
+    these arrays counts, and flags of sensors, contacts and the solver.
 
     Args:
         model: what `m` and `d` were made of.
@@ -224,47 +235,47 @@ def adopt(model: mujoco.MjModel, m: Any, d: Any) -> bool:
     motors = on_joint & ~turns[np.where(on_joint, at, 0)] & (bias <= types.BiasType.AFFINE)
     thrusters = on_site & (bias == types.BiasType.NONE)
     sizes = (model.nbody, model.njnt, model.nv, model.nu)
-    batched = (getattr(m, name) for name in System.vars if hasattr(m, name))
+    batched = [getattr(m, name) for name in System.vars if hasattr(m, name)] + [m.opt.gravity]
     if not (
         solver_warp.adopt(model, m, d)
         and m.opt.integrator == types.IntegratorType.EULER
         and not m.opt.disableflags & ~int(types.DisableBit.SENSOR)
         and not m.opt.enableflags
         and m.opt.run_collision_detection
+        and not m.opt.run_rne_postconstraint
         and not m.has_fluid
         and not (model.na or model.ntendon or m.nhistory or m.nactuator != model.nu)
         and (motors | thrusters).all()
         and (model.actuator_gaintype == types.GainType.FIXED).all()
-        and not (model.jnt_actfrclimited.any() or model.body_gravcomp.any())
-        and not model.jnt_stiffness[turns].any()
+        and not (m.jnt_actfrclimited.numpy().any() or m.body_gravcomp.numpy().any())
+        and not m.jnt_stiffness.numpy()[0, turns].any()
         and not (m.jnt_stiffnesspoly.numpy().any() or m.dof_dampingpoly.numpy().any())
         and not any(vars(m.callback).values())
-        and all(x.shape[0] == 1 for x in batched if isinstance(x, wp.array) and x.ndim == 2)
+        and all(x.shape[0] == 1 for x in batched if x.ndim == 2 or x is m.opt.gravity)
         and 4 * shared_size(*sizes) * (THREADS // lanes_of(sizes)) <= SHARED_MEMORY
     ):
         return False
-    p = System()
-    for name, x in tree(model).items():
-        setattr(p, name, wp.array(x, dtype=int))
+    p, extra = System(), tree(model)
+    for name, x in extra.items():
+        setattr(p, name, wp.array(x, dtype=int, device=d.qacc.device))
     for name in System.vars:
-        for owner in (m, d):
+        for owner in (m, m.opt, d, d.efc):
             if hasattr(owner, name):
                 setattr(p, name, getattr(owner, name))
-    p.worlds, p.levels = d.nworld, int(tree(model)["body_level"].max()) + 1
-    p.geoms, p.sites = model.ngeom, model.nsite
+    p.levels = int(extra["body_level"].max()) + 1
     p.begin, p.column, p.place = m.M_mulm_rowadr, m.M_mulm_col, m.M_mulm_madr
-    p.gravity, p.timestep = m.opt.gravity, m.opt.timestep
-    p.Ma = d.efc.Ma
     p.rows, p.contacts = d.njmax, d.naconmax
-    overflow = types.OverflowType
-    p.no_rows, p.no_pairs = int(overflow.NEFC), int(overflow.BROADPHASE)
-    p.no_contacts = int(overflow.NARROWPHASE)
-    d.dynamics = Plan(p, sizes, bool(model.dof_damping.any()))
+    d.dynamics = Plan(
+        system=p,
+        sizes=sizes,
+        damped=bool(m.dof_damping.numpy().any()),
+        readable=bool(np.isin(model.sensor_type, READABLE).all()),
+    )
     return True
 
 
 def lanes_of(sizes: tuple[int, ...]) -> int:
-    """Threads of a world: a power of two, at least half of its bodies and degrees of freedom."""
+    """Threads of a world: 8, 16 or 32, at least half of its bodies and of its degrees of freedom."""
     lanes = 8
     while lanes < THREADS and 2 * lanes < max(sizes):
         lanes *= 2
@@ -274,10 +285,10 @@ def lanes_of(sizes: tuple[int, ...]) -> int:
 def forward(m: Any, d: Any) -> None:
     """In place of MuJoCo Warp's, for data that was adopted."""
     plan = getattr(d, "dynamics", None)
-    if plan is None:
+    sensors = not m.opt.disableflags & types.DisableBit.SENSOR
+    if plan is None or (sensors and not plan.readable):
         mujoco_warp.forward(m, d)
         return
-    sensors = not m.opt.disableflags & types.DisableBit.SENSOR
     together = d.qacc.device.is_cuda or wp.config.enable_cpu_blocks
     lanes = lanes_of(plan.sizes) if together else 1
     threads = THREADS if together else 1

@@ -125,7 +125,7 @@ for (int s = 0; s < OWN; ++s) {
     for (int k = p.begin.data[j]; k < p.begin.data[j + 1]; ++k)
         M[p.column.data[k] * N + j] = row_of(p.M)[p.place.data[k]];
     trace += M[j * N + j];
-    x[s] = row_of(p.qacc_warmstart)[j];
+    x[s] = free ? 0.0f : row_of(p.qacc_warmstart)[j];  // from 0 one step is exact
 }
 const float scale = 1.0f / wp::max(1e-15f, sum(trace));
 const float tolerance = p.tolerance.data[0];
@@ -457,4 +457,4 @@ for (int c = lane; c < contacts; c += LANES) {
         if (p.dim.data[i] > 1) force[first + 2 * k - 1] = less;
     }
 }
-if (lane == 0) p.niter.data[world] = free ? 0 : steps;  // without constraints one that is exact
+if (lane == 0) p.niter.data[world] = free ? 0 : steps;  // as MuJoCo counts

@@ -123,6 +123,9 @@ NO_ROOM = int(
     Kind.NEFC | Kind.NJMAX_NNZ | Kind.BROADPHASE | Kind.NARROWPHASE | Kind.CCD | Kind.CONTACT_MATCH
 )
 FEW_WORLDS = 128  # contacts more: the average of few worlds varies
+one_at_a_time = (
+    threading.Lock()
+)  # several devices call from several threads; a CPU's lanes share memory
 
 
 def floats(x: wp.array) -> wp.array:
@@ -162,7 +165,6 @@ def warp_engine(
     inputs, results = widths(model, outputs)
     results |= {"overflow": 1}
     batches: dict[tuple[str, int], Worlds] = {}
-    one_at_a_time = threading.Lock()  # several devices call from several threads
 
     def prepare(worlds: int) -> Worlds:
         m = mujoco_warp.put_model(model)

@@ -177,7 +177,7 @@ class Workspace:
     soft: wp.array  # [contacts, 3], of `assign`
     by_row: list[wp.array]  # each [worlds, rows]
     scratch: wp.array
-    never: int  # flags that switch off what is not among the plain rows
+    never: int  # flags of contacts, which are not plain rows, and of what the model has none of
 
 
 def adopt(model: mujoco.MjModel, m: Any, d: Any) -> bool:
@@ -215,7 +215,7 @@ def adopt(model: mujoco.MjModel, m: Any, d: Any) -> bool:
     off = types.DisableBit
     some = {
         off.EQUALITY: model.neq,
-        off.FRICTIONLOSS: model.dof_frictionloss.any() or model.ntendon,
+        off.FRICTIONLOSS: m.dof_frictionloss.numpy().any() or model.ntendon,
         off.LIMIT: model.jnt_limited.any() or model.ntendon,
     }
     d.newton = Workspace(

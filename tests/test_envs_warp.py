@@ -1,5 +1,7 @@
 """Engine `warp`, on Warp's CPU device: the same kernels and packing as on a GPU, without its graphs."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -57,6 +59,11 @@ def test_guides_go_round_and_steps_of_different_length_live_side_by_side():
 def test_poses_that_a_task_asks_for_come_along():
     worst = errors("point_goal1", lidar_type="natural", reward_orientation=True)
     assert worst["obs"] < 5e-3 and worst["reward"] < 1e-5
+
+
+def test_sensors_of_what_the_dynamics_do_not_write():
+    sensors = ("velocimeter", "subtreelinvel", "subtreeangmom")
+    assert errors("car_goal0", sensors_obs=sensors)["obs"] < 1e-3
 
 
 def test_contacts_without_room_are_counted():
@@ -204,7 +211,7 @@ def test_the_dynamics_are_mujocos(name, lanes):
         dynamics_warp.forward(m, ours)
         for k in WRITTEN:
             a, b = getattr(ours, k).numpy(), getattr(theirs, k).numpy()
-            if k in ("cinert", "cvel", "subtree_com"):  # others' are read by nobody
+            if k in ("cinert", "cvel", "subtree_com"):  # others' are not written
                 a, b = (x[:, roots if k == "subtree_com" else slice(1, None)] for x in (a, b))
             assert np.abs(a - b).max() < 2e-6 * np.abs(b).max(), k
         assert np.abs(ours.sensordata.numpy() - theirs.sensordata.numpy()).max() < 0.01 * (
@@ -229,31 +236,113 @@ def test_the_dynamics_are_for_every_task():
         assert dynamics_warp.adopt(model, m, ours), name
 
 
+ARM = """
+<mujoco>
+  <option timestep="0.01"/>
+  <worldbody>
+    <body name="upper" pos="0 0 1">
+      <joint name="a" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 .5 0 0" size=".05"/>
+      <body name="lower" pos=".5 0 0">
+        <joint name="b" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 .4 0 0" size=".05"/>
+        <site name="hand" pos=".4 0 0"/>
+      </body>
+    </body>
+    <body name="other" pos="1.2 0 1">
+      <joint name="c" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 .3 0 .1" size=".05"/>
+    </body>
+  </worldbody>
+  <equality/>
+  <actuator/>
+  <sensor/>
+</mujoco>
+"""
+
+
+def beside_c(xml: str, steps: int = 20, worlds: int = 2, **options):
+    """(adopted, our data, MuJoCo's) after steps that do not read sensors and a pass that does."""
+    from mujoco.mjx.third_party import mujoco_warp
+
+    from jaxsafe.envs import dynamics_warp
+
+    model = compiled(xml)
+    m, off = mujoco_warp.put_model(model), int(mujoco.mjtDisableBit.mjDSBL_SENSOR)  # type: ignore[attr-defined]
+    blind = dataclasses.replace(m, opt=dataclasses.replace(m.opt, disableflags=off))
+    d = mujoco_warp.make_data(model, nworld=worlds, nconmax=40, njmax=160)
+    adopted = dynamics_warp.adopt(model, m, d)
+    c = mujoco.MjData(model)  # type: ignore[attr-defined]
+    if model.nu:
+        c.ctrl[:] = 0.5
+        d.ctrl.fill_(0.5)
+    for _ in range(steps):
+        dynamics_warp.step(blind, d)
+        mujoco.mj_step(model, c)  # type: ignore[attr-defined]
+    dynamics_warp.forward(m, d)
+    mujoco.mj_forward(model, c)  # type: ignore[attr-defined]
+    return adopted, d, c
+
+
+@pytest.mark.parametrize(
+    ("where", "what"),
+    [
+        ("actuator", '<motor joint="a" gear="3"/>'),
+        ("actuator", '<motor joint="a" damping="2"/>'),
+        ("actuator", '<general joint="a" gainprm="1" biasprm="5 -10 -1"/>'),  # of no bias
+        ("actuator", '<position joint="b" kp="3"/><velocity joint="a" kv="2" forcerange="-.1 .1"/>'),
+        ("actuator", '<general site="hand" gear="1 0 2 0 1 0"/>'),
+        ("equality", '<connect body1="lower" body2="other" anchor=".4 0 0"/>'),
+        ("equality", '<weld body1="lower" body2="other"/>'),
+        ("sensor", '<subtreelinvel body="upper"/><framepos objtype="body" objname="lower"/>'),
+        ("sensor", '<actuatorfrc actuator="m"/><jointactuatorfrc joint="a"/>'),
+    ],
+)
+def test_the_dynamics_go_where_c_goes(where, what):
+    """Motors, thrusters, equalities, and sensors of what the dynamics do not write."""
+    motor = '<motor name="m" joint="a" gear="3"/>' if "actuator=" in what else ""
+    xml = ARM.replace("<actuator/>", f"<actuator>{motor}</actuator>" if motor else "<actuator/>")
+    adopted, d, c = beside_c(xml.replace(f"<{where}/>", f"<{where}>{what}</{where}>"))
+    assert adopted
+    np.testing.assert_allclose(d.qpos.numpy()[1], c.qpos, atol=1e-4)
+    np.testing.assert_allclose(d.qvel.numpy()[1], c.qvel, atol=2e-3)
+    np.testing.assert_allclose(d.sensordata.numpy()[1], c.sensordata, atol=2e-3)
+
+
 @pytest.mark.parametrize(
     "change",
     [
         ('timestep="0.01"', 'timestep="0.01" integrator="implicitfast"'),
         ('timestep="0.01"', 'timestep="0.01" density="1000"'),
+        ('<body name="upper"', '<body name="upper" gravcomp="1"'),
         ('<joint name="b" axis="0 1 0"/>', '<joint name="b" type="ball" stiffness="1"/>'),
-        ("</mujoco>", '<actuator><muscle joint="a" lengthrange="0 1"/></actuator></mujoco>'),
-        ("</mujoco>", '<actuator><intvelocity joint="a" actrange="-1 1"/></actuator></mujoco>'),
+        ("<actuator/>", '<actuator><muscle joint="a" lengthrange="0 1"/></actuator>'),
+        ("<actuator/>", '<actuator><intvelocity joint="a" actrange="-1 1"/></actuator>'),
+        ("<equality/>", "<!-- 400 bodies more, for which shared memory has no room -->"),
     ],
 )
 def test_models_that_the_dynamics_are_not_for_keep_mujocos(change):
+    xml = ARM.replace(*change)
+    if "400" in change[1]:
+        bodies = "".join(f'<body pos="{k} 5 0"><geom size=".1"/></body>' for k in range(400))
+        xml = xml.replace("</worldbody>", f"{bodies}</worldbody>")
+    adopted, d, c = beside_c(xml, steps=3)
+    assert not adopted
+    np.testing.assert_allclose(d.qpos.numpy()[1], c.qpos, atol=1e-4)
+
+
+def test_a_world_without_constraints_forgets_its_warmstart():
     from mujoco.mjx.third_party import mujoco_warp
 
     from jaxsafe.envs import dynamics_warp
 
-    xml = ROOM.replace("<equality>", "<!--").replace("</equality>", "-->").replace(*change)
-    xml = xml.replace('<joint joint1="b"', '<skip joint1="b"')
-    model = compiled(xml)
-    m = mujoco_warp.put_model(model)
-    ours, theirs = (mujoco_warp.make_data(model, nconmax=40, njmax=160) for _ in range(2))
-    assert not dynamics_warp.adopt(model, m, ours)
-    for _ in range(3):
-        dynamics_warp.step(m, ours)
-        mujoco_warp.step(m, theirs)
-    np.testing.assert_allclose(ours.qpos.numpy(), theirs.qpos.numpy(), atol=1e-4)
+    model = compiled(ARM)
+    m, d = mujoco_warp.put_model(model), mujoco_warp.make_data(model, nworld=3, nconmax=40, njmax=160)
+    assert dynamics_warp.adopt(model, m, d)
+    warmstart = np.zeros((3, model.nv))
+    warmstart[1], warmstart[2] = np.nan, 1e6
+    d.qacc_warmstart.assign(warmstart)
+    dynamics_warp.forward(m, d)
+    c = mujoco.MjData(model)  # type: ignore[attr-defined]
+    mujoco.mj_forward(model, c)  # type: ignore[attr-defined]
+    np.testing.assert_allclose(d.qacc.numpy(), np.tile(c.qacc, (3, 1)), rtol=1e-4)
 
 
 def test_models_that_the_solver_is_not_for_keep_mujocos():
