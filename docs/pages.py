@@ -90,10 +90,12 @@ def measured(name: str) -> str:
             continue
         metrics = run_folder.read_metrics(folder)
         ret, cost = (results.last_tenth(metrics, f"train/{k}") for k in ("return", "cost"))
-        rules = ", `env.rules=safety_gymnasium`" if "button" in env else ""  # as results/run.py has it
+        config = run_folder.read_config(folder)
+        rules = config["env"].get("rules", "safety_gym")
         which, seeds = preset[0] if preset else "fast", len(set(metrics["seed"]))
-        how = f"`{env}`{rules}, preset {which}, {seeds} seeds"
-        rows.append(f"| {how} | {ret} | {cost} | {results.published(env, algo)} |")
+        how = f"`{env}`, preset {which}, {seeds} seeds"
+        how += f", `env.rules={rules}`" if rules != "safety_gym" else ""
+        rows.append(f"| {how} | {ret} | {cost} | {results.published(config)} |")
     if not rows:
         return "Not run at length yet; it learns the small exact problem of tests/test_on_policy.py."
     head = "| 1e7 steps a seed, limit 25 | return, last 10% | cost | published |\n|---|---|---|---|\n"

@@ -347,10 +347,15 @@ class Published(NamedTuple):
     cost: tuple[float, float]
     cost_limit: float
     source: str
+    rules: str  # `env.rules` that it holds for, or '' where all are the same
+
+    def holds_for(self, rules: str) -> bool:
+        return self.rules in ("", rules)
 
 
 def read_published(path: Path) -> dict[tuple[str, str], Published]:
-    """Published figures by task and algorithm, from a CSV with the columns of `PUBLISHED`."""
+    """Published figures by task and algorithm, from a CSV with the columns of `PUBLISHED`, and `rules`
+    where a task has others in `env.rules=safety_gym` and `safety_gymnasium`."""
     try:
         with path.open(newline="") as file:
             rows = list(csv.DictReader(file))
@@ -360,7 +365,9 @@ def read_published(path: Path) -> dict[tuple[str, str], Published]:
         found = {}
         for row in rows:
             ret, ret_std, cost, cost_std, limit = (float(row[name]) for name in PUBLISHED[3:])
-            figures = Published((ret, ret_std), (cost, cost_std), limit, row["source"])
+            figures = Published(
+                (ret, ret_std), (cost, cost_std), limit, row["source"], row.get("rules") or ""
+            )
             found[row["task"], row["algo"]] = figures
     except ConfigError:
         raise
@@ -370,9 +377,14 @@ def read_published(path: Path) -> dict[tuple[str, str], Published]:
 
 
 def beside(g: Group, published: Mapping[tuple[str, str], Published]) -> Published | None:
-    """What was published for this task, algorithm and limit."""
+    """What was published for this task, its rules, algorithm and limit."""
     found = published.get((g.env, g.algo or ""))
-    return found if found and found.cost_limit == g.cost_limit else None
+    if found is None or found.cost_limit != g.cost_limit:
+        return None
+    rules = (
+        run.config.get("env.rules", "safety_gym") for run in g.runs
+    )  # none before they were an option
+    return found if all(map(found.holds_for, rules)) else None
 
 
 # ---- tables ----------------------------------------------------------------------------------

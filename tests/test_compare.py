@@ -197,12 +197,26 @@ def test_published_figures_stand_below_and_what_lies_beyond_their_spread_is_mark
     assert cost.rows[0][2] == "15.00 [10.00, 20.00]" and cost.rows[1][2] == "30.00 ± 20.00"
 
 
+def test_published_figures_stand_beside_runs_of_the_same_rules_alone(tmp_path):
+    path = tmp_path / "published.csv"
+    path.write_text(f"{HEADER.strip()},rules\npoint_button1,cpo,Peer,1,2,3,4,25,safety_gymnasium\n")
+    for rules in ("safety_gym", "safety_gymnasium"):
+        folder = write(tmp_path / rules / "1", "point_button1", "cpo")
+        config = run_folder.read_config(folder)
+        config["env"]["rules"] = rules
+        run_folder.write_config(folder, config)
+        (g,) = compared(tmp_path / rules)
+        known = compare.beside(g, compare.read_published(path))
+        assert (known is not None) == (rules == "safety_gymnasium")
+
+
 def test_the_committed_published_figures_are_whole():
     found = compare.read_published(RESULTS / "published.csv")
     assert len(found) == 160
     for env, algo in found:
         assert env in envs.ENVS and algo in algos.ALGOS
-    assert found["point_goal1", "cpo"] == ((20.46, 1.38), (28.84, 7.76), 25.0, "OmniSafe")
+    assert found["point_goal1", "cpo"] == ((20.46, 1.38), (28.84, 7.76), 25.0, "OmniSafe", "")
+    assert {f.rules for (env, _), f in found.items() if "button" in env} == {"safety_gymnasium"}
 
 
 def test_a_table_is_markdown_and_latex():

@@ -11,6 +11,7 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -46,9 +47,11 @@ def last_tenth(metrics: dict[str, np.ndarray], name: str) -> str:
     return tables.cell(stats.estimate(run_folder.last_tenth(metrics, name)), ".2f")
 
 
-def published(env: str, algo: str) -> str:
-    """What others report, and where that is nothing constrained, unconstrained PPO."""
-    if known := PUBLISHED.get((env, algo)):
+def published(config: dict[str, Any]) -> str:
+    """What others report of a run's setting, or where that is nothing constrained, unconstrained PPO."""
+    env, algo = config["env"]["name"], config["algo"]["name"]
+    known = PUBLISHED.get((env, algo))
+    if known and known.holds_for(config["env"].get("rules", "safety_gym")):
         (ret, ret_std), (cost, cost_std) = known.ret, known.cost
         return f"{known.source} {ret:.2f} ± {ret_std:.2f}, cost {cost:.2f} ± {cost_std:.2f}"
     if ppo := scores.CHARACTERISTIC.get(env):
@@ -71,8 +74,8 @@ def all_runs() -> str:
     ]
     for path in sorted(HERE.glob("*/config.yaml")):
         name, metrics = path.parent.name, run_folder.read_metrics(path.parent)
-        env, algo, *_ = name.split("-")
-        lines.append(row(name, metrics, final_policy(name), published(env, algo)))
+        known = published(run_folder.read_config(path.parent))
+        lines.append(row(name, metrics, final_policy(name), known))
     return "\n".join(lines)
 
 
@@ -84,9 +87,11 @@ def by_algorithm(groups: Sequence[compare.Group]) -> str:
     for algo in sorted({g.name for g in groups}):
         cells = []
         for env in tasks:
-            g, theirs = found.get((env, algo)), PUBLISHED.get((env, algo))
-            figures = [f"{g.ret.mean:.1f}, {g.cost.mean:.1f}"] if g else [""]
-            figures += [f"*{theirs.ret[0]:.1f}, {theirs.cost[0]:.1f}*"] if theirs else []
+            figures = []
+            if g := found.get((env, algo)):
+                figures.append(f"{g.ret.mean:.1f}, {g.cost.mean:.1f}")
+                if theirs := compare.beside(g, PUBLISHED):
+                    figures.append(f"*{theirs.ret[0]:.1f}, {theirs.cost[0]:.1f}*")
             cells.append("<br>".join(figures))
         lines.append(f"| `{algo}` | {' | '.join(cells)} |")
     return "\n".join(lines)
