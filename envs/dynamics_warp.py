@@ -30,8 +30,8 @@ from mujoco.mjx.third_party import mujoco_warp
 from mujoco.mjx.third_party.mujoco_warp._src import collision_driver, sensor, smooth, types
 
 from jaxsafe.envs import solver_warp
+from jaxsafe.envs.solver_warp import THREADS, threads
 
-THREADS = 32  # of a block: a warp
 SHARED_MEMORY = 47 * 1024  # bytes of a block; Warp takes one more KiB
 vec10 = types.vec10
 HERE = Path(__file__)
@@ -149,7 +149,9 @@ def shared_size(bodies: int, joints: int, dofs: int, actuators: int) -> int:
 
 
 @functools.cache
-def dynamics_kernel(bodies: int, joints: int, dofs: int, actuators: int, lanes: int, worlds: int):
+def dynamics_kernel(
+    bodies: int, joints: int, dofs: int, actuators: int, lanes: int, worlds: int
+) -> Any:
     sizes = (
         f"BODIES = {bodies}, JOINTS = {joints}, DOFS = {dofs}, ACTUATORS = {actuators}, "
         f"LANES = {lanes}, WORLDS = {worlds}, SHARED = {shared_size(bodies, joints, dofs, actuators)}"
@@ -167,7 +169,7 @@ def dynamics_kernel(bodies: int, joints: int, dofs: int, actuators: int, lanes: 
 
 
 @functools.cache
-def advance_kernel(nv: int, damped: bool, lanes: int):
+def advance_kernel(nv: int, damped: bool, lanes: int) -> Any:
     sizes = f"NV = {nv}, DAMPED = {int(damped)}, LANES = {lanes}"
 
     @wp.func_native(f"constexpr int {sizes};\n{ENUMS}{LANES}{ADVANCE}")
@@ -289,15 +291,13 @@ def forward(m: Any, d: Any) -> None:
     if plan is None or (sensors and not plan.readable):
         mujoco_warp.forward(m, d)
         return
-    together = d.qacc.device.is_cuda or wp.config.enable_cpu_blocks
-    lanes = lanes_of(plan.sizes) if together else 1
-    threads = THREADS if together else 1
-    worlds = threads // lanes  # of a block
+    lanes = min(threads(d), lanes_of(plan.sizes))
+    worlds = threads(d) // lanes  # of a block
     wp.launch_tiled(
         dynamics_kernel(*plan.sizes, lanes, worlds),
         dim=-(-d.nworld // worlds),
         inputs=[plan.system, sensors],
-        block_dim=threads,
+        block_dim=threads(d),
     )
     collision_driver.collision(m, d)
     solver_warp.make_constraint(m, d)
@@ -324,10 +324,9 @@ def step(m: Any, d: Any) -> None:
 def advance(m: Any, d: Any) -> None:
     """Euler's step, from the accelerations of `forward`."""
     plan = d.dynamics
-    lanes = THREADS if d.qacc.device.is_cuda or wp.config.enable_cpu_blocks else 1
     wp.launch_tiled(
-        advance_kernel(m.nv, plan.damped, lanes),
+        advance_kernel(m.nv, plan.damped, threads(d)),
         dim=d.nworld,
         inputs=[plan.system],
-        block_dim=lanes,
+        block_dim=threads(d),
     )

@@ -218,7 +218,7 @@ auto pull = [&](int row, float at, float& bent) {
 
 int steps = 0;
 float alpha = 0.0f, decrement = 0.0f;  // g' H^-1 g
-while (steps <= p.iterations) {
+while (steps <= p.iterations) {  // always; with `true` the compiler needs eight times the stack
     // where the last step has led
     float changes = dry;  // always some: the two linear pieces of dry friction have the same curvature
     #pragma unroll 1

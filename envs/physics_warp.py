@@ -123,9 +123,8 @@ NO_ROOM = int(
     Kind.NEFC | Kind.NJMAX_NNZ | Kind.BROADPHASE | Kind.NARROWPHASE | Kind.CCD | Kind.CONTACT_MATCH
 )
 FEW_WORLDS = 128  # contacts more: the average of few worlds varies
-one_at_a_time = (
-    threading.Lock()
-)  # several devices call from several threads; a CPU's lanes share memory
+# Several devices call from several threads; on a CPU the memory that lanes share is the kernel's.
+one_at_a_time = threading.Lock()
 
 
 def floats(x: wp.array) -> wp.array:

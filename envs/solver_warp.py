@@ -146,6 +146,11 @@ class Problem:
     overflow: wp.array[int]
 
 
+def threads(d: Any) -> int:
+    """Of a block: a warp, and on a CPU one, unless tests ask for as many."""
+    return THREADS if d.qacc.device.is_cuda or wp.config.enable_cpu_blocks else 1
+
+
 def scratch_size(nv: int, room: int) -> int:
     """Floats of a world in `scratch`, which newton.cu divides up and holds to this."""
     width = -(-nv // 4) * 4
@@ -291,6 +296,6 @@ def solve(m: Any, d: Any) -> None:
     p.address = contact.efc_address
     p.qacc, p.Ma, p.force, p.qfrc_constraint = d.qacc, efc.Ma, efc.force, d.qfrc_constraint
     p.niter, p.overflow = d.solver_niter, d.overflow
-    lanes = THREADS if d.qacc.device.is_cuda or wp.config.enable_cpu_blocks else 1
+    lanes = threads(d)
     kernel = newton_kernel(m.nv, work.listed.shape[1], lanes)
     wp.launch_tiled(kernel, dim=d.nworld, inputs=[p], block_dim=lanes)

@@ -1,4 +1,6 @@
 """Engine `warp`, on Warp's CPU device: the same kernels and packing as on a GPU, without its graphs."""
+# MuJoCo's bindings come without types:
+# pyright: reportAttributeAccessIssue=false
 
 import dataclasses
 
@@ -105,7 +107,7 @@ ROOM = """
 
 
 def compiled(xml: str):
-    return mujoco.MjSpec.from_string(xml).compile()  # type: ignore[attr-defined] # no types in MuJoCo
+    return mujoco.MjSpec.from_string(xml).compile()
 
 
 @pytest.fixture(params=[1, 32])
@@ -265,19 +267,19 @@ def beside_c(xml: str, steps: int = 20, worlds: int = 2, **options):
     from jaxsafe.envs import dynamics_warp
 
     model = compiled(xml)
-    m, off = mujoco_warp.put_model(model), int(mujoco.mjtDisableBit.mjDSBL_SENSOR)  # type: ignore[attr-defined]
+    m, off = mujoco_warp.put_model(model), int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
     blind = dataclasses.replace(m, opt=dataclasses.replace(m.opt, disableflags=off))
     d = mujoco_warp.make_data(model, nworld=worlds, nconmax=40, njmax=160)
     adopted = dynamics_warp.adopt(model, m, d)
-    c = mujoco.MjData(model)  # type: ignore[attr-defined]
+    c = mujoco.MjData(model)
     if model.nu:
         c.ctrl[:] = 0.5
         d.ctrl.fill_(0.5)
     for _ in range(steps):
         dynamics_warp.step(blind, d)
-        mujoco.mj_step(model, c)  # type: ignore[attr-defined]
+        mujoco.mj_step(model, c)
     dynamics_warp.forward(m, d)
-    mujoco.mj_forward(model, c)  # type: ignore[attr-defined]
+    mujoco.mj_forward(model, c)
     return adopted, d, c
 
 
@@ -340,8 +342,8 @@ def test_a_world_without_constraints_forgets_its_warmstart():
     warmstart[1], warmstart[2] = np.nan, 1e6
     d.qacc_warmstart.assign(warmstart)
     dynamics_warp.forward(m, d)
-    c = mujoco.MjData(model)  # type: ignore[attr-defined]
-    mujoco.mj_forward(model, c)  # type: ignore[attr-defined]
+    c = mujoco.MjData(model)
+    mujoco.mj_forward(model, c)
     np.testing.assert_allclose(d.qacc.numpy(), np.tile(c.qacc, (3, 1)), rtol=1e-4)
 
 
