@@ -48,7 +48,7 @@ def last_tenth(metrics: dict[str, np.ndarray], name: str) -> str:
 
 
 def published(config: dict[str, Any]) -> str:
-    """What others report of a run's setting, or where that is nothing constrained, unconstrained PPO."""
+    """What others report of a setting, or where that is nothing constrained, unconstrained PPO."""
     env, algo = config["env"]["name"], config["algo"]["name"]
     known = PUBLISHED.get((env, algo))
     if known and known.holds_for(config["env"].get("rules", "safety_gym")):
