@@ -39,6 +39,7 @@ import jaxsafe
 from jaxsafe import checkpoint, distributed, evaluation, plots, run_folder, runner, stats
 from jaxsafe.config import ConfigError, flat, from_dict, is_float, nearest
 from jaxsafe.constraints import check_names, in_words, limits_of, own_limits
+from jaxsafe.interrupts import Interrupts
 from jaxsafe.on_policy import Algorithm
 from jaxsafe.progress import Report
 from jaxsafe.types import Env, PyTree
@@ -539,7 +540,10 @@ def run(
         return 130
     if not distributed.leads():
         return 0
-    finish(settings, env, envs, algos, folder, report)
+    with Interrupts(report.line, report.hosted) as stop:
+        if not report.hosted:
+            stop.nothing_to_save = f"stopped; the training is saved, and for what is left {again}"
+        finish(settings, env, envs, algos, folder, report, stop)
     report.line(f"run folder: {folder}")
     return 0
 
@@ -625,8 +629,20 @@ def evaluate(
     return scores
 
 
-def finish(settings: Settings, env: Env, envs: Any, algos: Any, folder: Path, report: Report) -> None:
-    """Curves, evaluation and video. What fails costs one line, never the training."""
+def finish(
+    settings: Settings,
+    env: Env,
+    envs: Any,
+    algos: Any,
+    folder: Path,
+    report: Report,
+    stop: Interrupts,
+) -> None:
+    """Curves, evaluation and video. What fails costs one line, never the training.
+
+    Raises:
+        KeyboardInterrupt: `stop` was requested while one of them went on.
+    """
     train = settings.train
     title = f"{settings.env_name}, {settings.algo_name}"
     policy = functools.cache(lambda: policy_of(settings, env, algos, folder))
@@ -666,6 +682,8 @@ def finish(settings: Settings, env: Env, envs: Any, algos: Any, folder: Path, re
                 task()
         except Exception as error:  # training is done and saved; this is an extra
             report.line(f"no {name}: {one_line(error)}")
+        if stop.requested:
+            raise KeyboardInterrupt
 
 
 class Actor(NamedTuple):
@@ -868,7 +886,10 @@ def evaluate_main(envs: Any, algos: Any) -> int:
             * alone,
             flush=True,
         )
-        for s in evaluate(settings, algo, ts, args.episodes, args.seed, args.run):
+        with Interrupts(functools.partial(print, flush=True)) as stop:
+            stop.nothing_to_save = "stopped"
+            scores = evaluate(settings, algo, ts, args.episodes, args.seed, args.run)
+        for s in scores:
             if not alone:
                 print(f"\n{s.name} | cost limit {in_words(s.limits)}")
             print(s)

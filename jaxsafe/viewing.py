@@ -4,6 +4,7 @@
 """
 
 import argparse
+import contextlib
 import importlib
 from pathlib import Path
 from typing import Any
@@ -150,15 +151,15 @@ def watch_main(envs: Any, algos: Any) -> int:
             title, env, policy, task = settings.env_name, make_env(settings, envs), None, None
         print(f"{title}: compiling a step ...", flush=True)
         try:
-            session = watch.Session(env, policy, task, args.seed)
-            if page:
-                watch.serve_page(session, title, args.port, args.open)
-            else:
-                watch.open_window(session)
+            with contextlib.suppress(KeyboardInterrupt):  # the page's server may have taken it
+                session = watch.Session(env, policy, task, args.seed)
+                if page:
+                    watch.serve_page(session, title, args.port, args.open)
+                else:
+                    watch.open_window(session)
+            print("closed")
         except watch.render.NoDisplay as error:
             raise NoVideo(one_line(error)) from error
-        except KeyboardInterrupt:
-            print("closed")
         return 0
 
     return guarded(command)

@@ -208,6 +208,18 @@ def test_ctrl_c_saves_and_says_how_to_resume_and_that_works(finished, tmp_path):
     assert [row[0] for row in table[1:]] == [str(i + 1) for i in range(reached[0] + 1)]
 
 
+def test_ctrl_c_during_the_evaluation_leaves_a_run_that_is_trained(finished, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(finished[0], run)
+    (run / "curves.png").unlink(missing_ok=True)  # it is drawn right before the evaluation
+    process = start("train.py", "resume=run", "eval_episodes=20000", cwd=tmp_path)
+    wait_for((run / "curves.png").exists, process)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 130 and err == ""
+    assert "the training is saved" in out and "python scripts/train.py resume=run" in out
+
+
 def settings(*args: str) -> command.Settings:
     """Top-level options as the command line would settle them."""
     base = {k: yaml.safe_load(v) for k, v in (a.split("=") for a in args)}
