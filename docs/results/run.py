@@ -4,17 +4,17 @@ Every task with every algorithm, 5 seeds and 10 million steps each, several comm
 NVIDIA's multi-process service first, see ../performance.md). Button has Safety-Gymnasium's rules, those
 of the published figures; Goal's are the same in both, and of Push none are published.
 
-A run that is done comes here with its metrics compressed; one that is stopped, by Ctrl-C or after
---minutes, continues the next time. With options of train.py it is a trial, which stays in --runs. Then
-`python docs/results/make.py` draws curves and writes tables. Exit status: 0 if nothing is left to do,
-130 if stopped, 1 if a run failed.
+A run that is done comes here, its metrics with five digits and compressed; one that is stopped, by
+Ctrl-C or after --minutes, continues the next time. With options of train.py it is a trial, which stays
+in --runs. Then `python docs/results/make.py` draws curves and writes tables. Exit status: 0 if nothing
+is left to do, 130 if stopped, 1 if a run failed.
 """
 
 import argparse
+import csv
 import lzma
 import os
 import queue
-import shutil
 import signal
 import subprocess
 import sys
@@ -38,8 +38,11 @@ def keep(run: Path, name: str) -> None:
     """Copy what a finished run leaves here, as if it had been trained in runs/."""
     (HERE / name).mkdir(exist_ok=True)
     part = HERE / name / "metrics.csv.xz.part"
-    with (run / "metrics.csv").open("rb") as plain, lzma.open(part, "wb", preset=9) as packed:
-        shutil.copyfileobj(plain, packed)
+    with (run / "metrics.csv").open(newline="") as plain, lzma.open(part, "wt", preset=9) as packed:
+        header, *rows = csv.reader(plain)
+        where = header.index("seconds") + 1  # the metrics, of which five digits are kept
+        rounded = ([*row[:where], *(x and f"{float(x):.5g}" for x in row[where:])] for row in rows)
+        csv.writer(packed, lineterminator="\n").writerows([header, *rounded])
     for file in ("config.yaml", "versions.json", "evaluation.json"):
         if (run / file).exists():
             text = (run / file).read_text().replace(str(run), f"runs/{name}").replace(f"{ROOT}/", "")
