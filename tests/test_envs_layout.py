@@ -149,6 +149,14 @@ def test_a_margin_is_added_to_every_distance():
     assert found.all() and 0.2 - 1e-6 <= apart.min() < 0.25
 
 
+def test_a_negative_margin_lets_objects_overlap():
+    place = layouts.placement(envs.make("point_goal1", engine="c", placements_margin=-2.0).config)
+    xy, found = jax.vmap(lambda k: layouts.sample_layout(place, k))(
+        jax.random.split(jax.random.key(0), 64)
+    )
+    assert found.all() and layouts.feasible(place) and distances(np.asarray(xy)).min() < 0.1
+
+
 def test_locations_fix_the_first_objects_of_a_kind():
     fixed = ((-1.2, 0.3), (0.7, -1.1))
     t = task(
