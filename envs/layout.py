@@ -52,6 +52,11 @@ class Placement:
     keepouts: np.ndarray
     margin: float
 
+    @property
+    def apart(self) -> np.ndarray:
+        """The distance required between any two objects, [n, n] in m."""
+        return np.maximum(self.keepouts[:, None] + self.keepouts[None, :] + self.margin, 0.0)
+
     def slice(self, kind: str) -> slice:
         """Where the objects of a kind are; they stand together."""
         start = self.kinds.index(kind) if kind in self.kinds else 0
@@ -125,7 +130,7 @@ def draw(key: jax.Array, areas: jax.Array, weights: jax.Array, count: int) -> ja
 def clear(candidates: jax.Array, xy: jax.Array, apart: jax.Array) -> jax.Array:
     """Whether candidates [m, 2] are at least `apart` [n] from the objects [n, 2]: bool [m, n]."""
     x, y = (candidates[:, None] - xy[None]).transpose(2, 0, 1)  # a norm is ten times as slow on a CPU
-    return x**2 + y**2 >= jnp.maximum(apart, 0.0) ** 2
+    return x**2 + y**2 >= apart**2
 
 
 def sample_layout(place: Placement, key: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -134,20 +139,18 @@ def sample_layout(place: Placement, key: jax.Array) -> tuple[jax.Array, jax.Arra
     One loop over all draws, so that under `vmap` a world that starts again waits for no other.
     """
     n = len(place.names)
-    areas, weights = jnp.asarray(place.areas), jnp.asarray(place.weights)
-    keepouts = jnp.asarray(place.keepouts)
-    keep_apart = keepouts[:, None] + keepouts[None, :] + place.margin
+    areas, weights, apart = (jnp.asarray(x) for x in (place.areas, place.weights, place.apart))
 
     def place_next(carry: tuple) -> tuple:
         xy, i, draws, tries, key = carry  # objects before i are placed; draws for i so far
         key, draw_key = jax.random.split(key)
         candidates = draw(draw_key, areas[i], weights[i], DRAWS_AT_ONCE)
-        free = jnp.all(clear(candidates, xy, keep_apart[i]) | (jnp.arange(n) >= i), axis=1)
+        free = jnp.all(clear(candidates, xy, apart[i]) | (jnp.arange(n) >= i), axis=1)
         found, draws = free.any(), draws + DRAWS_AT_ONCE
         failed = ~found & (draws >= DRAWS_PER_OBJECT)
         xy = jnp.where((jnp.arange(n) == i)[:, None], candidates[jnp.argmax(free)], xy)
-        again = jnp.where(failed, 0, i + found)
-        return xy, again, jnp.where(found | failed, 0, draws), tries + failed, key
+        i, draws = jnp.where(failed, 0, i + found), jnp.where(found | failed, 0, draws)
+        return xy, i, draws, tries + failed, key
 
     start = (jnp.zeros((n, 2)), *[jnp.int32(0)] * 3, key)
     xy, placed, *_ = jax.lax.while_loop(lambda c: (c[1] < n) & (c[3] < LAYOUTS), place_next, start)
@@ -157,10 +160,9 @@ def sample_layout(place: Placement, key: jax.Array) -> tuple[jax.Array, jax.Arra
 def feasible(place: Placement) -> bool:
     """Whether 10,000 layouts hold a valid one: the search of `sample_layout`, without compiling."""
     rng = np.random.default_rng(0)
-    keep_apart = np.maximum(place.keepouts[:, None] + place.keepouts[None, :] + place.margin, 0.0)
     for _ in range(0, LAYOUTS, LAYOUT_BATCH):
         placed = np.zeros((0, 2, LAYOUT_BATCH, 1), np.float32)  # in the layouts still valid
-        for areas, weights, apart in zip(place.areas, place.weights, keep_apart, strict=True):
+        for areas, weights, apart in zip(place.areas, place.weights, place.apart, strict=True):
             shape = placed.shape[2], DRAWS_PER_OBJECT
             area = areas[rng.choice(len(areas), shape, p=weights / weights.sum(dtype=float)).T].T
             x, y = area[:2] + rng.random((2, *shape), np.float32) * (area[2:] - area[:2])
@@ -185,7 +187,7 @@ def sample_goal(
     Up to 10,000 draws, in batches; no work where `wanted` is False.
     """
     goal = place.names.index("goal")
-    apart = jnp.asarray(place.keepouts) + place.keepouts[goal] + place.margin
+    apart = jnp.asarray(place.apart[goal])
     others = np.arange(len(place.names)) != goal
 
     def batch(carry: tuple) -> tuple:
