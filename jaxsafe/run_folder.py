@@ -30,7 +30,6 @@ import numpy as np
 import yaml
 from tensorboardX.event_file_writer import EventsWriter
 from tensorboardX.proto import event_pb2, summary_pb2
-from tensorboardX.summary import scalar
 
 import jaxsafe
 from jaxsafe import checkpoint
@@ -177,7 +176,7 @@ class Metrics:
 
 
 class Board:
-    """TensorBoard's file of one seed, written at once: no thread that could fail unseen."""
+    """TensorBoard's file of one seed, written at once: no thread of its own that could fail unseen."""
 
     def __init__(self, folder: Path, steps: int):
         """Open for appending after `steps`; TensorBoard drops what older files have beyond."""
@@ -188,8 +187,7 @@ class Board:
             self._write(steps + 1, session_log=session)
 
     def append(self, steps: int, values: Mapping[str, float]) -> None:
-        finite = {name: v for name, v in values.items() if math.isfinite(v)}
-        entries = [entry for name, v in finite.items() for entry in scalar(name, v).value]
+        entries = [{"tag": name, "simple_value": v} for name, v in values.items() if math.isfinite(v)]
         self._write(steps, summary=summary_pb2.Summary(value=entries))  # type: ignore[attr-defined]
 
     def _write(self, steps: int, **what: Any) -> None:

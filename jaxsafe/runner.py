@@ -2,7 +2,7 @@
 
 Every array of the train state carries a leading axis here: over members (each setting of the
 algorithm's floats with each seed), or over the devices that share the environments of a lone one.
-The loop stays one update ahead of what it logs, so the device does not wait for the host.
+The loop stays one update ahead of what is logged, in a thread, so the device does not wait for files.
 """
 
 import contextlib
@@ -11,6 +11,7 @@ import math
 import os
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -332,13 +333,12 @@ def train(
         ) as log:
             limits = [m.algo.cost_limit for m in program.members if not own_limits(m.algo)]
             report.start(iterations * per_update, iteration * per_update, limits)
-            pending, saved_at = None, time.perf_counter()
+            saved_at = time.perf_counter()
             while iteration < iterations:
                 ts, metrics = update(ts)
-                metrics = distributed.whole(metrics)
-                if log and pending:
-                    log.append(*pending, report)
-                iteration, pending = iteration + 1, (iteration + 1, metrics)
+                metrics, iteration = distributed.whole(metrics), iteration + 1
+                if log:
+                    log.append(iteration, metrics, report)
                 by_count = (
                     settings.checkpoint_iterations and iteration % settings.checkpoint_iterations == 0
                 )
@@ -347,10 +347,9 @@ def train(
                 if stopping or by_count or by_time or iteration == iterations:
                     state = distributed.whole(ts)
                     if log:
-                        log.append(*pending, report)
-                        log.sync()
+                        log.sync(report)
                         checkpoint.save(store, state, iteration, iteration * per_update)
-                    pending, saved_at = None, time.perf_counter()
+                    saved_at = time.perf_counter()
                 if stopping:
                     break
         report.stop()
@@ -375,7 +374,10 @@ def restored(store: Path, like: PyTree, report: Report) -> tuple[PyTree, int]:
 
 
 class Log:
-    """Metrics to metrics.csv, TensorBoard and the progress report."""
+    """Metrics to metrics.csv, TensorBoard and the progress report, the files by a thread.
+
+    What goes wrong in the thread is raised by the next call.
+    """
 
     def __init__(
         self, folder: Path, names: list[str], members: list[Member], iteration: int, per_update: int
@@ -391,27 +393,51 @@ class Log:
             )
             for m in members
         ]
+        self.thread = ThreadPoolExecutor(1)
+        self.writing: Future[tuple[int, dict[str, np.ndarray]]] | None = None
 
     def __enter__(self) -> "Log":
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.thread.shutdown()
         self.csv.close()
         for board in self.boards:
             board.close()
 
     def append(self, iteration: int, metrics: dict[str, jax.Array], report: Report) -> None:
+        """Begin to write the metrics of an iteration, once those of the last one are written."""
+        self._finish(report)
+        self.writing = self.thread.submit(self._write, iteration, metrics)
+
+    def sync(self, report: Report) -> None:
+        """Put all that was appended on the disk."""
+        self._finish(report)
+        self.csv.sync()
+        for board in self.boards:
+            board.flush()
+
+    def _write(
+        self, iteration: int, metrics: dict[str, jax.Array]
+    ) -> tuple[int, dict[str, np.ndarray]]:
         values = {k: np.asarray(v, np.float32) for k, v in jax.device_get(metrics).items()}
         steps, seconds = iteration * self.per_update, time.perf_counter() - self.begun
+        self.csv.append(iteration, steps, self.seeds, seconds, values | self.swept)
+        for s, board in enumerate(self.boards):
+            board.append(steps, {name: float(value[s]) for name, value in values.items()})
+        return steps, values
+
+    def _finish(self, report: Report) -> None:
+        if not self.writing:
+            return
+        writing, self.writing = self.writing, None
+        steps, values = writing.result()
         if not self.warned and (values.get(OVERFLOW, np.zeros(())) > 0).any():  # NaN: nothing ended
             self.warned = True
             report.line(
                 f"warning: contacts found no room in some steps ({OVERFLOW} in metrics.csv); "
                 "raise env.contact_room"
             )
-        self.csv.append(iteration, steps, self.seeds, seconds, values | self.swept)
-        for s, board in enumerate(self.boards):
-            board.append(steps, {name: float(value[s]) for name, value in values.items()})
         report.update(
             steps,
             len(self.seeds),
@@ -424,11 +450,6 @@ class Log:
                 )
             },
         )
-
-    def sync(self) -> None:
-        self.csv.sync()
-        for board in self.boards:
-            board.flush()
 
 
 def mean(values: np.ndarray) -> float:
