@@ -28,6 +28,7 @@ from jaxsafe.types import Env
 @config
 class PCPOConfig(cpo.CPOConfig):
     line_search_tries: int = 200  # OmniSafe
+    margin_max: float = 5.0  # more than CPO's, for the reward's step is taken first, whatever c is
 
 
 PUBLISHED: dict[str, dict[str, Any]] = cpo.PUBLISHED

@@ -2,12 +2,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 from scipy.optimize import minimize
 
 from jaxsafe.algos.cpo import BOUNDED, FREE, RECOVER, RETURN, CPOConfig, Margin, cpo_step, dual
 from jaxsafe.gaussian import log_prob, sample
 from jaxsafe.networks import init_params, policy
 from jaxsafe.on_policy import Batch
+from jaxsafe.steps import mean_kl
 from jaxsafe.surrogates import plain
 
 solve = jax.jit(dual)
@@ -155,14 +157,16 @@ def test_the_dual_is_finite_everywhere():
     assert (out[0] >= 0).all() and (out[1] >= 0).all()
 
 
+KEYS = jax.random.split(jax.random.key(0), 3)
+
+
 def learner(**options):
     """One CPO step on a fixed batch: (violation, margin, axis_name, batch) -> actor, state, metrics."""
     cfg = CPOConfig(hidden=(8,), **options)
-    keys = jax.random.split(jax.random.key(0), 3)
-    actor = init_params(keys[0], 3, 2, cfg)["actor"]
-    obs = jax.random.normal(keys[1], (256, 3))
+    actor = init_params(KEYS[0], 3, 2, cfg)["actor"]
+    obs = jax.random.normal(KEYS[1], (256, 3))
     old = policy(actor, obs, cfg)
-    action = sample(old, keys[2])
+    action = sample(old, KEYS[2])
     adv_r, adv_c = action.sum(-1), 0.5 * action[:, 0]
     adv_r, adv_c = (x - x.mean() for x in (adv_r, adv_c))
     batch = Batch(obs, action, log_prob(old, action), old, adv_r, adv_c, adv_r, adv_c)
@@ -185,18 +189,38 @@ LENGTH = 1024  # steps of an episode; a power of 2 loses no digits
 
 
 def test_the_margin_adds_up_violations_and_is_never_negative():
-    step = jax.jit(learner(margin_lr=0.5)[0])
+    step = jax.jit(learner(margin_lr=0.1)[0])
     margin, seen = START, []
     for violation in (0.1, 0.2, -0.1, -0.3, -0.2, 0.1):
         _, margin, metrics = step(violation, margin)
         assert metrics["train/violation"] == np.float32(violation)  # the margin is not in it
         seen.append(float(margin.margin))
         assert metrics["train/margin"] == margin.margin
-    np.testing.assert_allclose(seen, [0.05, 0.15, 0.1, 0.0, 0.0, 0.05], atol=1e-6)
+    np.testing.assert_allclose(seen, [0.01, 0.03, 0.02, 0.0, 0.0, 0.01], atol=1e-6)
+
+
+def test_the_margin_is_bounded_by_what_a_step_can_promise():
+    step, batch, cfg = learner(margin_max=1.5)
+    _, margin, metrics = jax.jit(step)(9.0, START)
+    actor, unravel = ravel_pytree(init_params(KEYS[0], 3, 2, cfg)["actor"])
+
+    def divergence(params):
+        return mean_kl(batch.old, policy(unravel(params), batch.obs, cfg), None)
+
+    def cost(params):
+        return plain(policy(unravel(params), batch.obs, cfg), batch, batch.adv_c, cfg)[0]
+
+    hessian = np.float64(jax.hessian(divergence)(actor)) + cfg.damping * np.eye(actor.size)
+    b = np.float64(jax.grad(cost)(actor))
+    reach = np.sqrt(2 * cfg.target_kl * (b @ np.linalg.solve(hessian, b)))
+    np.testing.assert_allclose(margin.margin, 1.5 * reach, rtol=1e-3)
+    assert metrics["train/case"] == RECOVER
 
 
 def test_a_margin_counts_as_violation_and_without_its_rate_there_is_none():
-    plain_step, with_margin = (jax.jit(learner(margin_lr=lr)[0]) for lr in (0.0, 0.5))
+    plain_step, with_margin = (
+        jax.jit(learner(margin_lr=lr, violation_gain=1.0)[0]) for lr in (0.0, 0.5)
+    )
     assert plain_step(0.02, START)[1] == START
     for violation in (0.02, -0.02):
         after, margin, _ = with_margin(violation, Margin(jnp.float32(0.03)))
@@ -205,6 +229,18 @@ def test_a_margin_counts_as_violation_and_without_its_rate_there_is_none():
     safe, _, metrics = with_margin(-0.02, START)  # no margin: nothing is added
     jax.tree.map(np.testing.assert_array_equal, safe, plain_step(-0.02, START)[0])
     assert metrics["train/case"] == BOUNDED
+
+
+def test_a_gain_multiplies_the_violation_and_not_the_margin():
+    plain_step, with_gain = (
+        jax.jit(learner(margin_lr=lr, violation_gain=gain)[0]) for lr, gain in ((0.0, 1.0), (0.5, 4.0))
+    )
+    for violation in (2**-8, -(2**-8)):
+        after, margin, metrics = with_gain(violation, Margin(jnp.float32(2**-7)))
+        assert margin.margin == 2**-7 + violation / 2
+        assert metrics["train/violation"] == violation
+        same, _, _ = plain_step(4 * violation + margin.margin, START)
+        jax.tree.map(np.testing.assert_array_equal, after, same)
 
 
 def test_a_violation_per_episode_leaves_nothing_between_all_reward_and_all_cost():
@@ -219,7 +255,7 @@ def test_a_violation_per_episode_leaves_nothing_between_all_reward_and_all_cost(
     "violation, case", [(-9.0, FREE), (-0.02, BOUNDED), (0.02, RETURN), (9.0, RECOVER)]
 )
 def test_a_step_keeps_its_promises_and_two_devices_take_it_as_one(violation, case):
-    step, batch, cfg = learner()
+    step, batch, cfg = learner(violation_gain=1.0)
     after, _, metrics = jax.jit(step)(violation, START, batch)
     m = {name.removeprefix("train/"): float(x) for name, x in metrics.items()}
     assert m["case"] == case and m["accepted"] == 1 and m["nonfinite"] == 0
