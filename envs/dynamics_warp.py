@@ -3,7 +3,8 @@
 MuJoCo Warp takes some 50 kernels of a few microseconds each to get from positions and velocities to the
 forces without constraints, for robots of 4 to 30 bodies. Here that is one kernel, in which 8, 16 or 32
 threads share a world and keep what they compute in shared memory, and one more moves the state on.
-Between them collisions are MuJoCo Warp's, plain constraint rows too, and the solver is `solver_warp`.
+Between them collisions are MuJoCo Warp's, but for `pillars_warp`, plain constraint rows too, and the
+solver is `solver_warp`.
 
 Of `Data` only what later kernels and this project read is written: no `qacc_smooth`, no parts of
 `qfrc_smooth`, no inertial frames, cameras, lights or energy. A pass whose sensors read more is MuJoCo
@@ -29,7 +30,7 @@ import warp as wp
 from mujoco.mjx.third_party import mujoco_warp
 from mujoco.mjx.third_party.mujoco_warp._src import collision_driver, sensor, smooth, types
 
-from jaxsafe.envs import solver_warp
+from jaxsafe.envs import pillars_warp, solver_warp
 from jaxsafe.envs.solver_warp import THREADS, threads
 
 SHARED_MEMORY = 47 * 1024  # bytes of a block; Warp takes one more KiB
@@ -191,6 +192,7 @@ class Plan:
     sizes: tuple[int, int, int, int]  # bodies, joints, degrees of freedom, actuators
     damped: bool
     readable: bool  # whether its sensors need nothing else
+    pillars: pillars_warp.Pillars | None
 
 
 def tree(model: mujoco.MjModel) -> dict[str, np.ndarray]:
@@ -272,6 +274,7 @@ def adopt(model: mujoco.MjModel, m: Any, d: Any) -> bool:
         sizes=sizes,
         damped=bool(m.dof_damping.numpy().any()),
         readable=bool(np.isin(model.sensor_type, READABLE).all()),
+        pillars=pillars_warp.adopt(model, m, d),
     )
     return True
 
@@ -300,6 +303,8 @@ def forward(m: Any, d: Any) -> None:
         block_dim=threads(d),
     )
     collision_driver.collision(m, d)
+    if plan.pillars:
+        plan.pillars.contacts(d.nworld)
     solver_warp.make_constraint(m, d)
     if sensors:
         d.sensordata.zero_()
