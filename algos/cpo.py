@@ -16,7 +16,7 @@ Fisher product is damped.
     margin <- clip(margin + margin_lr v, 0, margin_max sqrt(2 delta s))
 
 A batch's own b promises more than it keeps: with thousands of parameters, most of the step fits this
-batch's noise and lowers the surrogate, but not the cost; about 2% comes true on Goal and Button. With
+batch's noise and lowers the surrogate, but not the cost; some 1% comes true on Goal and Button. With
 c = v the cost therefore stays well above the limit, as in Ray, Achiam and Amodei (2019). The margin,
 from their code (where it is off and has no bound), asks for more until the limit holds. Alone it
 swings about the limit, for where a share eta comes true cost and margin are a pendulum, damped by

@@ -48,9 +48,9 @@ def towards(away: wp.vec2, ux: wp.vec3, uy: wp.vec3) -> tuple[wp.vec2, int]:
             n = wp.normalize(across)
             if wp.dot(n, away) < 0.0:
                 n = -n
-            if gap(n, away, ux, uy) > largest:
-                largest = gap(n, away, ux, uy)
-                best, edge = n, i
+            along = gap(n, away, ux, uy)
+            if along > largest:
+                largest, best, edge = along, n, i
     for corner in range(8):
         way = wp.vec2(away[0], away[1])
         for i in range(3):
@@ -58,9 +58,9 @@ def towards(away: wp.vec2, ux: wp.vec3, uy: wp.vec3) -> tuple[wp.vec2, int]:
             way -= sign * wp.vec2(ux[i], uy[i])
         if wp.length(way) > TINY:
             n = wp.normalize(way)
-            if gap(n, away, ux, uy) > largest:
-                largest = gap(n, away, ux, uy)
-                best, edge = n, -1
+            along = gap(n, away, ux, uy)
+            if along > largest:
+                largest, best, edge = along, n, -1
     return best, edge
 
 
@@ -115,7 +115,7 @@ def touch(
     return wp.vec2(dist, dist), wp.vec2(height, height), normal, False
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def pillar_contacts(
     pairs: wp.array[wp.vec2i],
     geom_size: wp.array2d[wp.vec3],

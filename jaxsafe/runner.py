@@ -327,7 +327,7 @@ def train(
 
         vote = distributed.Vote(program.sharding)
         with (
-            Log(folder, names, program.members, iteration, per_update)
+            Log(folder, names, program.members, iteration, per_update, report)
             if distributed.leads()
             else contextlib.nullcontext()
         ) as log:
@@ -338,7 +338,7 @@ def train(
                 ts, metrics = update(ts)
                 metrics, iteration = distributed.whole(metrics), iteration + 1
                 if log:
-                    log.append(iteration, metrics, report)
+                    log.append(iteration, metrics)
                 by_count = (
                     settings.checkpoint_iterations and iteration % settings.checkpoint_iterations == 0
                 )
@@ -347,7 +347,7 @@ def train(
                 if stopping or by_count or by_time or iteration == iterations:
                     state = distributed.whole(ts)
                     if log:
-                        log.sync(report)
+                        log.sync()
                         checkpoint.save(store, state, iteration, iteration * per_update)
                     saved_at = time.perf_counter()
                 if stopping:
@@ -380,9 +380,16 @@ class Log:
     """
 
     def __init__(
-        self, folder: Path, names: list[str], members: list[Member], iteration: int, per_update: int
+        self,
+        folder: Path,
+        names: list[str],
+        members: list[Member],
+        iteration: int,
+        per_update: int,
+        report: Report,
     ):
         self.seeds, self.per_update, self.warned = [m.seed for m in members], per_update, False
+        self.report = report
         self.swept = {name: np.array([m.swept[name] for m in members]) for name in members[0].swept}
         self.csv = run_folder.Metrics(folder, [*self.swept, *names], iteration)
         self.begun = time.perf_counter() - self.csv.seconds
@@ -405,14 +412,14 @@ class Log:
         for board in self.boards:
             board.close()
 
-    def append(self, iteration: int, metrics: dict[str, jax.Array], report: Report) -> None:
+    def append(self, iteration: int, metrics: dict[str, jax.Array]) -> None:
         """Begin to write the metrics of an iteration, once those of the last one are written."""
-        self._finish(report)
+        self._finish()
         self.writing = self.thread.submit(self._write, iteration, metrics)
 
-    def sync(self, report: Report) -> None:
+    def sync(self) -> None:
         """Put all that was appended on the disk."""
-        self._finish(report)
+        self._finish()
         self.csv.sync()
         for board in self.boards:
             board.flush()
@@ -427,18 +434,18 @@ class Log:
             board.append(steps, {name: float(value[s]) for name, value in values.items()})
         return steps, values
 
-    def _finish(self, report: Report) -> None:
+    def _finish(self) -> None:
         if not self.writing:
             return
         writing, self.writing = self.writing, None
         steps, values = writing.result()
         if not self.warned and (values.get(OVERFLOW, np.zeros(())) > 0).any():  # NaN: nothing ended
             self.warned = True
-            report.line(
+            self.report.line(
                 f"warning: contacts found no room in some steps ({OVERFLOW} in metrics.csv); "
                 "raise env.contact_room"
             )
-        report.update(
+        self.report.update(
             steps,
             len(self.seeds),
             **{

@@ -5,13 +5,10 @@
 import mujoco
 import numpy as np
 import pytest
+from mujoco.mjx.third_party import mujoco_warp
 
-wp = pytest.importorskip("warp")
-from mujoco.mjx.third_party import mujoco_warp  # noqa: E402
-
-from jaxsafe import envs  # noqa: E402
-from jaxsafe.envs import pillars_warp  # noqa: E402
-from jaxsafe.envs import scene as scenes  # noqa: E402
+from jaxsafe import envs
+from jaxsafe.envs import pillars_warp, scene
 
 XML = """
 <mujoco>
@@ -22,8 +19,6 @@ XML = """
   </worldbody>
 </mujoco>
 """
-
-
 FIELDS = ("dist", "pos", "frame", "friction", "solref", "solimp", "dim")
 
 
@@ -140,7 +135,7 @@ def test_boxes_apart_do_not_touch():
 
 def test_only_pillars_and_boxes_are_taken():
     for task, some in (("car_push2", True), ("car_goal2", False), ("doggo_button2", False)):
-        model = scenes.build(envs.make(task).config).model
+        model = scene.build(envs.make(task).config).model
         model.opt.disableflags &= ~mujoco.mjtDisableBit.mjDSBL_AUTORESET.value
         m = mujoco_warp.put_model(model)
         before = m.nxn_geom_pair_filtered.numpy().tolist()

@@ -218,6 +218,32 @@ def gains() -> str:
     return "\n".join(lines)
 
 
+def kept() -> str:
+    """How much of the cost that CPO's steps promise to take off comes true, on Goal and Button.
+
+    The slope, over 20 iterations each, of the change of the violation on the sum of promises.
+    """
+    promised, shares = [], []
+    for path in sorted(HERE.glob("*[12]-cpo")):
+        if "push" in path.name:
+            continue
+        metrics, slopes = run_folder.read_metrics(path), []
+        for seed in np.unique(metrics["seed"]):
+            violation, promise = (
+                metrics[f"train/{k}"][metrics["seed"] == seed] for k in ("violation", "objective_c")
+            )
+            spans = (len(violation) // 20, 20)
+            violation, sums = (x[: np.prod(spans)].reshape(spans) for x in (violation, promise))
+            slopes.append(np.polyfit(sums.sum(1)[:-1], np.diff(violation.mean(1)), 1)[0])
+            promised.append(-promise.mean())
+        shares.append(np.mean(slopes))
+    mean, least, most = (100 * f(shares) for f in (np.mean, min, max))
+    return (
+        f"A step promises {min(promised):.2f} to {max(promised):.2f} less cost a step, of which "
+        f"{mean:.1f}% come true ({least:.1f} to {most:.1f}% by task)."
+    )
+
+
 def algorithm_speeds() -> str:
     """Environment steps a second of every algorithm's training, 16 seeds, and of PPO-Lagrangian's."""
     rows = [r for r in benchmark_rows("benchmark_h200.jsonl") if r["algo"] and "peer" not in r]
@@ -275,6 +301,7 @@ def main() -> None:
         (HERE / "README.md", "runs", all_runs()),
         (HERE / "README.md", "outside", outside(groups)),
         (HERE / "README.md", "speeds", algorithm_speeds()),
+        (HERE / "README.md", "kept", kept()),
         (HERE / "README.md", "gains", gains()),
         (HERE.parent / "performance.md", "throughput", throughput_table()),
         (HERE.parent.parent / "README.md", "results", by_algorithm(groups)),
