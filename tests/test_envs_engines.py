@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 import pytest
 from mujoco import mjx
+from mujoco.mjx._src import math
 from tasks import FAST, task
 
 from jaxsafe import envs
@@ -130,9 +131,85 @@ def test_a_rod_and_a_box_are_as_far_apart_as_mujoco_says(rod):
     assert np.median(error) < 1e-5 and np.quantile(error, 0.97) < 4e-3  # rims on corners
     certain = np.abs(truth[:, 0]) > 1e-3
     assert np.median((frame[:, 0, 0] * truth[:, 1:])[certain].sum(1)) > 0.999
-    beside = (np.arange(200) % 2 == 1) & (np.abs(truth[:, 3]) < 0.1)  # sides touch at both their ends
-    alike = np.abs(dist[beside, 0] - dist[beside, 1]) < 1e-5
-    assert beside.sum() > 10 and alike.mean() > 0.9  # but where an end just meets a corner
+    beside = (np.arange(200) % 2 == 1) & (np.abs(truth[:, 3]) < 0.1)
+    face = np.abs(truth[:, None, 1:] @ axes(qpos[:, 10:14])).max((1, 2)) > 0.9998
+    alike = np.abs(dist[:, 0] - dist[:, 1]) < 1e-5  # sides touch at both their ends, edges once
+    assert (beside & face).sum() > 10 and alike[beside & face].mean() > 0.9  # an end may meet a corner
+    assert (dist[beside & ~face & certain, 1] == 1).all()
+
+
+def axes(quats: Any) -> np.ndarray:
+    """Of these orientations [count, 4], in columns [count, 3, 3]."""
+    return np.array(jax.vmap(lambda q: math.quat_to_mat(math.normalize(q)))(jnp.asarray(quats)))
+
+
+def pair(first: str, second: str) -> mujoco.MjModel:
+    """Two shapes that move freely, or one on a plane."""
+    free = "<body><freejoint/>{}</body>"
+    bodies = (f"<geom {x}/>" if "plane" in x else free.format(f"<geom {x}/>") for x in (first, second))
+    return mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{''.join(bodies)}</worldbody></mujoco>")
+
+
+def agree_on_contacts(collide: str, model: mujoco.MjModel, poses: np.ndarray) -> np.ndarray:
+    """Every contact that MuJoCo finds in these poses, and no other; how many there are in each."""
+    from jaxsafe.envs import physics_jax
+
+    mjx_model = mjx.put_model(model, impl="jax")
+    data, poses = mujoco.MjData(model), poses.astype(np.float32)
+
+    @jax.jit
+    @jax.vmap
+    def contacts(qpos):
+        moved = mjx.kinematics(mjx_model, mjx.make_data(mjx_model).replace(qpos=qpos))
+        return getattr(physics_jax, collide)(mjx_model, moved, None, jnp.array([[0, 1]]))
+
+    counts = []
+    for qpos, dist, pos, frame in zip(poses, *jax.device_get(contacts(poses)), strict=True):
+        data.qpos[:] = qpos
+        mujoco.mj_forward(model, data)
+        counts.append(data.ncon)
+        assert (dist < 0).sum() == data.ncon
+        for theirs in data.contact:
+            ours = np.argmin(np.where(dist < 0, np.linalg.norm(pos - theirs.pos, axis=1), np.inf))
+            np.testing.assert_allclose(pos[ours], theirs.pos, atol=1e-4)  # edges that are parallel
+            np.testing.assert_allclose(dist[ours], theirs.dist, atol=5e-7)
+            np.testing.assert_allclose(frame[ours].ravel(), theirs.frame, atol=1e-5)
+    return np.array(counts)
+
+
+@pytest.mark.parametrize("lie", ["anyhow", "standing", "leaning", "alike", "stacked"])
+def test_boxes_touch_where_mujocos_do(lie):
+    model = pair('type="box" size=".1 .1 .1"', 'type="box" size=".1 .12 .04"')
+    data, rng, poses = mujoco.MjData(model), np.random.default_rng(0), []
+    for _ in range(100):
+        data.qpos[:] = rng.standard_normal(14)
+        data.qpos[7:10] = 0
+        if lie != "anyhow":
+            data.qpos[[4, 5, 11, 12]] *= {"standing": 0}.get(lie, 1e-3)
+            data.qpos[2] *= 0.1
+        if lie == "alike":
+            data.qpos[3:7] = data.qpos[10:14] + rng.normal(size=4, scale=1e-2)
+        if lie == "stacked":
+            data.qpos[:2] *= 0.03
+            data.qpos[2] = 1
+        for turn in (data.qpos[3:7], data.qpos[10:14]):
+            turn /= np.linalg.norm(turn)
+        separated(model, data, -(10 ** rng.uniform(-5, -2)))
+        poses.append(data.qpos.copy())
+    counts = agree_on_contacts("box_box", model, np.array(poses))
+    assert len(np.unique(counts)) > 1 and counts.max() == (8 if lie == "stacked" else 4)
+
+
+def test_a_box_touches_the_floor_where_mujocos_does():
+    model = pair('type="plane" size="1 1 1"', 'type="box" size=".1 .15 .04"')
+    rng = np.random.default_rng(0)
+    poses = rng.standard_normal((100, 7))
+    poses[50:, 4:6] *= 0.02  # it lies, one side a little higher
+    poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
+    reach = np.abs(axes(poses[:, 3:])[:, 2]) @ [0.1, 0.15, 0.04]
+    poses[:, 2] = reach - rng.uniform(0, 0.01, 100)
+    counts = agree_on_contacts("plane_box", model, poses)
+    assert set(counts) == {1, 2, 3, 4}
 
 
 @pytest.mark.parametrize("engine", ["c", "warp"])
