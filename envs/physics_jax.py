@@ -2,8 +2,8 @@
 
 MJX has no collision of a cylinder with a box and misses most of a box with an upright capsule. Of a
 plane with an upright capsule its contact frame is another, of a box with a plane or a box its points
-are. All are registered with MJX when this module is imported, which is by the engine itself only, and
-hold for every user of MJX in the process.
+are; and its line search gives up in float32. All are registered with MJX when this module is imported,
+which is by the engine itself only, and hold for every user of MJX in the process.
 """
 
 from typing import Any
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from mujoco import mjx
-from mujoco.mjx._src import collision_driver, collision_primitive, math
+from mujoco.mjx._src import collision_driver, collision_primitive, math, solver
 from mujoco.mjx._src.types import GeomType
 
 from jaxsafe.envs.physics import STATE, Physics, Readings, Run, mocap_at
@@ -279,6 +279,22 @@ collision_driver._COLLISION_FUNC[GeomType.PLANE, GeomType.BOX] = plane_box
 collision_driver._COLLISION_FUNC[GeomType.CYLINDER, GeomType.BOX] = cylinder_box
 collision_driver._COLLISION_FUNC[GeomType.CAPSULE, GeomType.BOX] = capsule_box
 collision_driver._COLLISION_FUNC[GeomType.BOX, GeomType.BOX] = box_box
+
+
+class LinePoint(solver._LSPoint):
+    """A point of the solver's line search, judged by its slope.
+
+    MJX takes a step only if the cost falls, which in float32 is rounding where the cost is large, and
+    stops with accelerations that are wrong by 0.1% now and then. The cost is convex: its slope tells.
+    """
+
+    @classmethod
+    def create(cls, *args: Any) -> Any:
+        point = super().create(*args)
+        return point.replace(cost=jnp.abs(point.deriv_0))
+
+
+solver._LSPoint = LinePoint  # type: ignore[misc]
 
 
 def jax_engine(scene: Scene, max_substeps: int, outputs: tuple[str, ...]) -> Run:

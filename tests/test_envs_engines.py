@@ -4,6 +4,7 @@
 
 import sys
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -17,8 +18,11 @@ from tasks import FAST, task
 
 from jaxsafe import envs
 from jaxsafe.config import ConfigError
-from jaxsafe.envs import physics
+from jaxsafe.envs import physics, recording, scene
+from jaxsafe.envs.config import read as read_config
 from jaxsafe.rollout import collect, init_rollout
+
+DATA = Path(__file__).parent / "data"
 
 
 def test_an_unknown_engine_gets_the_nearest():
@@ -280,3 +284,30 @@ def test_an_observation_after_a_reset_is_that_of_the_new_episode(rollout):
         traj.obs[::5, :, :3], np.broadcast_to([0, 0, 9.81], (4, 3, 3)), atol=1e-6
     )
     assert (np.abs(traj.obs[4, :, -3:]) > 0).any()
+
+
+def test_jax_solves_contacts_as_c_does():
+    """MJX's own line search gives up on some of these states, with velocities 0.03 to 0.2 off."""
+    from jaxsafe.envs import physics_jax  # noqa: F401, which mends MJX
+
+    record = recording.Recording(DATA / "doggo_goal1.npz")
+    config = read_config(record.meta["config"])
+    model, mjx_model = (scene.build(config, for_mjx).model for for_mjx in (False, True))
+    start = {k: record[f"state.{k}"][record.rows] for k in ("qpos", "qvel", "qacc_warmstart")}
+    ctrl = np.clip(record["step.action"], *model.actuator_ctrlrange.T)
+    m, d = mjx.put_model(mjx_model, impl="jax"), mjx.make_data(mjx_model, impl="jax")
+    step = jax.jit(jax.vmap(lambda state, ctrl: mjx.step(m, d.replace(ctrl=ctrl, **state)).qvel))
+
+    data = mujoco.MjData(model)
+    for _ in range(3):
+        after = {k: np.empty_like(x) for k, x in start.items()}
+        for i in range(len(ctrl)):
+            for k, x in start.items():
+                getattr(data, k)[:] = np.float32(x[i])
+            data.ctrl[:] = np.float32(ctrl[i])
+            mujoco.mj_step(model, data)
+            for k, x in after.items():
+                x[i] = getattr(data, k)
+        got = step({k: np.float32(x) for k, x in start.items()}, np.float32(ctrl))
+        np.testing.assert_allclose(got, after["qvel"], rtol=0, atol=2e-4)
+        start = after
