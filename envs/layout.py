@@ -6,6 +6,7 @@ layout is drawn again, up to 10,000 times. Source: Safety Gym's Engine, `build_l
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +18,7 @@ from jaxsafe.envs.config import KINDS, Rectangle, SafetyGymConfig
 DRAWS_PER_OBJECT = 100
 DRAWS_AT_ONCE = 25  # examined at once
 LAYOUTS = 10_000
+LANES = 32  # layouts tried side by side, at most
 LAYOUT_BATCH = 100  # layouts examined at once before training
 GOAL_DRAWS = 10_000
 ORDER = {  # of placing
@@ -56,6 +58,12 @@ class Placement:
     def apart(self) -> np.ndarray:
         """The distance required between any two objects, [n, n] in m."""
         return np.maximum(self.keepouts[:, None] + self.keepouts[None, :] + self.margin, 0.0)
+
+    @cached_property
+    def lanes(self) -> int:
+        """Layouts tried side by side: as many as hold a valid one on average, 1 where most are."""
+        valid = count_valid(self, np.random.default_rng(0))
+        return min(LANES, round(LAYOUT_BATCH / max(valid, 1)))
 
     def slice(self, kind: str) -> slice:
         """Where the objects of a kind are; they stand together."""
@@ -136,47 +144,59 @@ def clear(candidates: jax.Array, xy: jax.Array, apart: jax.Array) -> jax.Array:
 def sample_layout(place: Placement, key: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Positions of all objects [n, 2], and whether one of the 10,000 layouts was valid.
 
-    One loop over all draws, so that under `vmap` a world that starts again waits for no other.
+    Of `place.lanes` lanes each tries every such layout, by turns, and waits for no other. The valid
+    layout of the lowest number is used, not the one found first, or those that need few draws would
+    be too many.
     """
-    n = len(place.names)
+    n, lanes = len(place.names), place.lanes
     areas, weights, apart = (jnp.asarray(x) for x in (place.areas, place.weights, place.apart))
 
-    def place_next(carry: tuple) -> tuple:
-        xy, i, draws, tries, key = carry  # objects before i are placed; draws for i so far
+    def place_next(lane: tuple) -> tuple:
+        xy, i, draws, number, key = lane  # objects before i are placed; draws for i so far
         key, draw_key = jax.random.split(key)
         candidates = draw(draw_key, areas[i], weights[i], DRAWS_AT_ONCE)
         free = jnp.all(clear(candidates, xy, apart[i]) | (jnp.arange(n) >= i), axis=1)
-        found, draws = free.any(), draws + DRAWS_AT_ONCE
-        failed = ~found & (draws >= DRAWS_PER_OBJECT)
+        found, draws = free.any() & (i < n), draws + DRAWS_AT_ONCE
+        failed = ~found & (i < n) & (draws >= DRAWS_PER_OBJECT)
         xy = jnp.where((jnp.arange(n) == i)[:, None], candidates[jnp.argmax(free)], xy)
         i, draws = jnp.where(failed, 0, i + found), jnp.where(found | failed, 0, draws)
-        return xy, i, draws, tries + failed, key
+        return xy, i, draws, number + lanes * failed, key
 
-    start = (jnp.zeros((n, 2)), *[jnp.int32(0)] * 3, key)
-    xy, placed, *_ = jax.lax.while_loop(lambda c: (c[1] < n) & (c[3] < LAYOUTS), place_next, start)
-    return xy, placed == n
+    def searching(state: tuple) -> jax.Array:
+        _, i, _, number, _ = state
+        lowest = jnp.argmin(number)
+        return (i[lowest] < n) & (number[lowest] < LAYOUTS)
+
+    nothing = jnp.zeros(lanes, jnp.int32)
+    numbers, keys = jnp.arange(lanes, dtype=jnp.int32), jax.random.split(key, lanes)
+    start = (jnp.zeros((lanes, n, 2)), nothing, nothing, numbers, keys)
+    xy, i, _, number, _ = jax.lax.while_loop(searching, jax.vmap(place_next), start)
+    lowest = jnp.argmin(number)
+    return xy[lowest], i[lowest] == n
 
 
 def feasible(place: Placement) -> bool:
-    """Whether 10,000 layouts hold a valid one: the search of `sample_layout`, without compiling."""
+    """Whether 10,000 layouts hold a valid one."""
     rng = np.random.default_rng(0)
-    for _ in range(0, LAYOUTS, LAYOUT_BATCH):
-        placed = np.zeros((0, 2, LAYOUT_BATCH, 1), np.float32)  # in the layouts still valid
-        for areas, weights, apart in zip(place.areas, place.weights, place.apart, strict=True):
-            shape = placed.shape[2], DRAWS_PER_OBJECT
-            area = areas[rng.choice(len(areas), shape, p=weights / weights.sum(dtype=float)).T].T
-            x, y = area[:2] + rng.random((2, *shape), np.float32) * (area[2:] - area[:2])
-            free = np.ones(shape, bool)
-            for (other_x, other_y), gap in zip(placed, apart, strict=False):
-                free &= (x - other_x) ** 2 + (y - other_y) ** 2 >= gap**2
-            room, first = free.any(1), free.argmax(1)[:, None]
-            chosen = np.stack([np.take_along_axis(v, first, 1) for v in (x, y)])
-            placed = np.concatenate([placed, chosen[None]])[:, :, room]
-            if not room.any():
-                break
-        else:
-            return True
-    return False
+    return any(count_valid(place, rng) for _ in range(0, LAYOUTS, LAYOUT_BATCH))
+
+
+def count_valid(place: Placement, rng: np.random.Generator) -> int:
+    """How many of 100 layouts are valid, by the search of `sample_layout` without compiling."""
+    placed = np.zeros((0, 2, LAYOUT_BATCH, 1), np.float32)  # in the layouts still valid
+    for areas, weights, apart in zip(place.areas, place.weights, place.apart, strict=True):
+        shape = placed.shape[2], DRAWS_PER_OBJECT
+        area = areas[rng.choice(len(areas), shape, p=weights / weights.sum(dtype=float)).T].T
+        x, y = area[:2] + rng.random((2, *shape), np.float32) * (area[2:] - area[:2])
+        free = np.ones(shape, bool)
+        for (other_x, other_y), gap in zip(placed, apart, strict=False):
+            free &= (x - other_x) ** 2 + (y - other_y) ** 2 >= gap**2
+        room, first = free.any(1), free.argmax(1)[:, None]
+        chosen = np.stack([np.take_along_axis(v, first, 1) for v in (x, y)])
+        placed = np.concatenate([placed, chosen[None]])[:, :, room]
+        if not room.any():
+            break
+    return placed.shape[2]
 
 
 def sample_goal(

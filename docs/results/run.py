@@ -26,12 +26,19 @@ HERE = Path(__file__).parent
 ROOT = HERE.parent.parent
 TASKS = [f"{robot}_{task}" for task in ("goal1", "goal2", "push1", "button1", "button2")
          for robot in ("point", "car")]  # fmt: skip
-RULES = {task: "safety_gymnasium" for task in TASKS if "button" in task}
 MAIN = ["ppo", "ppo_lag", "trpo_lag", "cppo_pid", "cpo", "pcpo", "focops", "cup"]  # first
 ALGOS = [
     *MAIN, "pg", "npg", "trpo", "rcpo", "p3o", "trpo_pid", "ppo_saute", "trpo_saute", "ppo_simmer_pid",
     "trpo_simmer_pid", "ppo_early_terminated", "trpo_early_terminated",
 ]  # fmt: skip
+
+
+def options(task: str, algo: str) -> list[str]:
+    """What a run has besides its algorithm's defaults: OmniSafe's settings of Button."""
+    if "button" not in task:
+        return ["env.rules=safety_gym"]
+    unsafe = ["algo.saute_discount=0.999", "algo.unsafe_reward=-1"]
+    return ["env.rules=safety_gymnasium", *(unsafe if "saute" in algo or "simmer" in algo else [])]
 
 
 def keep(run: Path, name: str) -> None:
@@ -90,7 +97,7 @@ def main() -> int:
         run.parent.mkdir(parents=True, exist_ok=True)
         command = [
             sys.executable, str(ROOT / "scripts" / "train.py"), f"env={task}", f"algo={algo}",
-            f"env.rules={RULES.get(task, 'safety_gym')}", "num_seeds=5", "total_steps=1e7",
+            *options(task, algo), "num_seeds=5", "total_steps=1e7",
             "video=false", f"run_dir={run}", "resume=true",
             *args.options,
         ]  # fmt: skip
