@@ -1,11 +1,13 @@
 """Engine `jax`: MJX in plain JAX, with contacts as MuJoCo's in C where MJX has others.
 
-MJX has no collision of a cylinder with a box and misses most of a box with an upright capsule. Of a
-plane with an upright capsule its contact frame is another, of a box with a plane or a box its points
-are; and its line search gives up in float32. All are registered with MJX when this module is imported,
-which is by the engine itself only, and hold for every user of MJX in the process.
+MJX has no collision of a cylinder with a box, misses most of a box with an upright capsule, and is
+centimetres off where a cylinder meets a sphere or a capsule. Of a plane with an upright capsule its
+contact frame is another, of a box with a plane or a box its points are; and its line search gives up
+in float32. All are registered with MJX when this module is imported, which is by the engine itself
+only, and hold for every user of MJX in the process.
 """
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -23,6 +25,8 @@ collider: Any = collision_primitive.collider  # (pose and size of each) -> conta
 Collision = tuple[jax.Array, jax.Array, jax.Array]  # distance (m), position [3], frame [3, 3]
 FLAT = 0.02  # rad between normal and side (or end) within which it lies flat
 PROJECTIONS = 8  # between cylinder and box, towards their closest points
+HALVINGS = 24  # of a capsule's axis
+LEVEL = 1e-5  # slope below which it is rounding
 PARALLEL = 3e-4  # sine between edges below which their crossing is rounding
 CORNERS = np.array([[1.0, 1, 1], [-1, 1, 1], [-1, -1, 1], [1, -1, 1]])  # of a box's upper side
 SQUARE = CORNERS[:, :2]
@@ -57,6 +61,58 @@ def plane_box(plane: Any, box: Any) -> Collision:
     dist = (box.pos - plane.pos + corners) @ normal
     pos = box.pos + corners - 0.5 * dist[:, None] * normal
     return dist, pos, jnp.tile(math.make_frame(normal), (4, 1, 1))
+
+
+@collider(ncon=1)
+def sphere_cylinder(sphere: Any, cylinder: Any) -> Collision:
+    """MJX's own, ten steps of a gradient descent, is up to 2 cm and 25 degrees off."""
+    return ball_cylinder(sphere.pos, sphere.size[0], cylinder)
+
+
+@collider(ncon=1)
+def capsule_cylinder(capsule: Any, cylinder: Any) -> Collision:
+    """The contact of the ball around that point of the capsule's axis which is deepest in the cylinder.
+
+    The depth is convex along the axis, so the point is where its slope changes sign, in the middle
+    where it is zero on a stretch. (MJX's own is a gradient descent, too.)
+    """
+    axis, half = capsule.mat[:, 2], capsule.size[1]
+
+    def slope(t: jax.Array) -> jax.Array:
+        return from_cylinder(capsule.pos + t * axis, cylinder)[1].dot(axis)
+
+    def halve(_: int, bounds: tuple[jax.Array, jax.Array], sign: jax.Array) -> tuple[Any, Any]:
+        low, high = bounds
+        middle = (low + high) / 2
+        rises = slope(middle) > sign * LEVEL
+        return jnp.where(rises, low, middle), jnp.where(rises, middle, high)
+
+    def turning(sign: jax.Array) -> jax.Array:
+        low, high = jax.lax.fori_loop(0, HALVINGS, partial(halve, sign=sign), (-half, half))
+        return (low + high) / 2
+
+    deepest = jax.vmap(turning)(jnp.array([-1.0, 1.0])).mean()
+    return ball_cylinder(capsule.pos + deepest * axis, capsule.size[0], cylinder)
+
+
+def ball_cylinder(centre: jax.Array, radius: jax.Array, cylinder: Any) -> Collision:
+    outside, out = from_cylinder(centre, cylinder)
+    dist = outside - radius
+    return dist, centre - out * (radius + dist / 2), math.make_frame(-out)
+
+
+def from_cylinder(point: jax.Array, cylinder: Any) -> tuple[jax.Array, jax.Array]:
+    """How far `point` is outside a cylinder (m), and the direction away from it [3]."""
+    axis, from_centre = cylinder.mat[:, 2], point - cylinder.pos
+    height = from_centre.dot(axis)
+    across, reach = math.normalize_with_norm(from_centre - height * axis)
+    along = jnp.where(height < 0, -axis, axis)
+    beyond = jnp.array([reach - cylinder.size[0], jnp.abs(height) - cylinder.size[1]])
+    rim, corner = math.normalize_with_norm(jnp.maximum(beyond, 0.0))
+    nearest = jnp.where(beyond[0] > beyond[1], jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0]))
+    share = jnp.where(beyond.min() > 0, rim, nearest)
+    outside = jnp.where(beyond.min() > 0, corner, beyond.max())
+    return outside, share[0] * across + share[1] * along
 
 
 @collider(ncon=2)
@@ -276,6 +332,8 @@ def clipped(
 
 collision_driver._COLLISION_FUNC[GeomType.PLANE, GeomType.CAPSULE] = plane_capsule
 collision_driver._COLLISION_FUNC[GeomType.PLANE, GeomType.BOX] = plane_box
+collision_driver._COLLISION_FUNC[GeomType.SPHERE, GeomType.CYLINDER] = sphere_cylinder
+collision_driver._COLLISION_FUNC[GeomType.CAPSULE, GeomType.CYLINDER] = capsule_cylinder
 collision_driver._COLLISION_FUNC[GeomType.CYLINDER, GeomType.BOX] = cylinder_box
 collision_driver._COLLISION_FUNC[GeomType.CAPSULE, GeomType.BOX] = capsule_box
 collision_driver._COLLISION_FUNC[GeomType.BOX, GeomType.BOX] = box_box

@@ -142,6 +142,49 @@ def test_a_rod_and_a_box_are_as_far_apart_as_mujoco_says(rod):
     assert (dist[beside & ~face & certain, 1] == 1).all()
 
 
+@pytest.mark.parametrize("cylinder", [".05 .025", ".075 .1"])
+@pytest.mark.parametrize("other", ["sphere .1", "capsule .2 .5", "capsule .032 .07"])
+def test_a_wheel_or_torso_is_as_far_from_a_round_shape_as_mujoco_says(other, cylinder):
+    """Buttons, pillars and legs; half of them upright with the cylinder's axis level, a wheel's."""
+    from jaxsafe.envs import physics_jax
+
+    shape, *size = other.split()
+    model = pair(f'type="{shape}" size="{" ".join(size)}"', f'type="cylinder" size="{cylinder}"')
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    mjx_model, poses, truth = mjx.put_model(model, impl="jax"), [], []
+    for i in range(100):
+        data.qpos[:] = rng.standard_normal(14)
+        data.qpos[7:10] = 0
+        if i % 2:
+            data.qpos[[4, 5]] = 0
+            data.qpos[10:14] = np.array([1, 1, 0, 0]) * data.qpos[10] + [
+                0,
+                0,
+                data.qpos[13],
+                data.qpos[13],
+            ]
+        truth.append(separated(model, data, rng.uniform(-0.01, 0.01)))
+        poses.append(data.qpos.copy())
+
+    @jax.jit
+    @jax.vmap
+    def contact(qpos):
+        moved = mjx.kinematics(mjx_model, mjx.make_data(mjx_model).replace(qpos=qpos))
+        return getattr(physics_jax, f"{shape}_cylinder")(mjx_model, moved, None, jnp.array([[0, 1]]))
+
+    dist, pos, frame = map(np.array, contact(jnp.asarray(np.array(poses), jnp.float32)))
+    dist, pos, normal = dist.reshape(-1), pos.reshape(-1, 3), frame.reshape(-1, 3, 3)[:, 0]
+    np.testing.assert_allclose(dist, np.array(truth)[:, 0], atol=1e-6)
+    certain = np.abs(dist) > 1e-3
+    assert (normal * np.array(truth)[:, 1:])[certain].sum(1).min() > 0.9999
+    for qpos, distance, place in zip(poses, dist, pos, strict=True):
+        data.qpos[:] = qpos
+        mujoco.mj_forward(model, data)
+        assert data.ncon >= (distance < -1e-6)
+        if shape == "sphere" and data.ncon:
+            np.testing.assert_allclose(place, data.contact[0].pos, atol=1e-6)
+
+
 def axes(quats: Any) -> np.ndarray:
     """Of these orientations [count, 4], in columns [count, 3, 3]."""
     return np.array(jax.vmap(lambda q: math.quat_to_mat(math.normalize(q)))(jnp.asarray(quats)))
