@@ -168,7 +168,9 @@ def sample_layout(place: Placement, key: jax.Array) -> tuple[jax.Array, jax.Arra
         return (i[lowest] < n) & (number[lowest] < LAYOUTS)
 
     nothing = jnp.zeros(lanes, jnp.int32)
-    numbers, keys = jnp.arange(lanes, dtype=jnp.int32), jax.random.split(key, lanes)
+    numbers, keys = jnp.arange(lanes, dtype=jnp.int32), key[None]
+    if lanes > 1:
+        keys = jax.random.split(key, lanes)
     start = (jnp.zeros((lanes, n, 2)), nothing, nothing, numbers, keys)
     xy, i, _, number, _ = jax.lax.while_loop(searching, jax.vmap(place_next), start)
     lowest = jnp.argmin(number)

@@ -93,8 +93,8 @@ class Budget:
 
 @config
 class SauteConfig:
-    saute_discount: float = 0.9999  # gamma_n; OmniSafe for Point and Car on Goal and Circle
-    unsafe_reward: float = -0.2  # n, of a step that ends without budget; OmniSafe for the same
+    saute_discount: float = 0.9999  # gamma_n; OmniSafe on Goal and Circle, on Button 0.999
+    unsafe_reward: float = -0.2  # n, of a step without budget left; OmniSafe likewise, on Button -1
 
 
 def full_budget(env: Env, cfg: Any) -> jax.Array:

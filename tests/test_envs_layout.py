@@ -231,6 +231,32 @@ def test_every_registered_layout_is_found(name):
     assert layouts.feasible(layouts.placement(read(defaults(**envs.ENVS[name]))))
 
 
+@pytest.mark.parametrize("lanes", [1, 8])
+def test_trying_layouts_side_by_side_favours_none(lanes):
+    """Two hazards on a line: the nearer to its middle the first, the more draws the second needs.
+
+    With f of the line free, the second is found with probability 1 - (1 - f)^100; that is the law
+    of the first. Were the layout found first the one used, the middle would be rare.
+    """
+    line, gap = np.float32([[-1, -1e-4, 1, 1e-4]]), 0.998
+    place = layouts.Placement(
+        names=("hazard0", "hazard1"),
+        kinds=("hazards", "hazards"),
+        areas=np.stack([line, line]),
+        weights=np.ones((2, 1), np.float32),
+        keepouts=np.full(2, gap / 2, np.float32),
+        margin=0.0,
+    )
+    vars(place)["lanes"] = lanes
+    sample = jax.jit(jax.vmap(lambda key: layouts.sample_layout(place, key)))
+    xy, found = sample(jax.random.split(jax.random.key(2), 10_000))
+    grid = np.linspace(0, 1, 2001)
+    free = (grid + 1 - gap + np.maximum(1 - gap - grid, 0)) / 2
+    law = np.cumsum(1 - (1 - free) ** layouts.DRAWS_PER_OBJECT)
+    assert found.all()
+    assert kstest(np.abs(xy[:, 0, 0]), lambda x: np.interp(x, grid, law / law[-1])).pvalue > FALSE_ALARM
+
+
 def test_a_layout_is_found_exactly_where_there_is_room():
     """Two hazards of keepout 0.4 on a line of 0.8 m between centres need a margin of at most 0."""
     line = {"hazards_num": 2, "hazards_locations": ((0.6, 0.0), (1.4, 0.0)), "hazards_keepout": 0.4}
