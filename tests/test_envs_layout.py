@@ -238,7 +238,7 @@ def test_trying_layouts_side_by_side_favours_none(lanes):
     With f of the line free, the second is found with probability 1 - (1 - f)^100; that is the law
     of the first. Were the layout found first the one used, the middle would be rare.
     """
-    line, gap = np.float32([[-1, -1e-4, 1, 1e-4]]), 0.998
+    line, gap = np.array([[-1, -1e-4, 1, 1e-4]], np.float32), 0.998
     place = layouts.Placement(
         names=("hazard0", "hazard1"),
         kinds=("hazards", "hazards"),
