@@ -15,8 +15,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from jaxsafe import run_folder
+from jaxsafe import algos, command, run_folder
 from jaxsafe.algos import ALGOS, Entry
+from jaxsafe.config import from_dict
 from jaxsafe.envs import ENVS
 
 HERE = Path(__file__).parent
@@ -95,6 +96,10 @@ def measured(name: str) -> str:
         which, seeds = preset[0] if preset else "fast", len(set(metrics["seed"]))
         how = f"`{env}`, preset {which}, {seeds} seeds"
         how += f", `env.rules={rules}`" if rules != "safety_gym" else ""
+        options = {k: x for k, x in config["algo"].items() if k != "name"}
+        given = dataclasses.asdict(from_dict(ALGOS[name].config, options, "algo."))
+        usual = command.algo_options(algos, name, config["preset"])
+        how += "".join(f", `algo.{k}={given[k]}`" for k in options if given[k] != usual[k])
         rows.append(f"| {how} | {ret} | {cost} | {results.published(config)} |")
     if not rows:
         return "Not run at length yet; it learns the small exact problem of tests/test_on_policy.py."
