@@ -169,7 +169,7 @@ def sample_layout(place: Placement, key: jax.Array) -> tuple[jax.Array, jax.Arra
 
     nothing = jnp.zeros(lanes, jnp.int32)
     numbers, keys = jnp.arange(lanes, dtype=jnp.int32), key[None]
-    if lanes > 1:
+    if lanes > 1:  # a lone lane keeps the key, whose layouts are those of earlier versions
         keys = jax.random.split(key, lanes)
     start = (jnp.zeros((lanes, n, 2)), nothing, nothing, numbers, keys)
     xy, i, _, number, _ = jax.lax.while_loop(searching, jax.vmap(place_next), start)

@@ -7,7 +7,6 @@ in float32. All are registered with MJX when this module is imported, which is b
 only, and hold for every user of MJX in the process.
 """
 
-from functools import partial
 from typing import Any
 
 import jax
@@ -81,17 +80,15 @@ def capsule_cylinder(capsule: Any, cylinder: Any) -> Collision:
     def slope(t: jax.Array) -> jax.Array:
         return from_cylinder(capsule.pos + t * axis, cylinder)[1].dot(axis)
 
-    def halve(_: int, bounds: tuple[jax.Array, jax.Array], sign: jax.Array) -> tuple[Any, Any]:
+    def halve(_: int, bounds: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         low, high = bounds
         middle = (low + high) / 2
-        rises = slope(middle) > sign * LEVEL
+        rises = jax.vmap(slope)(middle) > jnp.array([-LEVEL, LEVEL])
         return jnp.where(rises, low, middle), jnp.where(rises, middle, high)
 
-    def turning(sign: jax.Array) -> jax.Array:
-        low, high = jax.lax.fori_loop(0, HALVINGS, partial(halve, sign=sign), (-half, half))
-        return (low + high) / 2
-
-    deepest = jax.vmap(turning)(jnp.array([-1.0, 1.0])).mean()
+    ends = jnp.full(2, half)  # both ends of a level stretch are sought
+    low, high = jax.lax.fori_loop(0, HALVINGS, halve, (-ends, ends))
+    deepest = (low + high).mean() / 2
     return ball_cylinder(capsule.pos + deepest * axis, capsule.size[0], cylinder)
 
 
@@ -352,7 +349,7 @@ class LinePoint(solver._LSPoint):
         return point.replace(cost=jnp.abs(point.deriv_0))
 
 
-solver._LSPoint = LinePoint  # type: ignore[misc]
+solver._LSPoint = LinePoint  # type: ignore[misc]  # a class, found there by name at each solve
 
 
 def jax_engine(scene: Scene, max_substeps: int, outputs: tuple[str, ...]) -> Run:

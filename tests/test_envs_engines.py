@@ -157,12 +157,7 @@ def test_a_wheel_or_torso_is_as_far_from_a_round_shape_as_mujoco_says(other, cyl
         data.qpos[7:10] = 0
         if i % 2:
             data.qpos[[4, 5]] = 0
-            data.qpos[10:14] = np.array([1, 1, 0, 0]) * data.qpos[10] + [
-                0,
-                0,
-                data.qpos[13],
-                data.qpos[13],
-            ]
+            data.qpos[10:14] = data.qpos[[10, 10, 13, 13]]
         truth.append(separated(model, data, rng.uniform(-0.01, 0.01)))
         poses.append(data.qpos.copy())
 
@@ -331,7 +326,7 @@ def test_an_observation_after_a_reset_is_that_of_the_new_episode(rollout):
 
 def test_jax_solves_contacts_as_c_does():
     """MJX's own line search gives up on some of these states, with velocities 0.03 to 0.2 off."""
-    from jaxsafe.envs import physics_jax  # noqa: F401, which mends MJX
+    from jaxsafe.envs import physics_jax  # noqa: F401, importing it mends MJX
 
     record = recording.Recording(DATA / "doggo_goal1.npz")
     config = read_config(record.meta["config"])
