@@ -27,7 +27,8 @@ Of several constraints (`cost_limits`) each has its own b, c and margin, and the
 them, or else goes towards the nearest x that would.
 
 OmniSafe has c = v per episode (`per_step=False`), about a thousand times as large as b'x can be: then
-a step maximises reward while the cost is under the limit and lowers cost while it is over.
+a step maximises reward while the cost is under the limit and lowers cost while it is over. What it gets
+wrong between the two (a sign in the dual, a clamp) is not reproduced, for it is never there.
 """
 
 from collections.abc import Callable
@@ -45,9 +46,9 @@ from jaxsafe.constraints import LimitsConfig, limit, named
 from jaxsafe.halfspaces import dot, furthest_point
 from jaxsafe.networks import policy
 from jaxsafe.on_policy import Algorithm, on_policy_pair
-from jaxsafe.steps import Objective, Step, mean_kl, own_trunk
+from jaxsafe.steps import Objective, Step, own_trunk
 from jaxsafe.surrogates import plain
-from jaxsafe.trust_region import conjugate_gradient, fisher_product, line_search
+from jaxsafe.trust_region import conjugate_gradient, distance, fisher_product, line_search
 from jaxsafe.types import Env, Metrics, PyTree
 
 
@@ -61,10 +62,7 @@ class CPOConfig(LimitsConfig, trpo.TRPOConfig):
 
 
 # CPO.yaml differs from TRPO.yaml by the constraint alone.
-PUBLISHED: dict[str, dict[str, Any]] = {
-    name: options | {"per_step": False, "violation_gain": 1.0, "margin_lr": 0.0}
-    for name, options in trpo.PUBLISHED.items()
-}
+PUBLISHED: dict[str, dict[str, Any]] = trpo.PUBLISHED
 
 RECOVER, RETURN, BOUNDED, FREE = range(4)  # cases of the dual
 
@@ -138,11 +136,12 @@ def cosines(s: jax.Array) -> jax.Array:
 
 
 class Problem(NamedTuple):
-    """The linearised problem, in the letters above; h_g = H^-1 g and h_b = H^-1 b are float [P].
+    """The linearised problem, in the letters above; g, h_g = H^-1 g and h_b = H^-1 b are float [P].
 
     Of several constraints h_b is [K, P], r and c are [K], and s is [K, K].
     """
 
+    g: jax.Array
     h_g: jax.Array
     h_b: jax.Array
     q: jax.Array
@@ -152,7 +151,7 @@ class Problem(NamedTuple):
     delta: jax.Array
 
 
-Rule = Callable[[Problem], "Direction"]
+Rule = Callable[[Problem, Any], "Direction"]  # of the problem and the config
 
 
 class Direction(NamedTuple):
@@ -168,7 +167,7 @@ class Direction(NamedTuple):
     metrics: Metrics
 
 
-def solution(p: Problem) -> Direction:
+def solution(p: Problem, cfg: Any) -> Direction:
     """The solution of the linearised problem."""
     lam, nu, case = (duals if p.c.ndim else dual)(p.q, p.r, p.s, p.c, p.delta)
     recover, back = case == RECOVER, dot(nu, p.h_b)
@@ -211,13 +210,13 @@ def update(
     def evaluate(params: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         actor = unravel(params)
         reward, cost = pmean((objective_r(actor, batch)[0], objective_c(actor, batch)[0]), axis_name)
-        return reward, cost, mean_kl(batch.old, policy(actor, batch.obs, cfg), axis_name)
+        return reward, cost, distance(batch.old, policy(actor, batch.obs, cfg), cfg, axis_name)
 
     g = pmean(jax.grad(lambda params: objective_r(unravel(params), batch)[0])(start), axis_name)
     gradient = jax.jacrev if excess.ndim else jax.grad  # [K, P], or [P]
     b = pmean(gradient(lambda params: objective_c(unravel(params), batch)[0])(start), axis_name)
     product = fisher_product(
-        lambda params: policy(unravel(params), batch.obs, cfg), start, batch.old, cfg.damping, axis_name
+        lambda params: policy(unravel(params), batch.obs, cfg), start, batch.old, cfg, axis_name
     )
     solve = jax.vmap(lambda v: conjugate_gradient(product, v, cfg.cg_iterations))
     h, residual = solve(jnp.concatenate([g[None], b.reshape(-1, g.size)]))
@@ -227,7 +226,7 @@ def update(
     margin = jnp.clip(opt_state.margin + cfg.margin_lr * violation, 0.0, cfg.margin_max * reach)
     margin = jnp.where(jnp.isfinite(margin), margin, opt_state.margin)
     c = cfg.violation_gain * violation + margin
-    step, earns, metrics = rule(Problem(h_g, h_b, q, r, s, c, delta))
+    step, earns, metrics = rule(Problem(g, h_g, h_b, q, r, s, c, delta), cfg)
     reward, cost, _ = evaluate(start)
 
     def accept(params: jax.Array) -> jax.Array:

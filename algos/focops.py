@@ -8,7 +8,7 @@ KL: KL(new || old) of each state; w = pi(a | s) / pi_old(a | s).
 Source: Zhang, Vuong and Ross (2020), "First Order Constrained Optimization in Policy Space",
 arXiv:2002.06506, equation 11 and algorithm 1.
 Differs from it: Adam on lam, and the scale 1 / (1 + lam), as in OmniSafe; the indicator is per state
-as in the paper (OmniSafe's multiplies the mean of the batch).
+as in the paper (OmniSafe's multiplies the mean of the minibatch, `per_state=False`).
 """
 
 from typing import Any
@@ -26,6 +26,7 @@ from jaxsafe.types import Env
 class FOCOPSConfig(LagrangianConfig, pg.PGConfig):
     temperature: float = 1.5  # lambda of the paper; OmniSafe
     near_kl: float = 0.02  # eta, nats; OmniSafe
+    per_state: bool = True  # each state's KL gates its own gain; OmniSafe: the mean gain, by the share
     lam_max: float = 2.0  # nu_max of the paper; OmniSafe
 
 

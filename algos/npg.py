@@ -22,6 +22,7 @@ from jaxsafe.types import Env
 @config
 class NPGConfig(OnPolicyConfig):
     target_kl: float = 0.02  # delta, nats; OmniSafe's 0.01 is of a mean over (2) action dimensions
+    kl_per_action: bool = False  # the KL is a mean over action dimensions; OmniSafe
     damping: float = 0.1  # added to the Fisher matrix; OmniSafe
     cg_iterations: int = 15  # OmniSafe
 

@@ -7,7 +7,8 @@ c: (J_c - cost_limit) / mean episode length, the violation in cost per step.
 Source: Zhang et al. (2022), "Penalized Proximal Policy Optimization for Safe Reinforcement Learning",
 arXiv:2205.11814, equation 13.
 Differs from it: c, which there is (1 - gamma) times the discounted violation, another mean per step.
-OmniSafe takes c per episode and does not clip the cost's surrogate.
+OmniSafe takes c per episode (`per_step=False`) and does not clip the cost's surrogate
+(`clip_cost=False`).
 """
 
 from typing import Any
@@ -18,15 +19,18 @@ import jax.numpy as jnp
 from jaxsafe.algos import ppo
 from jaxsafe.batch import pmean
 from jaxsafe.config import config
+from jaxsafe.gaussian import Gaussian
 from jaxsafe.on_policy import Algorithm, on_policy_pair
 from jaxsafe.steps import Objective, Step, adam_epochs
-from jaxsafe.surrogates import clipped, pessimistic
+from jaxsafe.surrogates import clipped, pessimistic, plain
 from jaxsafe.types import Env, Metrics, PyTree
 
 
 @config
 class P3OConfig(ppo.PPOConfig):
     kappa: float = 20.0  # reward advantages, of standard deviation 1, per unit of cost; OmniSafe
+    per_step: bool = True  # the violation c in cost per step; OmniSafe: per episode
+    clip_cost: bool = True  # max(w A_c, clip(w) A_c); OmniSafe: w A_c
 
 
 PUBLISHED: dict[str, dict[str, Any]] = {
@@ -46,17 +50,25 @@ def update(
     cfg: Any,
     axis_name: str | None,
 ) -> tuple[PyTree, PyTree, Metrics]:
+    violation = excess / length if cfg.per_step else excess
+
     def objective(actor: PyTree, batch: Any) -> tuple[jax.Array, Metrics]:
         reward, metrics = objective_r(actor, batch)
         cost, _ = objective_c(actor, batch)
         # max(0, x) of the mean over all devices, as a factor: its gradient is this device's share
-        beyond = jax.lax.stop_gradient(pmean(cost, axis_name) + excess / length)
-        penalty = cfg.kappa * jnp.where(beyond > 0, cost + excess / length, 0.0)
+        beyond = jax.lax.stop_gradient(pmean(cost, axis_name) + violation)
+        penalty = cfg.kappa * jnp.where(beyond > 0, cost + violation, 0.0)
         return reward - penalty, metrics | {"train/penalty": penalty}
 
     return adam_epochs.update(actor, opt_state, objective, batch, key, cfg, axis_name)
 
 
+def surrogate_c(
+    dist: Gaussian, batch: Any, advantage: jax.Array, cfg: Any
+) -> tuple[jax.Array, Metrics]:
+    return (pessimistic if cfg.clip_cost else plain)(dist, batch, advantage, cfg)
+
+
 def make(env: Env, axis_name: str | None = None) -> Algorithm:
     step = Step(adam_epochs.init, update)
-    return on_policy_pair(env, clipped, step, axis_name, surrogate_c=pessimistic)
+    return on_policy_pair(env, clipped, step, axis_name, surrogate_c=surrogate_c)

@@ -8,7 +8,7 @@ is onto what satisfies them all.
 Source: Yang et al. (2020), "Projection-based Constrained Policy Optimization", arXiv:2010.03152,
 equation 9.
 Differs from it, as CPO does: c with its margin, and the line search, which keeps the step within
-delta (the paper has none; OmniSafe has CPO's, and x without H^-1 in the first term).
+delta (the paper has none; OmniSafe has CPO's, and x without H^-1 in the first term, `natural=False`).
 """
 
 from typing import Any
@@ -28,17 +28,19 @@ from jaxsafe.types import Env
 @config
 class PCPOConfig(cpo.CPOConfig):
     line_search_tries: int = 200  # OmniSafe
+    natural: bool = True  # the reward's step is along H^-1 g; OmniSafe: along g
     margin_max: float = 5.0  # more than CPO's, for the reward's step is taken first, whatever c is
 
 
 PUBLISHED: dict[str, dict[str, Any]] = cpo.PUBLISHED
 
 
-def projection(p: cpo.Problem) -> cpo.Direction:
+def projection(p: cpo.Problem, cfg: Any) -> cpo.Direction:
     """The reward's step, moved back along H^-1 b to where b'x + c = 0, if it lies beyond."""
     scale = jnp.sqrt(2 * p.delta / jnp.maximum(p.q, 1e-20))
     back = (backs if p.c.ndim else back_to)(scale * p.r + p.c, p.s)
-    return cpo.Direction(scale * p.h_g - dot(back, p.h_b), jnp.bool_(False), {"train/nu": back})
+    step = scale * (p.h_g if cfg.natural else p.g) - dot(back, p.h_b)
+    return cpo.Direction(step, jnp.bool_(False), {"train/nu": back})
 
 
 def back_to(excess: jax.Array, s: jax.Array) -> jax.Array:

@@ -24,6 +24,7 @@ class PGConfig(OnPolicyConfig):
     lr_decay: bool = False  # of lr, linearly to 0 at total_iterations; OmniSafe: True
     epochs: int = 10  # passes over each batch; with 8 minibatches the 80 steps of safety-starter-agents
     target_kl: float = 0.02  # nats, checked after each pass; OmniSafe
+    critics_stop: bool = False  # the critics have no more passes than the policy had; OmniSafe
 
 
 # OmniSafe @15603dd, configs/on-policy/PolicyGradient.yaml. Its minibatches of 64 do not divide

@@ -18,6 +18,7 @@ from jaxsafe.types import Env
 @config
 class TRPOConfig(OnPolicyConfig):
     target_kl: float = 0.02  # delta, nats; OmniSafe's 0.01 is of a mean over (2) action dimensions
+    kl_per_action: bool = False  # the KL is a mean over action dimensions; OmniSafe
     damping: float = 0.1  # added to the Fisher matrix; OmniSafe, safety-starter-agents
     cg_iterations: int = 15  # OmniSafe
     line_search_tries: int = 15  # OmniSafe
@@ -26,7 +27,7 @@ class TRPOConfig(OnPolicyConfig):
 
 # OmniSafe @15603dd, configs/on-policy/TRPO.yaml. Its minibatches of 128 do not divide 20 * 1000
 # steps: these are of 125. Its target_kl is 0.01 per action dimension: right for Point and Car; for
-# Doggo's 12 it is algo.target_kl=0.12.
+# Doggo's 12 it is algo.target_kl=0.12, or compat=omnisafe.
 PUBLISHED: dict[str, dict[str, Any]] = {
     "omnisafe": {
         **OMNISAFE,

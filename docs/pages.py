@@ -15,7 +15,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from jaxsafe import algos, command, run_folder
+from jaxsafe import algos, command, compat, run_folder
 from jaxsafe.algos import ALGOS, Entry
 from jaxsafe.config import from_dict
 from jaxsafe.envs import ENVS
@@ -74,11 +74,14 @@ def settings(config: type) -> str:
 
 
 def published(entry: Entry) -> str:
-    """What `preset=published` changes."""
+    """What `preset=published` and `compat=omnisafe` change."""
     lines = []
     for origin, options in entry.published.items():
         changed = ", ".join(f"`{name}={value}`" for name, value in options.items())
         lines.append(f"`preset=published` ({origin}): {changed}.")
+    conventions = compat.overrides("omnisafe", entry.config)
+    changed = ", ".join(f"`{name}={value}`" for name, value in conventions.items())
+    lines.append(f"`compat=omnisafe` ([why](../howto/migrate.md#conventions)): {changed}.")
     return "\n\n".join(lines)
 
 
@@ -98,7 +101,7 @@ def measured(name: str) -> str:
         how += f", `env.rules={rules}`" if rules != "safety_gym" else ""
         options = {k: x for k, x in config["algo"].items() if k != "name"}
         given = dataclasses.asdict(from_dict(ALGOS[name].config, options, "algo."))
-        usual = command.algo_options(algos, name, config["preset"])
+        usual = command.algo_options(algos, name, config["preset"], config.get("compat", "none"))
         how += "".join(f", `algo.{k}={given[k]}`" for k in options if given[k] != usual[k])
         rows.append(f"| {how} | {ret} | {cost} | {results.published(config)} |")
     if not rows:

@@ -7,6 +7,7 @@ import functools
 from collections.abc import Mapping
 from pathlib import Path
 
+from jaxsafe import compat
 from jaxsafe.algos import ALGOS
 from jaxsafe.envs import ENVS, SafetyGym, make
 from jaxsafe.migrate import ALGORITHMS, OMNISAFE
@@ -41,6 +42,17 @@ def omnisafe_algorithms() -> str:
     return "\n".join(lines + [f"| `{theirs}` | `{ours}` |" for theirs, ours in ALGORITHMS.items()])
 
 
+def omnisafe_conventions() -> str:
+    """What jaxsafe/compat.py reproduces, with the algorithms that have it."""
+    lines = ["| OmniSafe | here | options | algorithms |", "|---|---|---|---|"]
+    for c in compat.OMNISAFE:
+        options = ", ".join(f"`algo.{k}={str(v).lower()}`" for k, v in c.options.items())
+        takers = [f"`{name}`" for name, entry in ALGOS.items() if c.applies(entry.config)]
+        which = "all" if len(takers) == len(ALGOS) else ", ".join(takers)
+        lines.append(f"| {c.theirs} | {c.ours} | {options} | {which} |")
+    return "\n".join(lines)
+
+
 def omnisafe_keys() -> str:
     """What jaxsafe/migrate.py makes of each key of OmniSafe's configs."""
     lines = ["| OmniSafe | here | |", "|---|---|---|"]
@@ -54,6 +66,7 @@ TABLES = {
     HERE.parent / "README.md": {"environments": environments, "algorithms": algorithms},
     HERE / "howto" / "migrate.md": {
         "omnisafe algorithms": omnisafe_algorithms,
+        "omnisafe conventions": omnisafe_conventions,
         "omnisafe keys": omnisafe_keys,
     },
 }

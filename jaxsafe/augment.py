@@ -26,12 +26,14 @@ class Augmentation(NamedTuple):
     renew(resets, cfg, dual) -> State [N], resets drawn in an earlier iteration as they are now.
     stop(episode, cfg) -> bool [N], where an episode of training ends for good.
     reward(traj, cfg) -> float [T, N], what the learner is paid.
+    last_obs(traj, cfg) -> float [T, N, O], the observations whose value each step leads to.
     """
 
     wrap: Callable[[Env, Any, PyTree], Env]
     renew: Callable[[State, Any, PyTree], State]
     stop: Callable[[Episode, Any], jax.Array]
     reward: Callable[[Trajectory, Any], jax.Array]
+    last_obs: Callable[[Trajectory, Any], jax.Array]
 
 
 nothing = Augmentation(
@@ -39,6 +41,7 @@ nothing = Augmentation(
     renew=lambda resets, cfg, dual: resets,
     stop=lambda episode, cfg: never(episode),
     reward=lambda traj, cfg: traj.reward,
+    last_obs=lambda traj, cfg: traj.next_obs,
 )
 
 
@@ -95,6 +98,7 @@ class Budget:
 class SauteConfig:
     saute_discount: float = 0.9999  # gamma_n; OmniSafe on Goal and Circle, on Button 0.999
     unsafe_reward: float = -0.2  # n, of a step without budget left; OmniSafe likewise, on Button -1
+    full_at_end: bool = False  # the value at a time limit is of z = 1; OmniSafe
 
 
 def full_budget(env: Env, cfg: Any) -> jax.Array:
@@ -107,11 +111,17 @@ def safe_reward(traj: Trajectory, cfg: Any) -> jax.Array:
     return jnp.where(traj.next_obs[..., -1] > 0, traj.reward, cfg.unsafe_reward)
 
 
+def last_budget(traj: Trajectory, cfg: Any) -> jax.Array:
+    full = traj.next_obs.at[..., -1].set(1.0)
+    return jnp.where((traj.truncated & cfg.full_at_end)[..., None], full, traj.next_obs)
+
+
 # Sootla et al. (2022), "Saute RL: Almost Surely Safe Reinforcement Learning Using State
 # Augmentation", arXiv:2202.06558, section 3; the scale of the budget is from their code
 saute = nothing._replace(
     wrap=lambda env, cfg, dual: Budget(env, 1.0, full_budget(env, cfg), cfg.saute_discount),
     reward=safe_reward,
+    last_obs=last_budget,
 )
 
 
@@ -125,6 +135,8 @@ class SimmerConfig(SauteConfig):
     simmer_kaw: float = 0.01  # of what clipping took from the last u; the authors' 0 to 0.04
     simmer_smoothing: float = 0.9  # share of the past in the error; the authors' 0 to 0.999
     simmer_window: int = 100  # errors in the sum; the authors' code
+    simmer_adds: bool = False  # u is added to the last B, not to d; OmniSafe
+    simmer_full: bool = False  # z is the share of B that is left, and starts at 1; OmniSafe
 
 
 class Schedule(NamedTuple):
@@ -149,7 +161,7 @@ def init_schedule(cfg: Any) -> Schedule:
 
 def control_budget(dual: Schedule, episode_cost: jax.Array, cfg: Any) -> Schedule:
     """B = d + u, u = K_p e + K_i sum e + K_aw (u' - u'_raw), from the error e = d - J_c, smoothed."""
-    d = reference(dual.iteration + 1, cfg)
+    d = dual.budget if cfg.simmer_adds else reference(dual.iteration + 1, cfg)
     past = cfg.simmer_smoothing
     error = past * dual.errors[-1] + (1 - past) * (d - episode_cost)
     errors = jnp.append(dual.errors[1:], error)
@@ -173,13 +185,19 @@ schedule = Treatment(
 
 def start(cfg: Any, dual: Schedule) -> jax.Array:
     """z_0, the scheduled share of the whole budget."""
-    return dual.budget / jnp.maximum(cfg.cost_limit, MIN_BUDGET)
+    share = dual.budget / jnp.maximum(cfg.cost_limit, MIN_BUDGET)
+    return jnp.ones_like(share) if cfg.simmer_full else share
+
+
+def scheduled(env: Env, cfg: Any, dual: Schedule) -> Budget:
+    whole = full_budget(env, cfg)
+    if cfg.simmer_full:
+        whole = whole * dual.budget / jnp.maximum(cfg.cost_limit, MIN_BUDGET)
+    return Budget(env, start(cfg, dual), whole, cfg.saute_discount)
 
 
 simmer = saute._replace(
-    wrap=lambda env, cfg, dual: Budget(
-        env, start(cfg, dual), full_budget(env, cfg), cfg.saute_discount
-    ),
+    wrap=scheduled,
     renew=lambda resets, cfg, dual: dataclasses.replace(
         resets, obs=resets.obs.at[:, -1].set(start(cfg, dual))
     ),
@@ -189,12 +207,16 @@ simmer = saute._replace(
 @config
 class EarlyConfig:
     termination_reward: float = 0.0  # r_e, of the step that breaks the limit; OmniSafe
+    keep_cost: bool = False  # cost counts on through episodes that time ends; OmniSafe
+
+
+def broken(episode: Episode, cfg: Any) -> jax.Array:
+    """Whether the step breaks the limit, bool [..., N]."""
+    return (episode.kept_cost if cfg.keep_cost else episode.cost) > cfg.cost_limit
 
 
 # Sun et al. (2021), "Safe Exploration by Solving Early Terminated MDP", arXiv:2107.04200
 early = nothing._replace(
-    stop=lambda episode, cfg: episode.cost > cfg.cost_limit,
-    reward=lambda traj, cfg: jnp.where(
-        traj.episode.cost > cfg.cost_limit, cfg.termination_reward, traj.reward
-    ),
+    stop=broken,
+    reward=lambda traj, cfg: jnp.where(broken(traj.episode, cfg), cfg.termination_reward, traj.reward),
 )

@@ -37,6 +37,7 @@ from rich.console import Console
 
 import jaxsafe
 from jaxsafe import checkpoint, distributed, evaluation, plots, run_folder, runner, stats
+from jaxsafe.compat import COMPAT, overrides
 from jaxsafe.config import ConfigError, flat, from_dict, is_float, nearest
 from jaxsafe.constraints import check_names, in_words, limits_of, own_limits
 from jaxsafe.interrupts import Interrupts
@@ -147,7 +148,7 @@ def read_arguments(argv: list[str], envs: Any, algos: Any) -> Request:
     base = dataclasses.asdict(runner.TrainConfig())
     if args.multirun and given.keys() & {*distributed.OPTIONS}:
         raise ConfigError(f"{', '.join(distributed.OPTIONS)} are for one run, without --multirun")
-    for name in ("preset", "resume"):
+    for name in ("preset", "compat", "resume"):
         if name in given and given[name].is_sweep_override():
             raise ConfigError(f"{name} takes one value, not a sweep")
     resume = given["resume"].value() if "resume" in given else False
@@ -156,10 +157,14 @@ def read_arguments(argv: list[str], envs: Any, algos: Any) -> Request:
         base |= {k: v for k, v in saved.items() if k not in ("env", "algo")} | {"resume": resume}
         groups = {"env": env_group(envs, saved["env"]), "algo": algo_group(algos, saved["algo"])}
     else:
-        preset = str(given["preset"].value()) if "preset" in given else base["preset"]
+        preset, compat = (
+            str(given[name].value()) if name in given else base[name] for name in ("preset", "compat")
+        )
+        if compat not in COMPAT:
+            raise ConfigError(f"compat={compat}{nearest(compat, COMPAT)}")
         groups = {
             "env": {name: {"name": name, **envs.env_defaults(name)} for name in envs.ENVS},
-            "algo": {name: algo_options(algos, name, preset) for name in algos.ALGOS},
+            "algo": {name: algo_options(algos, name, preset, compat) for name in algos.ALGOS},
         }
     texts = list(args.overrides)
     chosen = {
@@ -266,10 +271,11 @@ def algo_group(algos: Any, saved: dict[str, Any]) -> dict[str, dict[str, Any]]:
     return {name: {**algo_options(algos, name, "fast"), **saved}}
 
 
-def algo_options(algos: Any, name: str, preset: str) -> dict[str, Any]:
+def algo_options(algos: Any, name: str, preset: str, compat: str = "none") -> dict[str, Any]:
     """The defaults of an algorithm; those of `preset` if it has that one."""
     entry = algos.ALGOS[name]
-    return {"name": name, **dataclasses.asdict(entry.config(**presets(entry).get(preset, {})))}
+    options = presets(entry).get(preset, {}) | overrides(compat, entry.config)
+    return {"name": name, **dataclasses.asdict(entry.config(**options))}
 
 
 def presets(entry: Any) -> dict[str, dict[str, Any]]:

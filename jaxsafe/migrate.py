@@ -123,9 +123,10 @@ def passes(value: Any, facts: Facts) -> dict[str, Any]:
     return {"algo.critic_epochs": value} if facts.trust_region else both
 
 
-def divergence(value: Any, facts: Facts) -> dict[str, Any]:
-    value = convert(value, float, "algo_cfgs.target_kl")
-    return {"algo.target_kl": 2 * value if facts.trust_region else value}
+def window(value: Any, facts: Facts) -> dict[str, Any]:
+    """Episodes as iterations, of one episode of each environment."""
+    episodes = convert(value, int, "logger_cfgs.window_lens")
+    return {"algo.cost_window": max(1, round(episodes / facts.batch()["num_envs"]))}
 
 
 def budget(value: Any, facts: Facts) -> dict[str, Any]:
@@ -135,6 +136,7 @@ def budget(value: Any, facts: Facts) -> dict[str, Any]:
     return {"algo.budget_init": convert(value, float, "algo_cfgs.safety_budget") / upper}
 
 
+DEFAULTS = "preset=published compat=omnisafe"  # OmniSafe's settings, and its conventions
 NETWORK = "one option for policy and critics"
 OMNISAFE: dict[str, Key] = {  # later keys win
     "algo": Key("algo", "see the names"),
@@ -163,11 +165,7 @@ OMNISAFE: dict[str, Key] = {  # later keys win
     "algo_cfgs.update_iters": Key(
         "algo.epochs algo.critic_epochs", "with trust regions of the critics alone", passes
     ),
-    "algo_cfgs.target_kl": Key(
-        "algo.target_kl",
-        "of trust regions twice as much: OmniSafe's is a mean over Point's and Car's 2 actions",
-        divergence,
-    ),
+    "algo_cfgs.target_kl": Key("algo.target_kl", "with compat=omnisafe of trust regions per action"),
     "algo_cfgs.kl_early_stop": Key(
         "algo.target_kl",
         "false is inf; trust regions never stop early",
@@ -230,7 +228,7 @@ OMNISAFE: dict[str, Key] = {  # later keys win
     "logger_cfgs.use_tensorboard": Key("", "always written", same=(True,)),
     "logger_cfgs.save_model_freq": Key("", "a run is saved each minute, whole, for resume", same=None),
     "logger_cfgs.log_dir": Key("", "run_dir names a run's folder; default runs/ENV-ALGO/", same=None),
-    "logger_cfgs.window_lens": Key("", "the episode cost is of the batch, not of a window", same=None),
+    "logger_cfgs.window_lens": Key("algo.cost_window", "episodes; here iterations", window),
     "model_cfgs.weight_initialization_mode": Key(
         "algo.init",
         "kaiming_uniform is torch",
@@ -313,12 +311,12 @@ def omnisafe(config: dict[str, Any], envs: Any, algos: Any, algo: str = "", env:
     name = find_algorithm(algo or values.get("algo"))
     target = find_environment(env or values.get("env_id"), envs)
     entry = algos.ALGOS[name]
-    preset = command.algo_options(algos, name, "published")
+    preset = command.algo_options(algos, name, "published", "omnisafe")
     start = {f"algo.{k}": v for k, v in preset.items() if k != "name"}
     start |= {"num_envs": preset["num_envs"], "seed": 0, "total_steps": 10_000_000}
     facts = Facts(values, name, "epochs" not in preset)
     found: dict[str, Any] = {}
-    lines = [Line("algo", algo or values.get("algo"), f"algo={name} preset=published")]
+    lines = [Line("algo", algo or values.get("algo"), f"algo={name} {DEFAULTS}")]
     lines.append(Line("env_id", env or values.get("env_id"), " ".join(target)))
     for key in [k for k in OMNISAFE if k in values and k not in ("algo", "env_id")]:
         rule, value = OMNISAFE[key], values[key]
@@ -345,7 +343,7 @@ def omnisafe(config: dict[str, Any], envs: Any, algos: Any, algo: str = "", env:
     for key, value in found.items():
         found[key] = getattr(checked, key[5:]) if key.startswith("algo.") else convert(value, int, key)
     changed = [written(k, v) for k, v in found.items() if v != start[k]]
-    return Migrated([*target, f"algo={name}", "preset=published", *changed], lines)
+    return Migrated([*target, f"algo={name}", *DEFAULTS.split(), *changed], lines)
 
 
 def find_algorithm(theirs: Any) -> str:

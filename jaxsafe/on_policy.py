@@ -25,7 +25,7 @@ from jaxsafe.networks import init_params, policy, share_trunk, stack, stack_crit
 from jaxsafe.normalise import init_normaliser, merge, normalise
 from jaxsafe.returns import Estimator, advantages, mean_length
 from jaxsafe.rollout import RolloutState, Trajectory, collect, init_rollout
-from jaxsafe.steps import Step, adam, fit_critic
+from jaxsafe.steps import Step, adam, fit_critic, stops_critics
 from jaxsafe.surrogates import Surrogate, with_entropy
 from jaxsafe.treatments import Treatment
 from jaxsafe.types import Env, Metrics, PyTree
@@ -59,6 +59,7 @@ class OnPolicyConfig:
     cost_discount: float = 0.99  # [O, S], who name it but use `discount`
     cost_gae_lambda: float = 0.95  # [O]
     cost_limit: float = 25.0  # undiscounted cost per episode [O, S]; without constraint only a mark
+    cost_window: int = 1  # iterations that J_c is a mean over; [O] the last 100 episodes, 5 of its own
     minibatches: int = 8  # a pass over the batch, for policy and critics
     critic_lr: float = 1e-3  # [S]; Adam; unused with a shared trunk, as are the next two
     critic_epochs: int = 10  # passes of each critic; with 8 minibatches the 80 steps of [S]
@@ -90,6 +91,7 @@ class TrainState:
     signals: Normaliser of [reward, costs ...], or () without `reward_normalize` and `cost_normalize`.
     rollout: this device's environments.
     episode_length: float [], running mean length of an episode, in steps.
+    past_costs: J_c of the last `cost_window` iterations, the newest last, float [W] or [W, K].
     """
 
     config: Any
@@ -100,6 +102,7 @@ class TrainState:
     signals: PyTree
     rollout: RolloutState
     episode_length: jax.Array
+    past_costs: jax.Array
     key: jax.Array
     iteration: jax.Array
 
@@ -254,6 +257,7 @@ def loop(
             signals=init_signals(cfg, len(named(cfg)) or 1),
             rollout=init_rollout(wrapped, own(rollout_key, axis_name), cfg.num_envs, cfg.stagger),
             episode_length=jnp.float32(env.episode_length),
+            past_costs=jnp.zeros((cfg.cost_window, *jnp.shape(limit(cfg, named(cfg))))),
             key=key,
             iteration=jnp.int32(0),
         )
@@ -282,24 +286,30 @@ def loop(
         names = named(cfg)
         charged = signal(env, traj, names)
         reward, cost, signals = learned(ts, augmentation.reward(traj, cfg), charged, axis_name)
-        batch, explained = estimate(ts, traj, reward, cost, names, axis_name)
+        last_obs = augmentation.last_obs(traj, cfg)
+        batch, explained = estimate(ts, traj, last_obs, reward, cost, names, axis_name)
         length = mean_length(ts.episode_length, traj.ended, traj.length, axis_name)
         cost_rate = batch_mean(traj.cost, axis_name)
         episode_cost = batch_mean(charged, axis_name, (0, 1)) * length
+        past_costs = jnp.concatenate([ts.past_costs[1:], episode_cost[None]])
+        recent = past_costs.sum(0) / jnp.minimum(ts.iteration + 1, cfg.cost_window)
 
-        actor, opt_actor, dual, metrics = improve(ts, batch, episode_cost, length, step_key)
+        actor, opt_actor, dual, metrics = improve(ts, batch, recent, length, step_key)
         critics, opt_critics, skipped = {}, (), 0
         if cfg.trunk == "separate":
-            critics, opt_critics, skipped, fitted = fit_critics(ts, batch, critic_key, axis_name)
+            passes = metrics["train/passes"] if stops_critics(cfg) else cfg.critic_epochs
+            critics, opt_critics, skipped, fitted = fit_critics(
+                ts, batch, passes, critic_key, axis_name
+            )
             metrics |= fitted
         seen = traj.obs[..., : env.obs_size]
         normaliser = merge(ts.normaliser, seen, axis_name) if cfg.obs_normalize else ()
         # parameters are guarded step by step; what is not a step of a gradient is guarded here
         finite = psum(~all_finite((batch, normaliser, signals)), axis_name) == 0
-        dual, normaliser, signals, length = select(
+        dual, normaliser, signals, length, past_costs = select(
             finite,
-            (dual, normaliser, signals, length),
-            (ts.dual, ts.normaliser, ts.signals, ts.episode_length),
+            (dual, normaliser, signals, length, past_costs),
+            (ts.dual, ts.normaliser, ts.signals, ts.episode_length, ts.past_costs),
         )
         metrics |= explained | {"train/cost_estimate": episode_cost}
         metrics = spread(metrics, names) | episode_metrics(env, traj, axis_name)
@@ -319,6 +329,7 @@ def loop(
             signals=signals,
             rollout=rollout,
             episode_length=length,
+            past_costs=past_costs,
             key=key,
             iteration=ts.iteration + 1,
         )
@@ -332,11 +343,11 @@ def loop(
 
 
 def fit_critics(
-    ts: TrainState, batch: Batch, key: jax.Array, axis_name: str | None
+    ts: TrainState, batch: Batch, passes: jax.Array | int, key: jax.Array, axis_name: str | None
 ) -> tuple[dict[str, PyTree], PyTree, jax.Array, Metrics]:
     """All critics fitted to their targets at once: {'critic_r', 'critic_c'}, opt_state, the number of
     steps skipped, and metrics."""
-    fit = partial(fit_critic, obs=batch.obs, key=key, cfg=ts.config, axis_name=axis_name)
+    fit = partial(fit_critic, obs=batch.obs, passes=passes, key=key, cfg=ts.config, axis_name=axis_name)
     critics, opt_state, errors, skipped = jax.vmap(lambda c, o, y: fit(c, o, target=y))(
         stack_critics(ts.params), ts.opt_state["critics"], stack(batch.ret_r, batch.ret_c.T)
     )
@@ -392,7 +403,7 @@ def learned(
 
 def check(cfg: Any) -> None:
     """Refuse sizes that do not fit each other."""
-    for name in ("num_envs", "horizon", "minibatches"):
+    for name in ("num_envs", "horizon", "minibatches", "cost_window"):
         if getattr(cfg, name) < 1:
             raise ConfigError(f"{name}={getattr(cfg, name)}: expected at least 1")
     size = cfg.num_envs * cfg.horizon
@@ -407,15 +418,16 @@ def check(cfg: Any) -> None:
 def estimate(
     ts: TrainState,
     traj: Trajectory,
+    next_obs: jax.Array,
     reward: jax.Array,
     cost: jax.Array,
     names: Names,
     axis_name: str | None,
 ) -> tuple[Batch, Metrics]:
     """Advantages and targets of `reward` [T, N] and of `cost` [T, N] or, for several `names`,
-    [T, N, K], under the parameters that acted."""
+    [T, N, K], under the parameters that acted. next_obs [T, N, O]: whose value a step leads to."""
     cfg = ts.config
-    obs, next_obs = see(ts, traj.obs), see(ts, traj.next_obs)
+    obs, next_obs = see(ts, traj.obs), see(ts, next_obs)
     old = policy(ts.params["actor"], obs, cfg)
     ratio = jnp.exp(log_prob(old, traj.action) - traj.log_prob)  # 1: the policy is still the same
 

@@ -20,12 +20,14 @@ PolicyFn = Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
 
 @flax.struct.dataclass
 class Episode:
-    """Sums over an episode so far: float [N]; costs [N, K]; info a dict of [N]."""
+    """Sums over an episode so far: float [N]; costs [N, K]; info a dict of [N]. kept_cost goes on
+    through resets, until `stop` ends an episode."""
 
     ret: jax.Array
     cost: jax.Array
     costs: jax.Array
     info: dict[str, jax.Array]
+    kept_cost: jax.Array
 
 
 @flax.struct.dataclass
@@ -83,13 +85,17 @@ def init_rollout(env: Env, key: jax.Array, num_envs: int, stagger: bool) -> Roll
     state = reset_all(env, state_key, num_envs)
     spread = np.arange(num_envs, dtype=np.int64) * env.episode_length // num_envs  # int32 may overflow
     steps = jnp.asarray(spread if stagger else 0 * spread, jnp.int32)
-    episode = jax.tree.map(jnp.zeros_like, Episode(state.reward, state.cost, state.costs, state.info))
+    episode = jax.tree.map(jnp.zeros_like, sums(state))
     pool = reset_all(env, pool_key, num_envs)
     return RolloutState(state, steps, episode, steps == 0, pool, jnp.int32(0))
 
 
 def reset_all(env: Env, key: jax.Array, num_envs: int) -> State:
     return jax.vmap(env.reset)(jax.random.split(key, num_envs))
+
+
+def sums(state: State) -> Episode:
+    return Episode(state.reward, state.cost, state.costs, state.info, state.cost)
 
 
 def never(episode: Episode) -> jax.Array:
@@ -117,9 +123,9 @@ def collect(
         action, log_prob = policy_fn(obs, action_key)
         state = jax.vmap(env.step)(rollout.state, action)
         steps = rollout.steps + 1
-        last = Episode(state.reward, state.cost, state.costs, state.info)
-        episode = jax.tree.map(jnp.add, rollout.episode, last)
-        terminated = state.terminated | stop(episode)
+        episode = jax.tree.map(jnp.add, rollout.episode, sums(state))
+        stopped = stop(episode)
+        terminated = state.terminated | stopped
         truncated = (steps >= env.episode_length) & ~terminated
         done = terminated | truncated
         record = Trajectory(
@@ -138,7 +144,10 @@ def collect(
             length=steps,
         )
         rollout = dataclasses.replace(rollout, state=state, steps=steps, episode=episode)
-        return restart(env, rollout, done, reset_key), record
+        rollout = restart(env, rollout, done, reset_key)
+        kept_cost = jnp.where(stopped, 0.0, episode.kept_cost)
+        episode = dataclasses.replace(rollout.episode, kept_cost=kept_cost)
+        return dataclasses.replace(rollout, episode=episode), record
 
     return jax.lax.scan(step, rollout, jax.random.split(key, horizon))
 

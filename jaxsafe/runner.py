@@ -47,6 +47,7 @@ class TrainConfig:
     num_processes: int | None = None  # of them; under SLURM all three are known
     process_index: int | None = None  # 0 .. num_processes - 1
     preset: str = "fast"  # the algorithm's defaults: fast, published, or one of its published settings
+    compat: str = "none"  # whose departures from the papers to follow: none, or omnisafe
     run_dir: str | None = None  # null: runs/<env>-<algo>/<time>-seed<seed>
     resume: bool | str = False  # true: run_dir, or the newest unfinished run like this one; or a folder
     init_from: str | None = None  # a run folder whose policy to start from

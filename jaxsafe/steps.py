@@ -1,8 +1,8 @@
 """First-order steps: epochs of Adam on minibatches, for policies and for critics.
 
 Policy and critics have loops of their own, so that stopping the policy early leaves the critics'
-passes alone. OmniSafe alternates them on each minibatch and stops all three together. On a shared
-trunk they are one network, and their loss is one.
+passes alone. OmniSafe alternates them on each minibatch and stops all three together
+(`critics_stop`). On a shared trunk they are one network, and their loss is one.
 """
 
 from collections.abc import Callable
@@ -175,6 +175,7 @@ def fit_critic(
     opt_state: PyTree,
     obs: jax.Array,
     target: jax.Array,
+    passes: jax.Array | int,
     key: jax.Array,
     cfg: Any,
     axis_name: str | None,
@@ -183,6 +184,7 @@ def fit_critic(
 
     Args:
         obs, target: float [B, O] and [B].
+        passes: whose change counts, the first of them.
     Returns:
         critic, opt_state, the mean squared error during the last pass, and the number of
         minibatch steps skipped because their gradient was not finite.
@@ -199,9 +201,16 @@ def fit_critic(
         return (critic, state), (error, skipped)
 
     def next_pass(carry: PyTree, key: jax.Array) -> tuple[PyTree, PyTree]:
-        return one_pass(minibatch_step, carry, (obs, target), key, cfg.minibatches)
+        before, done = carry
+        after, metrics = one_pass(minibatch_step, before, (obs, target), key, cfg.minibatches)
+        return (select(done < passes, after, before), done + 1), metrics
 
-    (critic, opt_state), (error, skipped) = jax.lax.scan(
-        next_pass, (critic, opt_state), jax.random.split(key, cfg.critic_epochs)
+    ((critic, opt_state), _), (error, skipped) = jax.lax.scan(
+        next_pass, ((critic, opt_state), 0), jax.random.split(key, cfg.critic_epochs)
     )
     return critic, opt_state, batch_mean(error[-1], axis_name), skipped.sum()
+
+
+def stops_critics(cfg: Any) -> bool:
+    """Whether the critics stop with a policy that Adam moves; other policies have no passes."""
+    return getattr(cfg, "critics_stop", False)

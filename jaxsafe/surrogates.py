@@ -48,14 +48,20 @@ def near_old(dist: Gaussian, batch: Any, advantage: jax.Array, cfg: Any) -> tupl
     """E[1{KL <= eta} (w A / temperature - KL)], with the KL of each state.
 
     Source: Zhang, Vuong and Ross (2020), "First Order Constrained Optimization in Policy Space",
-    arXiv:2002.06506, equation 11; the KL is KL(new || old).
+    arXiv:2002.06506, equation 11; the KL is KL(new || old). Without `per_state` it is OmniSafe's,
+    E[1{KL <= eta}] E[w A] / temperature - E[1{KL <= eta} KL], where a matrix is formed by oversight.
     """
     divergence = kl(dist, batch.old)
     inside = divergence <= cfg.near_kl
+    metrics = {"train/inside": jnp.mean(inside)}
+    if not cfg.per_state:
+        far = jnp.mean(jnp.where(inside, divergence, 0.0))
+        gain = plain(dist, batch, advantage, cfg)[0] / cfg.temperature
+        return jnp.mean(inside) * gain - far, metrics
     # outside, w may overflow, and 0 times its gradient would be NaN
     w = jnp.exp(jnp.where(inside, log_prob(dist, batch.action) - batch.log_prob, 0.0))
     gain = w * advantage / cfg.temperature - divergence
-    return jnp.mean(jnp.where(inside, gain, 0.0)), {"train/inside": jnp.mean(inside)}
+    return jnp.mean(jnp.where(inside, gain, 0.0)), metrics
 
 
 def with_entropy(surrogate: Surrogate, iteration: jax.Array) -> Surrogate:

@@ -24,20 +24,31 @@ def fisher_product(
     dist: Callable[[jax.Array], Gaussian],
     params: jax.Array,
     old: Gaussian,
-    damping: jax.Array | float,
+    cfg: Any,
     axis_name: str | None,
 ) -> Matvec:
     """v -> H v + damping v, with H the Hessian of E_s[KL(old || dist(params))] at `params`.
 
-    The KL is summed over action dimensions and averaged over states and devices. Where `params`
-    are the old policy's, H is the Fisher information. The gradient is linearised once for all v.
+    The KL is summed over action dimensions, unless `cfg.kl_per_action`, and averaged over states and
+    devices. Where `params` are the old policy's, H is the Fisher information. The gradient is
+    linearised once for all v.
     """
 
     def divergence(params: jax.Array) -> jax.Array:
-        return jnp.mean(kl(old, dist(params)))
+        return jnp.mean(kl(old, dist(params))) / dimensions(old, cfg)
 
     product = jax.linearize(jax.grad(divergence), params)[1]
-    return lambda v: pmean(product(v), axis_name) + damping * v
+    return lambda v: pmean(product(v), axis_name) + cfg.damping * v
+
+
+def dimensions(dist: Gaussian, cfg: Any) -> int:
+    """What a sum over the dimensions of an action is divided by: with `kl_per_action` it is a mean."""
+    return dist.mean.shape[-1] if cfg.kl_per_action else 1
+
+
+def distance(old: Gaussian, new: Gaussian, cfg: Any, axis_name: str | None) -> jax.Array:
+    """KL(old || new), what `target_kl` bounds."""
+    return mean_kl(old, new, axis_name) / dimensions(old, cfg)
 
 
 def conjugate_gradient(matvec: Matvec, b: jax.Array, iterations: int) -> tuple[jax.Array, jax.Array]:
@@ -113,11 +124,11 @@ def update_natural(
     def evaluate(params: jax.Array) -> tuple[jax.Array, jax.Array]:
         actor = unravel(params)
         gain = pmean(objective(actor, batch)[0], axis_name)
-        return gain, mean_kl(batch.old, policy(actor, batch.obs, cfg), axis_name)
+        return gain, distance(batch.old, policy(actor, batch.obs, cfg), cfg, axis_name)
 
     g = pmean(jax.grad(lambda params: objective(unravel(params), batch)[0])(start), axis_name)
     product = fisher_product(
-        lambda params: policy(unravel(params), batch.obs, cfg), start, batch.old, cfg.damping, axis_name
+        lambda params: policy(unravel(params), batch.obs, cfg), start, batch.old, cfg, axis_name
     )
     h_g, residual = conjugate_gradient(product, g, cfg.cg_iterations)
     step = jnp.sqrt(2 * cfg.target_kl / jnp.maximum(g @ h_g, 1e-20)) * h_g

@@ -115,6 +115,18 @@ def test_a_step_that_ends_without_budget_earns_the_unsafe_reward():
     np.testing.assert_array_equal(augment.saute.reward(traj, cfg)[:, 0], [1, -3, -3, -3, -3, 1])
 
 
+def test_omnisafes_value_at_a_time_limit_is_of_a_full_budget():
+    env, cfg = Clock(episode_length=5, lives=(3, 9)), ALGOS["ppo_saute"].config(full_at_end=True)
+    traj = run(augment.saute.wrap(env, cfg, ()), 6, 20, idle)
+    assert traj.truncated.any() and traj.terminated.any()
+    last = augment.saute.last_obs(traj, cfg)
+    np.testing.assert_array_equal(last[..., :-1], traj.next_obs[..., :-1])
+    z = jnp.where(traj.truncated, 1.0, traj.next_obs[..., -1])
+    np.testing.assert_array_equal(last[..., -1], z)
+    ours = dataclasses.replace(cfg, full_at_end=False)
+    np.testing.assert_array_equal(augment.saute.last_obs(traj, ours), traj.next_obs)
+
+
 def test_the_unsafe_reward_is_the_learners_alone():
     env = Clock(episode_length=5)
     after = {}
@@ -168,6 +180,24 @@ def test_the_controller_by_hand():
         np.testing.assert_allclose(dual.errors[-1], error, rtol=1e-6)
         np.testing.assert_allclose(dual.budget, budget, rtol=1e-6)
         np.testing.assert_allclose(dual.clipped, clipped, rtol=1e-5, atol=1e-6)
+
+
+def test_omnisafes_controller_adds_to_the_last_budget_by_hand():
+    cfg = ALGOS["ppo_simmer_pid"].config(**HAND, simmer_adds=True, simmer_full=True)
+    dual = init_schedule(cfg)
+    rows = [  # J_c, then by hand: smoothed error, B; gains 0.5, 0.1 and 0.5, the last two errors
+        (5.0, 0.0, 5.0),
+        (3.0, 1.0, 5.6),  # e = 2 / 2, u = 0.5 + 0.1
+        (9.6, -1.5, 4.8),  # e = 1 / 2 - 4 / 2, u = -0.75 - 0.05
+    ]
+    for cost, error, budget in rows:
+        dual = control_budget(dual, jnp.float32(cost), cfg)
+        np.testing.assert_allclose(dual.errors[-1], error, rtol=1e-6)
+        np.testing.assert_allclose(dual.budget, budget, rtol=1e-6)
+    env = Clock(episode_length=5)
+    shown: Any = augment.simmer.wrap(env, cfg, dual)
+    assert shown.start == 1.0
+    np.testing.assert_allclose(shown.budget, full_budget(env, cfg) * 0.48, rtol=1e-6)
 
 
 def test_new_episodes_start_with_the_present_budget_and_running_ones_keep_theirs():
@@ -244,6 +274,19 @@ def test_the_count_of_cost_begins_anew_with_every_episode():
     cfg = ALGOS["ppo_early_terminated"].config(cost_limit=10.0)  # what an episode costs
     traj = run(Clock(episode_length=5), 2, 20, idle, stop=lambda sums: augment.early.stop(sums, cfg))
     assert not traj.terminated.any() and traj.truncated.sum() == 8
+
+
+def test_omnisafes_count_of_cost_goes_on_until_it_ends_an_episode():
+    cfg = ALGOS["ppo_early_terminated"].config(cost_limit=13.0, keep_cost=True, termination_reward=-7.0)
+    traj = run(Clock(episode_length=5), 2, 24, idle, stop=lambda sums: augment.early.stop(sums, cfg))
+    # 2 a step: 10 at the first time limit, 14 two steps later, which ends the second episode
+    ends = [6, 13, 20]
+    np.testing.assert_array_equal(np.flatnonzero(traj.terminated[:, 0]), ends)
+    np.testing.assert_array_equal(np.flatnonzero(traj.truncated[:, 0]), [4, 11, 18])
+    np.testing.assert_array_equal(traj.episode.cost[np.array(ends), 0], 4)
+    paid = np.ones(24)
+    paid[ends] = -7
+    np.testing.assert_array_equal(augment.early.reward(traj, cfg)[:, 0], paid)
 
 
 def test_training_episodes_end_early_and_others_do_not():

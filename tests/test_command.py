@@ -18,7 +18,7 @@ import pytest
 import yaml
 from tasks import FAST
 
-from jaxsafe import algos, checkpoint, command, envs, run_folder, runner, viewing
+from jaxsafe import algos, checkpoint, command, compat, envs, run_folder, runner, viewing
 from jaxsafe.config import ConfigError
 
 SCRIPTS = Path(__file__).parent.parent / "scripts"
@@ -110,6 +110,7 @@ BAD = {
     "seed": "cannot read",
     "algo.clip=[1": "cannot read",
     "preset=quick": "valid: fast",
+    "compat=omnisaf": "did you mean 'omnisafe'?",
     "resume=nowhere": "not a run folder",
     "init_from=nowhere": "not a run folder",
     "env.name=point_goal1": "choose with env=",
@@ -157,6 +158,24 @@ def test_published_settings_are_defaults_that_the_command_line_overrides():
     request = command.read_arguments(["preset=published", "algo=cpo"], envs, algos)
     setting = next(iter(algos.ALGOS["cpo"].published.values()))
     assert request.groups["algo"]["cpo"].items() >= setting.items()
+
+
+def test_the_conventions_of_omnisafe_are_defaults_of_either_preset():
+    for preset in ("fast", "published"):
+        texts = [f"preset={preset}", "compat=omnisafe", "algo=cpo", "algo.margin_lr=0.1"]
+        settings = command.compose(texts, envs, algos)
+        cfg = settings.algo
+        assert (cfg.per_step, cfg.violation_gain, cfg.margin_lr) == (False, 1.0, 0.1)
+        assert (cfg.kl_per_action, cfg.target_kl, cfg.cost_window) == (True, 0.01, 5)
+        assert settings.plain()["compat"] == "omnisafe"
+
+
+def test_each_convention_is_of_some_algorithm_and_differs_from_its_defaults():
+    for convention in compat.OMNISAFE:
+        takers = [e.config for e in algos.ALGOS.values() if convention.applies(e.config)]
+        assert takers
+        for config in takers:
+            assert all(getattr(config(), k) != v for k, v in convention.options.items())
 
 
 def test_a_run_folder_holds_what_a_reader_needs(finished):

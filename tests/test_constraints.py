@@ -70,7 +70,7 @@ def test_a_metric_of_several_constraints_is_one_each():
 
 
 solve = jax.jit(cpo.duals)
-project = jax.jit(lambda problem: pcpo.projection(problem).step)
+project = jax.jit(lambda problem: pcpo.projection(problem, pcpo.PCPOConfig()).step)
 
 
 def step_of(g, b, hessian, c, delta):
@@ -207,7 +207,7 @@ def test_the_projection_onto_several_constraints_is_the_nearest_point(k):
     for g, b, hessian, c, delta in problems(60, k, seed=2):
         h_g, h_b = np.linalg.solve(hessian, g), np.linalg.solve(hessian, b.T).T
         wide = np.pad(h_g, (0, 6 - g.size)), np.pad(h_b, ((0, 0), (0, 6 - g.size)))  # compiled once
-        arrays = (*wide, g @ h_g, h_b @ g, b @ h_b.T, c, delta)
+        arrays = (jnp.zeros(6), *wide, g @ h_g, h_b @ g, b @ h_b.T, c, delta)
         step = project(cpo.Problem(*(jnp.asarray(x, jnp.float32) for x in arrays)))[: g.size]
         root, along, e, kappa = in_balls_units(g, b, hessian, c, delta)
         best = slsqp(

@@ -1,5 +1,7 @@
 """What single algorithms add: surrogates, projections and penalties, by hand or by oracle."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +14,7 @@ from jaxsafe.gaussian import Gaussian, kl, log_prob, sample
 from jaxsafe.networks import init_params, policy
 from jaxsafe.on_policy import Batch
 from jaxsafe.steps import adam_epochs
-from jaxsafe.surrogates import clipped, near_old, pessimistic
+from jaxsafe.surrogates import clipped, near_old, pessimistic, plain
 
 
 def batch_of(old, action, adv):
@@ -31,6 +33,19 @@ def test_focops_weighs_states_by_their_own_kl():
     value, metrics = near_old(new, batch_of(old, action, adv), adv, cfg)
     w = np.exp(0.5 * 0.1 - 0.1**2 / 2)
     np.testing.assert_allclose(value, (1 / 2 + (2 * w / 2 - 0.005) + 0) / 3, rtol=1e-5)
+    np.testing.assert_allclose(metrics["train/inside"], 2 / 3, rtol=1e-6)
+
+
+def test_omnisafes_focops_multiplies_the_mean_gain_by_the_share_of_states_inside():
+    old, new = gaussian([0.0, 0.0, 0.0]), gaussian([0.0, 0.1, 1.0])
+    action, adv = jnp.array([[0.3], [0.5], [0.7]]), jnp.array([1.0, 2.0, 4.0])
+    cfg = focops.FOCOPSConfig(temperature=2.0, near_kl=0.02, per_state=False)
+    value, metrics = near_old(new, batch_of(old, action, adv), adv, cfg)
+    kls = np.array([0.0, 0.005, 0.5])[:, None]  # [3, 1], as there, so that the loss is [3, 3]
+    w = np.exp(log_prob(new, action) - log_prob(old, action))
+    loss = (kls - w * np.array([1.0, 2.0, 4.0]) / 2.0) * (kls <= 0.02)
+    assert loss.shape == (3, 3)
+    np.testing.assert_allclose(value, -loss.mean(), rtol=1e-5)
     np.testing.assert_allclose(metrics["train/inside"], 2 / 3, rtol=1e-6)
 
 
@@ -72,8 +87,8 @@ def test_the_projection_is_scipys(seed, c):
     h, g, b = root @ root.T + np.eye(4), rng.standard_normal(4), rng.standard_normal(4)
     h_g, h_b = np.linalg.solve(h, g), np.linalg.solve(h, b)
     delta = 0.02
-    arrays = (h_g, h_b, g @ h_g, g @ h_b, b @ h_b, c, delta)
-    step = pcpo.projection(cpo.Problem(*map(jnp.float32, arrays))).step
+    arrays = (g, h_g, h_b, g @ h_g, g @ h_b, b @ h_b, c, delta)
+    step = pcpo.projection(cpo.Problem(*map(jnp.float32, arrays)), pcpo.PCPOConfig()).step
     reward = np.sqrt(2 * delta / (g @ h_g)) * h_g
     oracle = minimize(
         lambda x: (x - reward) @ h @ (x - reward),
@@ -83,6 +98,14 @@ def test_the_projection_is_scipys(seed, c):
         options={"ftol": 1e-14},
     )
     np.testing.assert_allclose(step, oracle.x, atol=2e-4)
+
+
+def test_omnisafes_pcpo_steps_along_the_plain_gradient():
+    h_g, h_b = jnp.array([1.0, 2.0]), jnp.array([0.5, 0.0])
+    p = cpo.Problem(jnp.array([2.0, 8.0]), h_g, h_b, *map(jnp.float32, (18.0, 1.0, 0.25, 0.3, 0.04)))
+    step = pcpo.projection(p, pcpo.PCPOConfig(natural=False)).step
+    scale = (2 * 0.04 / 18) ** 0.5
+    np.testing.assert_allclose(step, scale * p.g - (scale * 1.0 + 0.3) / 0.25 * h_b, rtol=1e-6)
 
 
 def problem(cfg):
@@ -96,9 +119,12 @@ def problem(cfg):
     return actor, Batch(obs, action, log_prob(old, action), old, adv_r, adv_c, adv_r, adv_c)
 
 
+@pytest.mark.parametrize("omnisafe", [False, True])
 @pytest.mark.parametrize("excess, price", [(-1.0, 0.0), (1.0, 3.0)])
-def test_the_penalty_is_felt_beyond_the_limit_alone(excess, price):
-    cfg = p3o.P3OConfig(hidden=(8,), minibatches=1, epochs=1, kappa=3.0, lr=1e-3)
+def test_the_penalty_is_felt_beyond_the_limit_alone(excess, price, omnisafe):
+    sizes: dict[str, Any] = {"hidden": (8,), "minibatches": 1, "epochs": 1, "kappa": 3.0, "lr": 1e-3}
+    cfg = p3o.P3OConfig(**sizes, per_step=not omnisafe, clip_cost=not omnisafe)
+    of_cost = plain if omnisafe else pessimistic
     actor, batch = problem(cfg)
 
     def objective(surrogate, field):
@@ -110,12 +136,16 @@ def test_the_penalty_is_felt_beyond_the_limit_alone(excess, price):
     def mixed(actor, batch):
         dist = policy(actor, batch.obs, cfg)
         reward, _ = clipped(dist, batch, batch.adv_r, cfg)
-        return reward - price * pessimistic(dist, batch, batch.adv_c, cfg)[0], {}
+        return reward - price * of_cost(dist, batch, batch.adv_c, cfg)[0], {}
 
-    pair = objective(clipped, "adv_r"), objective(pessimistic, "adv_c")
+    pair = objective(clipped, "adv_r"), objective(p3o.surrogate_c, "adv_c")
     state, key = adam_epochs.init(actor, cfg), jax.random.key(0)
     numbers = jnp.float32(excess), jnp.float32(10.0)
-    after, _, _ = p3o.update(actor, state, *pair, *numbers, batch, key, cfg, None)
+    after, _, metrics = p3o.update(actor, state, *pair, *numbers, batch, key, cfg, None)
+    cost = p3o.surrogate_c(policy(after, batch.obs, cfg), batch, batch.adv_c, cfg)[0]
+    violation = 1.0 if omnisafe else 1.0 / 10  # per episode, or per step of an episode of 10
+    paid = price * (cost + violation)
+    np.testing.assert_allclose(metrics["train/penalty"], paid, rtol=1e-5)
     same, _, _ = adam_epochs.update(actor, state, mixed, batch, key, cfg, None)
     for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(same), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7)

@@ -93,7 +93,7 @@ def lost(found: migrate.Migrated) -> list[str]:
 )
 def test_the_defaults_are_the_published_preset(config, theirs, ours):
     found = migrated(config, theirs)
-    assert found.argv == [*PLAIN, f"algo={ours}", "preset=published"]
+    assert found.argv == [*PLAIN, f"algo={ours}", "preset=published", "compat=omnisafe"]
     assert lost(found) == []
     assert {line.key for line in found.lines} == {"algo", "env_id", *migrate.flatten(config)}
 
@@ -107,7 +107,8 @@ CHANGES = [  # algorithm, key, value, options
     ("PPOLag", "algo_cfgs.update_iters", 20, "algo.epochs=20 algo.critic_epochs=20"),
     ("CPO", "algo_cfgs.update_iters", 20, "algo.critic_epochs=20"),
     ("PPOLag", "algo_cfgs.target_kl", 0.03, "algo.target_kl=0.03"),
-    ("CPO", "algo_cfgs.target_kl", 0.02, "algo.target_kl=0.04"),
+    ("CPO", "algo_cfgs.target_kl", 0.02, "algo.target_kl=0.02"),
+    ("CPO", "logger_cfgs.window_lens", 40, "algo.cost_window=2"),
     ("PPOLag", "algo_cfgs.kl_early_stop", False, "algo.target_kl=inf"),
     ("PPOLag", "algo_cfgs.use_max_grad_norm", False, "algo.max_grad_norm=inf"),
     ("PPOLag", "algo_cfgs.use_critic_norm", False, "algo.critic_norm_coef=0.0"),
@@ -128,7 +129,7 @@ CHANGES = [  # algorithm, key, value, options
 def test_a_changed_key_is_a_changed_option():
     for algo, key, value, options in CHANGES:
         found = migrated({key: value}, algo)
-        assert " ".join(found.argv[4:]) == options, key
+        assert " ".join(found.argv[5:]) == options, key
         assert lost(found) == []
 
 
@@ -152,13 +153,13 @@ def test_what_has_no_counterpart_is_named(algo, key, value, reason):
 def test_two_keys_of_one_option_say_which_counts():
     sizes = {"actor": {"hidden_sizes": [32]}, "critic": {"hidden_sizes": [64]}}
     found = migrated({"model_cfgs": sizes}, "PPOLag")
-    assert found.argv[4:] == ["algo.hidden=[32]"]
+    assert found.argv[5:] == ["algo.hidden=[32]"]
     assert "algo.hidden=[32] in place of algo.hidden=[64]" in migrate.report(found.lines)
 
 
 def test_sections_of_environments_count_for_theirs():
     config = {"defaults": PPO_LAG, "SafetyPointGoal1-v0": {"algo_cfgs": {"gamma": 0.9}}, "Other": {}}
-    assert migrated(config, "PPOLag").argv[4:] == ["algo.discount=0.9", "algo.cost_discount=0.9"]
+    assert migrated(config, "PPOLag").argv[5:] == ["algo.discount=0.9", "algo.cost_discount=0.9"]
 
 
 def test_every_option_that_a_key_becomes_exists():
@@ -226,7 +227,9 @@ def test_the_script_prints_a_command_and_refuses_in_a_line(tmp_path, monkeypatch
     assert migrate.main(envs, algos) == 0
     out, err = capsys.readouterr()
     rules = "env=car_push2 env.rules=safety_gymnasium"
-    assert out == f"python scripts/train.py {rules} algo=ppo_lag preset=published seed=3\n"
+    assert (
+        out == f"python scripts/train.py {rules} algo=ppo_lag preset=published compat=omnisafe seed=3\n"
+    )
     assert len(err.splitlines()) == len(migrate.flatten(PPO_LAG)) + 2
     for text, message in (
         ("{", "is no JSON"),

@@ -13,7 +13,7 @@ import pytest
 from tasks import FAST
 from toys import Clock, Corridor, Lever
 
-from jaxsafe import evaluation
+from jaxsafe import compat, evaluation
 from jaxsafe.algos import ALGOS
 from jaxsafe.config import ConfigError
 from jaxsafe.on_policy import learned
@@ -73,13 +73,15 @@ OPTIONS: dict[str, Any] = {
     "total_iterations": 3.0,
     "activation": "relu",
     "std": "state",
+    "cost_window": 3,
 }
 PAIRS = ("cpo", "p3o", "pcpo")  # their cost has a unit
 CHOICES = {"cup": "vtrace", "ppo_saute": "gae_rtg", "focops": "plain", "p3o": "vtrace", "cpo": "plain"}
 
 
 def every_option(name):
-    return OPTIONS | {"estimator": CHOICES.get(name, "vtrace"), "cost_normalize": name not in PAIRS}
+    options = OPTIONS | compat.overrides("omnisafe", ALGOS[name].config)
+    return options | {"estimator": CHOICES.get(name, "vtrace"), "cost_normalize": name not in PAIRS}
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -138,6 +140,22 @@ def test_the_constraint_and_the_metrics_see_rewards_and_costs_as_they_are():
         np.testing.assert_allclose(ts.dual.lam, 0.001 + 0.1, rtol=1e-4)  # a violation of 1, Adam's step
     plain, scaled = (m["train/value_loss_c"] for _, m in runs)
     assert scaled < plain / 2  # the critic's targets are near 0, not near 2 / (1 - discount)
+
+
+def test_the_constraint_sees_the_mean_cost_of_the_window():
+    algo, update = build("crpo", Clock(episode_length=5))
+    ts = algo.init(jax.random.key(0), ALGOS["crpo"].config(**TINY, cost_window=3, cost_limit=6.0))
+    seen = []
+    for _ in range(4):  # an episode costs 10: above the limit of 6, and its tolerance of 2
+        ts, metrics = update(ts)
+        assert metrics["train/cost_estimate"] == 10
+        seen.append(ts.past_costs.tolist())
+        assert metrics["train/over_limit"] == 1
+    assert seen == [[0, 0, 10], [0, 10, 10], [10, 10, 10], [10, 10, 10]]
+    # the next J_c is 10 again: with 1 and 4 before it the mean is 5, with 7 and 10 it is 9
+    for past, over in (((9.0, 1.0, 4.0), 0), ((0.0, 7.0, 10.0), 1)):
+        _, metrics = update(dataclasses.replace(ts, past_costs=jnp.array(past)))
+        assert metrics["train/over_limit"] == over
 
 
 def test_a_batch_that_is_not_finite_leaves_the_statistics_of_rewards_alone():

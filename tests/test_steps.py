@@ -108,10 +108,25 @@ def test_a_critic_learns_its_targets():
     params, batch, _ = problem(cfg)
     state = adam(cfg.critic_lr, cfg).init(params["critic_c"])
     critic, _, error, skipped = fit_critic(
-        params["critic_c"], state, batch.obs, batch.ret_c, jax.random.key(0), cfg, None
+        params["critic_c"], state, batch.obs, batch.ret_c, 200, jax.random.key(0), cfg, None
     )
     assert error < 0.01 and skipped == 0
     np.testing.assert_allclose(value(critic, batch.obs, cfg), batch.ret_c, atol=0.4)
+
+
+def test_passes_of_a_critic_beyond_those_that_count_change_nothing():
+    cfg = PPOConfig(**SMALL, critic_epochs=5)
+    params, batch, _ = problem(cfg)
+    start = params["critic_c"], adam(cfg.critic_lr, cfg).init(params["critic_c"])
+
+    def fit(passes, cfg):
+        arrays = batch.obs, batch.ret_c, passes, jax.random.key(0)
+        return fit_critic(*start, *arrays, cfg, None)[:2]
+
+    for passes in (0, 2, 5):
+        few = fit(passes, dataclasses.replace(cfg, critic_epochs=passes)) if passes else start
+        for a, b in zip(*map(jax.tree.leaves, (fit(jnp.int32(passes), cfg), few)), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-6)
 
 
 @pytest.mark.parametrize(

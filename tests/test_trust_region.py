@@ -60,12 +60,37 @@ def test_the_fisher_product_is_that_of_the_kls_hessian():
 
     old = dist(params)
     hessian = jax.hessian(lambda p: jnp.mean(kl(old, dist(p))))(params)
-    product = fisher_product(dist, params, old, 0.1, None)
+    product = fisher_product(dist, params, old, cfg, None)  # its damping is 0.1
     v = jax.random.normal(jax.random.key(2), params.shape)
     np.testing.assert_allclose(product(v), hessian @ v + 0.1 * v, rtol=1e-4, atol=1e-5)
     assert (
         np.linalg.eigvalsh(np.array(hessian)).min() > -1e-5
     )  # at the old policy it is a Fisher matrix
+
+
+def test_a_kl_per_action_is_half_the_kl_of_two_actions():
+    def step(**options):
+        cfg = TRPOConfig(hidden=(8,), init="torch", **options)
+        keys = jax.random.split(jax.random.key(0), 3)
+        actor = init_params(keys[0], 3, 2, cfg)["actor"]
+        obs = jax.random.normal(keys[1], (64, 3))
+        old = policy(actor, obs, cfg)
+        action = sample(old, keys[2])
+        adv = action[:, 0] - action[:, 0].mean()
+        batch = Batch(obs, action, log_prob(old, action), old, adv, adv, adv, adv)
+
+        def objective(actor, batch):
+            return plain(policy(actor, batch.obs, cfg), batch, batch.adv_r, cfg)
+
+        update = jax.jit(trust_region.update, static_argnums=(2, 6))
+        return update(actor, (), objective, batch, keys[2], cfg, None)
+
+    mean, _, metrics = step(target_kl=0.01, damping=0.1, kl_per_action=True)
+    total, _, twice = step(target_kl=0.02, damping=0.2)
+    for a, b in zip(jax.tree.leaves(mean), jax.tree.leaves(total), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6)
+    assert metrics["train/kl"] > 0.005
+    np.testing.assert_allclose(twice["train/kl"], 2 * metrics["train/kl"], rtol=1e-3)
 
 
 @pytest.mark.parametrize("bound, index", [(1.0, 0), (0.5, 1), (0.2, 3), (0.0, 5)])

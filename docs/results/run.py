@@ -5,8 +5,8 @@ NVIDIA's multi-process service first, see ../performance.md). Button has Safety-
 of the published figures; Goal's are the same in both, and of Push none are published.
 
 A run that is done comes here, its metrics with five digits and compressed; one that is stopped, by
-Ctrl-C or after --minutes, continues the next time. With options of train.py it is a trial, which stays
-in --runs. Then `python docs/results/make.py` draws curves and writes tables. Exit status: 0 if nothing
+Ctrl-C or after --minutes, continues the next time. With --compat omnisafe it has OmniSafe's conventions,
+and its folder a name of its own. With options of train.py it is a trial, which stays in --runs. Then `python docs/results/make.py` draws curves and writes tables. Exit status: 0 if nothing
 is left to do, 130 if stopped, 1 if a run failed.
 """
 
@@ -62,6 +62,7 @@ def main() -> int:
     parser.add_argument("options", nargs="*", metavar="key=value", help="of train.py, for a trial")
     parser.add_argument("--tasks", nargs="+", default=TASKS)
     parser.add_argument("--algos", nargs="+", default=ALGOS)
+    parser.add_argument("--compat", default="none", help="none, or omnisafe")
     parser.add_argument("--gpus", default="0", help="their indices, with commas between")
     parser.add_argument("--at-once", type=int, default=1, help="commands on each GPU")
     parser.add_argument("--minutes", type=float, default=float("inf"), help="then stop")
@@ -69,7 +70,8 @@ def main() -> int:
     args = parser.parse_args()
 
     end = time.monotonic() + 60 * args.minutes
-    names = [(f"{task}-{algo}", task, algo) for task in args.tasks for algo in args.algos]
+    suffix = "" if args.compat == "none" else f"-{args.compat}"
+    names = [(f"{task}-{algo}{suffix}", task, algo) for task in args.tasks for algo in args.algos]
     names.sort(key=lambda job: job[2] not in MAIN)
     todo: queue.SimpleQueue = queue.SimpleQueue()
     missing = [job for job in names if not (HERE / job[0] / "metrics.csv.xz").exists()]
@@ -97,7 +99,7 @@ def main() -> int:
         run.parent.mkdir(parents=True, exist_ok=True)
         command = [
             sys.executable, str(ROOT / "scripts" / "train.py"), f"env={task}", f"algo={algo}",
-            *options(task, algo), "num_seeds=5", "total_steps=1e7",
+            *options(task, algo), f"compat={args.compat}", "num_seeds=5", "total_steps=1e7",
             "video=false", f"run_dir={run}", "resume=true",
             *args.options,
         ]  # fmt: skip
