@@ -147,7 +147,7 @@ def test_what_has_no_counterpart_is_named(algo, key, value, reason):
     found = migrated({key: value}, algo)
     assert lost(found) == [key]
     assert reason in migrate.report(found.lines).splitlines()[-1]
-    assert len(found.argv) == 4
+    assert len(found.argv) == 5
 
 
 def test_two_keys_of_one_option_say_which_counts():
