@@ -8,7 +8,8 @@ is training: evaluation runs whole episodes, whose cost says what the limit was 
 
 Source: Sun et al. (2021), "Safe Exploration by Solving Early Terminated MDP", arXiv:2107.04200.
 Differs from it: PPO on the observation alone, as in OmniSafe; the paper's policies are off-policy
-ones that remember the episode. The count of cost is the episode's own, in each environment.
+ones that remember the episode. The count of cost is the episode's own, in each environment (OmniSafe's
+goes on after an episode that time ends, `keep_cost`).
 A cost critic is trained for its metrics alone.
 """
 

@@ -8,7 +8,8 @@ The policy takes z beside the observation; the limit is to hold in every episode
 Source: Sootla et al. (2022), "Saute RL: Almost Surely Safe Reinforcement Learning Using State
 Augmentation", arXiv:2202.06558; B, which turns a sum into a discounted one, is from the authors' code.
 Differs from it: a step that ends at z = 0 exactly is unsafe, as in the authors' code and OmniSafe.
-z is not normalised, and the value at a time limit is of the z that the episode ended with.
+z is not normalised, and the value at a time limit is of the z that the episode ended with (OmniSafe's
+is of z = 1, `full_at_end`).
 A cost critic is trained for its metrics alone.
 """
 

@@ -10,8 +10,9 @@ the clips left of u'_raw, both at U and at the bounds of B, so that the sum does
 Source: Sootla et al. (2022), "Effects of Safety State Augmentation on Safe Exploration",
 arXiv:2206.02675, PI Simmer; the filter, the sum over the last `simmer_window` errors and both clips
 are from the authors' code.
-Differs from it: d is a line, there a staircase. OmniSafe has B' for d, so that u adds up, and calls
-K_aw a derivative's gain; its episodes after the first of an epoch start at z = 1.
+Differs from it: d is a line, there a staircase. OmniSafe has B' for d, so that u adds up
+(`simmer_adds`), and calls K_aw a derivative's gain; its episodes after the first of an epoch start at
+z = 1, the share of B (`simmer_full`).
 """
 
 from typing import Any

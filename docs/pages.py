@@ -89,15 +89,16 @@ def measured(name: str) -> str:
     """The runs of this algorithm in docs/results."""
     rows = []
     for folder in sorted((HERE / "results").glob(f"*-{name}*/")):
-        env, algo, *preset = folder.name.split("-")
+        env, algo, *_ = folder.name.split("-")
         if algo != name:
             continue
         metrics = run_folder.read_metrics(folder)
         ret, cost = (results.last_tenth(metrics, f"train/{k}") for k in ("return", "cost"))
         config = run_folder.read_config(folder)
         rules = config["env"].get("rules", "safety_gym")
-        which, seeds = preset[0] if preset else "fast", len(set(metrics["seed"]))
+        which, seeds = config["preset"], len(set(metrics["seed"]))
         how = f"`{env}`, preset {which}, {seeds} seeds"
+        how += f", `compat={config['compat']}`" if config.get("compat", "none") != "none" else ""
         how += f", `env.rules={rules}`" if rules != "safety_gym" else ""
         options = {k: x for k, x in config["algo"].items() if k != "name"}
         given = dataclasses.asdict(from_dict(ALGOS[name].config, options, "algo."))

@@ -296,10 +296,11 @@ def differing(groups: Iterable[Group]) -> dict[str, list[Any]]:
 
 
 def telling(runs: Sequence[Run]) -> list[str]:
-    """Fields that tell all settings apart: the algorithm and, where they differ, preset and others."""
+    """Fields that tell all settings apart: the algorithm and, where they differ, preset, compat and
+    others."""
     by = ["algo.name"]
     while found := differing(group(runs, by)):
-        by.append("preset" if "preset" in found else next(iter(found)))
+        by.append(next((name for name in ("preset", "compat") if name in found), next(iter(found))))
     return by
 
 

@@ -28,10 +28,13 @@ PUBLISHED = compare.read_published(HERE / "published.csv")
 SWEEP = "jaxsafe, and dynamics"  # `solver` of the rows that are compared with each other
 # Why cells lie outside the published spread, by algorithm, or of one task alone.
 FIRST = "first-order learners earn less there (see below)"
+ADDS = "there Simmer's controller adds up and its episodes start full (see below)"
 SAMPLED = "sampled actions while training; the final policy is within"
 BUTTON = "not known; unconstrained learners earn up to 3 more here on Button, and cost less on Car's"
-PRICE = "there the price is up later, or the policy learned earlier (see below)"
-UNSAFE = "at these settings nobody earns on Button: theirs lose 0.6 to 3.1, ours 1.3 at most"
+PRICE = "there J_c is a mean over 100 episodes (see below)"
+UNSAFE = (
+    "at these settings nobody earns on Button; theirs lose more, by OmniSafe's conventions (see below)"
+)
 WHOLE = "training ends an episode once its cost exceeds the limit; their evaluation, once it reaches it"
 GAIN_TASKS = ["car_goal2", "point_button1", "point_goal2"]
 BUTTONS = [f"{robot}_button{level}" for robot in ("point", "car") for level in (1, 2)]
@@ -39,9 +42,9 @@ REASONS = {
     "cpo": "here the cost is [held at the limit](#holding-cpo-at-the-limit), there it stays above",
     "pcpo": "there the reward's step lacks H^-1; here the cost [comes down](#holding-cpo-at-the-limit)",
     "cppo_pid": FIRST,
-    "p3o": f"here the penalty is on the violation per step, there per episode, far stiffer; {FIRST}",
+    "p3o": f"{FIRST}, and little of that is the penalty per episode",
     "ppo_saute": FIRST,
-    "ppo_simmer_pid": FIRST,
+    "ppo_simmer_pid": ADDS,
     "ppo_early_terminated": WHOLE,
     "trpo_early_terminated": WHOLE,
     "trpo": SAMPLED,
@@ -163,6 +166,18 @@ def held(groups: Sequence[compare.Group]) -> str:
     )
 
 
+def conventions(ours: Sequence[compare.Group], theirs: Sequence[compare.Group]) -> str:
+    """Return and cost of the same runs without and with `compat=omnisafe`, and OmniSafe's."""
+    usual = {(g.env, g.name): g for g in ours}
+    lines = ["| | `compat=none` | `compat=omnisafe` | OmniSafe |", "|---|---:|---:|---:|"]
+    for g in sorted(theirs, key=lambda g: (g.name, g.env)):
+        known = PUBLISHED[(g.env, g.name)]
+        cells = [f"{x.ret.mean:.1f}, {x.cost.mean:.1f}" for x in (usual[(g.env, g.name)], g)]
+        cells.append("{:.1f} ± {:.1f}, {:.1f} ± {:.1f}".format(*known.ret, *known.cost))
+        lines.append(f"| `{g.env}` `{g.name}` | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
 def by_algorithm(groups: Sequence[compare.Group]) -> str:
     """Return and cost of each algorithm on each task, and below them what is published."""
     tasks = sorted({g.env for g in groups})
@@ -212,6 +227,17 @@ def throughput_table() -> str:
     largest = [row for (_, size), row in sorted(found.items()) if size == sizes[-1]]
     memory = (f"{row['env']} {row['memory_bytes'] / 2**30:.1f}" for row in largest)
     lines += ["", f"Memory with {sizes[-1]:,}, GiB: {', '.join(memory)}."]
+    return "\n".join(lines)
+
+
+def engine_jax() -> str:
+    """Environment steps a second of MJX on its own, beside the other engines."""
+    lines = ["| | device | environments | steps/s | compiled in, s |", "|---|---|---:|---:|---:|"]
+    for file in ("benchmark_h200.jsonl", "benchmark_cpu.jsonl"):
+        rows = [r for r in benchmark_rows(file) if r.get("engine") == "jax"]
+        for (env, size), r in sorted(latest(rows, "env", "num_envs").items()):
+            cells = f"{size:,} | {r['env_steps_per_s']:,.0f} | {r['compile_s']:.0f}"
+            lines.append(f"| {env} | {r['device']} | {cells} |")
     return "\n".join(lines)
 
 
@@ -299,7 +325,8 @@ def throughput(path: Path) -> None:
     for file, style in (("benchmark_h200.jsonl", "o-"), ("benchmark_cpu.jsonl", "s--")):
         found: dict[str, dict[int, float]] = {}
         for row in benchmark_rows(file):
-            if row["algo"] is None and ("peer" in row or "cpu" in file or whole_sweep(row)):
+            alike = row.get("engine") == "c" if "cpu" in file else whole_sweep(row)
+            if row["algo"] is None and ("peer" in row or alike):
                 what = f"{row['peer']}: {row['env']}" if "peer" in row else row["env"]
                 points = found.setdefault(what, {})
                 points[row["num_envs"]] = row["env_steps_per_s"]  # the last, if measured again
@@ -326,17 +353,18 @@ def figures(groups: Sequence[compare.Group]) -> None:
 
 def main() -> None:
     throughput(HERE / "throughput.png")
-    runs = [
-        x
-        for x in compare.read([HERE], envs, algos)
-        if x.config["preset"] == "fast" and x.config["compat"] == "none"
-    ]
-    groups = compare.ordered(compare.group(runs, ["algo.name"]))
+    runs = [x for x in compare.read([HERE], envs, algos) if x.config["preset"] == "fast"]
+    ours, theirs = (
+        compare.ordered(compare.group([x for x in runs if x.config["compat"] == c], ["algo.name"]))
+        for c in ("none", "omnisafe")
+    )
+    groups = [g for g in ours if g.name in run.ALGOS]
     figures(groups)
     for path, name, table in (
         (HERE / "README.md", "runs", all_runs()),
         (HERE / "README.md", "outside", outside(groups)),
         (HERE / "README.md", "held", held(groups)),
+        (HERE / "README.md", "conventions", conventions(groups, theirs)),
         (HERE / "README.md", "speeds", algorithm_speeds()),
         (HERE / "README.md", "kept", kept()),
         (HERE / "README.md", "gains", gains(["cpo", "pcpo"], GAIN_TASKS, 3e6, 5.4e6)),
@@ -346,6 +374,7 @@ def main() -> None:
             gains(["pcpo"], ["car_button2", "point_goal2"], 9e6, 1.01e7),
         ),
         (HERE.parent / "performance.md", "throughput", throughput_table()),
+        (HERE.parent / "performance.md", "engine jax", engine_jax()),
         (HERE.parent.parent / "README.md", "results", by_algorithm(groups)),
     ):
         path.write_text(marked.replaced(path.read_text(), {name: table}, "measured"))

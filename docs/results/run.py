@@ -5,8 +5,9 @@ NVIDIA's multi-process service first, see ../performance.md). Button has Safety-
 of the published figures; Goal's are the same in both, and of Push none are published.
 
 A run that is done comes here, its metrics with five digits and compressed; one that is stopped, by
-Ctrl-C or after --minutes, continues the next time. With --compat omnisafe it has OmniSafe's conventions,
-and its folder a name of its own. With options of train.py it is a trial, which stays in --runs. Then `python docs/results/make.py` draws curves and writes tables. Exit status: 0 if nothing
+Ctrl-C or after --minutes, continues the next time. With --compat omnisafe it has OmniSafe's
+conventions, and a folder of its own name. With options of train.py it is a trial, which stays in
+--runs. Then `python docs/results/make.py` draws curves and writes tables. Exit status: 0 if nothing
 is left to do, 130 if stopped, 1 if a run failed.
 """
 
