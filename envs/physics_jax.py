@@ -360,6 +360,8 @@ def jax_engine(scene: Scene, max_substeps: int, outputs: tuple[str, ...]) -> Run
     timestep = scene.model.opt.timestep
     carried = (*STATE, "mocap_pos")
 
+    # GPUs would multiply matrices with 10 bits of mantissa, TPUs with 7
+    @jax.default_matmul_precision("highest")
     def run(physics: Physics, ctrl: jax.Array, substeps: jax.Array) -> tuple[Physics, Readings]:
         data = template.replace(
             qpos=physics.qpos,

@@ -77,13 +77,16 @@ def interval(x: np.ndarray) -> float:
 
 
 def table(rows: list[dict]) -> str:
-    """Markdown; a row a task and variant, the first variant of a task being its reference."""
+    """Markdown; a row a task and variant, the first variant of a task being its reference, the last time
+    that it was run."""
     names = ("return", "cost", "goal_met", "cost_hazards", "cost_vases_contact", "cost_vases_velocity")
     names += ("cost_gremlins", "cost_buttons", "cost_pillars")
     lines = [f"| task | variant | {' | '.join(names)} |", "|---|---|" + "---:|" * len(names)]
     reference: dict[str, dict] = {}
     for row in rows:
         base = reference.setdefault(row["env"], row)
+        if row["variant"] == base["variant"]:
+            base = reference[row["env"]] = row
         cells = []
         for name in names:
             if name not in row["sums"]:

@@ -68,6 +68,14 @@ def agree(name: str, steps: int, tolerance: float) -> None:
         np.testing.assert_array_equal(twin.cost, state.cost)
 
 
+def test_the_jax_engine_multiplies_matrices_in_full_float32_on_every_device():
+    env = envs.make("point_goal0", engine="jax")
+    state = jax.eval_shape(env.reset, jax.random.key(0))
+    program = jax.jit(env.step).lower(state, jnp.zeros(2)).as_text()
+    products = [line for line in program.splitlines() if "dot_general" in line]
+    assert len(products) > 10 and all("precision = [HIGHEST, HIGHEST]" in line for line in products)
+
+
 def test_the_jax_engine_agrees_with_c_where_nothing_touches():
     agree("point_goal0", 4, 1e-4)
 
