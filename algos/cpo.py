@@ -28,7 +28,8 @@ them, or else goes towards the nearest x that would.
 
 OmniSafe has c = v per episode (`per_step=False`), about a thousand times as large as b'x can be: then
 a step maximises reward while the cost is under the limit and lowers cost while it is over. What it gets
-wrong between the two (a sign in the dual, a clamp) is not reproduced, for it is never there.
+wrong between the two (a sign in the dual, a clamp) is not reproduced: it is there in hardly 1% of
+iterations.
 """
 
 from collections.abc import Callable

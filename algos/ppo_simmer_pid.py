@@ -18,7 +18,7 @@ z = 1, the share of B (`simmer_full`).
 from typing import Any
 
 from jaxsafe.algos import ppo
-from jaxsafe.augment import SimmerConfig, schedule, simmer
+from jaxsafe.augment import OMNISAFE_SIMMER, SimmerConfig, schedule, simmer
 from jaxsafe.config import config
 from jaxsafe.on_policy import Algorithm, on_policy
 from jaxsafe.steps import adam_epochs
@@ -31,25 +31,14 @@ class PPOSimmerPIDConfig(SimmerConfig, ppo.PPOConfig):
     pass
 
 
-# What PPOSimmerPID.yaml and TRPOSimmerPID.yaml add to those of PPO and TRPO: a budget that starts at
-# its bound, and steps of at most 1 of 25.
-OMNISAFE_SIMMER: dict[str, Any] = {
-    "saute_discount": 0.999,
-    "unsafe_reward": -1.0,
-    "budget_init": 1.0,
-    "budget_reach": 0.04,
-    "simmer_kp": 5e-4,
-    "simmer_ki": 1e-5,
-    "simmer_kaw": 0.0,
-    "simmer_smoothing": 0.995,
-    "simmer_window": 10,
-}
+# What PPOSimmerPID.yaml and TRPOSimmerPID.yaml add to those of PPO and TRPO.
+SIMMER: dict[str, Any] = {"saute_discount": 0.999, "unsafe_reward": -1.0, **OMNISAFE_SIMMER}
 
 # For Point and Car on Goal, and Point on Circle, PPOSimmerPID.yaml adds what PPOSaute.yaml does:
 # algo.saute_discount=0.9999 algo.unsafe_reward=-0.2 algo.epochs=80 algo.critic_epochs=80, and on Goal
 # algo.obs_normalize=false.
 PUBLISHED: dict[str, dict[str, Any]] = {
-    name: options | OMNISAFE_SIMMER for name, options in ppo.PUBLISHED.items()
+    name: options | SIMMER for name, options in ppo.PUBLISHED.items()
 }
 
 

@@ -11,7 +11,7 @@ Differs from it as PPO-Simmer does.
 from typing import Any
 
 from jaxsafe.algos import trpo
-from jaxsafe.algos.ppo_simmer_pid import OMNISAFE_SIMMER
+from jaxsafe.algos.ppo_simmer_pid import SIMMER
 from jaxsafe.augment import SimmerConfig, schedule, simmer
 from jaxsafe.config import config
 from jaxsafe.on_policy import Algorithm, on_policy
@@ -28,7 +28,7 @@ class TRPOSimmerPIDConfig(SimmerConfig, trpo.TRPOConfig):
 # For Point and Car on Goal and Circle TRPOSimmerPID.yaml adds algo.saute_discount=0.9999
 # algo.unsafe_reward=-0.2.
 PUBLISHED: dict[str, dict[str, Any]] = {
-    name: options | OMNISAFE_SIMMER for name, options in trpo.PUBLISHED.items()
+    name: options | SIMMER for name, options in trpo.PUBLISHED.items()
 }
 
 

@@ -221,10 +221,10 @@ def train(env: str | Env | None = None, algo: Any = None, **options: Any) -> Run
             `jaxsafe.config.config`, and `make(env, axis_name=None)`, such as `jaxsafe.algos.Entry`,
             which is recorded under the name of that class.
         options: settings of the run as on the command line (`total_steps` of each seed, `num_envs`,
-            `num_seeds`, `seed`, `devices`, `preset`, `run_dir`, `resume`, `init_from`, `video`, ...)
-            and of the algorithm, whose prefix may be left out (`cost_limit`: undiscounted cost of an
-            episode). An option of the environment is `**{"env.hazards_num": 12}`, or an argument of
-            `make`.
+            `num_seeds`, `seed`, `devices`, `preset`, `compat`, `run_dir`, `resume`, `init_from`,
+            `video`, ...) and of the algorithm, whose prefix may be left out (`cost_limit`:
+            undiscounted cost of an episode). An option of the environment is
+            `**{"env.hazards_num": 12}`, or an argument of `make`.
 
     Returns:
         The run. One with an object of yours goes on, and opens, with that object alone

@@ -139,6 +139,19 @@ class SimmerConfig(SauteConfig):
     simmer_full: bool = False  # z is the share of B that is left, and starts at 1; OmniSafe
 
 
+# OmniSafe @15603dd, PPOSimmerPID.yaml and TRPOSimmerPID.yaml: a budget that starts at its bound, and
+# steps of at most 1 of 25. With `simmer_adds` far larger gains drive the budget to 0, and keep it there.
+OMNISAFE_SIMMER: dict[str, Any] = {
+    "budget_init": 1.0,
+    "budget_reach": 0.04,
+    "simmer_kp": 5e-4,
+    "simmer_ki": 1e-5,
+    "simmer_kaw": 0.0,
+    "simmer_smoothing": 0.995,
+    "simmer_window": 10,
+}
+
+
 class Schedule(NamedTuple):
     """What the controller of the budget remembers; costs are per episode."""
 

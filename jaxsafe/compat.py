@@ -1,13 +1,15 @@
 """What OmniSafe does that the papers do not, as options: `compat=omnisafe`.
 
 `preset=published` has the settings of its figures, and this its conventions. Each is an option of our
-own algorithms, which can be set alone. What is not here departs in ways that no figure shows.
+own algorithms, which can be set alone.
 
 Source: OmniSafe @15603dd.
 """
 
 import dataclasses
 from typing import Any, NamedTuple
+
+from jaxsafe.augment import OMNISAFE_SIMMER
 
 
 class Convention(NamedTuple):
@@ -24,7 +26,8 @@ class Convention(NamedTuple):
 OMNISAFE = (
     Convention(
         {"cost_window": 5},
-        "J_c is the mean of the last 100 episodes, those of 5 iterations",
+        "J_c is the mean of the last 100 episodes, those of 5 iterations (of 50 up to release 0.5.0 and "
+        "in the published figures)",
         "of the last iteration",
     ),
     Convention(
@@ -35,7 +38,7 @@ OMNISAFE = (
     Convention(
         {"kl_per_action": True, "target_kl": 0.01},
         "the KL of the trust region, and H with it, is a mean over action dimensions",
-        "their sum, and twice the bound; what is left is the damping, half as large",
+        "their sum, with a bound for 2 dimensions; there what is left is the damping, half as large",
     ),
     Convention(
         {"per_step": False, "violation_gain": 1.0, "margin_lr": 0.0},
@@ -68,10 +71,10 @@ OMNISAFE = (
         "of what the episode left",
     ),
     Convention(
-        {"simmer_adds": True, "simmer_full": True},
-        "the controller's u is added to the last budget, and episodes (but the first of 20) start with "
-        "z = 1, the share of it",
-        "u is added to the scheduled budget, and z is a share of the whole one",
+        {"simmer_adds": True, "simmer_full": True, **OMNISAFE_SIMMER},
+        "the controller's u is added to the last budget, with small gains, and episodes (but the first "
+        "of 20) start with z = 1, the share of it",
+        "u is added to the scheduled budget, with larger ones, and z is a share of the whole one",
     ),
 )
 COMPAT = {"none": (), "omnisafe": OMNISAFE}

@@ -5,7 +5,8 @@
 
 The command goes to stdout, what became of every key to stderr. Of OmniSafe it takes the config.json
 of a run, a file of its configs/on-policy, or a part of either; what a file leaves out has OmniSafe's
-default, which is `preset=published`. Of Safety Gym it takes the dict that Engine(config) is given.
+default, which is `preset=published compat=omnisafe`. Of Safety Gym it takes the dict that
+Engine(config) is given.
 
 Source: the configs of OmniSafe after 0.5.0 (2025), and Safety Gym's Engine.
 """
@@ -66,7 +67,8 @@ class Facts(NamedTuple):
     trust_region: bool  # else the policy moves by epochs of Adam
 
     def batch(self) -> dict[str, Any]:
-        """steps_per_epoch as environments side by side, and batch_size as a divisor of the batch."""
+        """steps_per_epoch as environments side by side, batch_size as a divisor of the batch, and
+        window_lens, which are episodes, as iterations of one episode of each environment."""
         steps = self.whole("algo_cfgs.steps_per_epoch", 20_000)
         size = self.whole("algo_cfgs.batch_size", 128 if self.trust_region else 64)
         horizon = min(steps, EPISODE)
@@ -74,7 +76,13 @@ class Facts(NamedTuple):
         total = num_envs * horizon
         divisors = [m for m in range(1, total + 1) if total % m == 0]
         minibatches = min(divisors, key=lambda m: abs(math.log(m * size / total)))
-        return {"num_envs": num_envs, "algo.horizon": horizon, "algo.minibatches": minibatches}
+        episodes = self.whole("logger_cfgs.window_lens", 100)
+        return {
+            "num_envs": num_envs,
+            "algo.horizon": horizon,
+            "algo.minibatches": minibatches,
+            "algo.cost_window": max(1, round(episodes / num_envs)),
+        }
 
     def whole(self, key: str, default: int) -> int:
         value = convert(self.values.get(key, default), int, key)
@@ -123,12 +131,6 @@ def passes(value: Any, facts: Facts) -> dict[str, Any]:
     return {"algo.critic_epochs": value} if facts.trust_region else both
 
 
-def window(value: Any, facts: Facts) -> dict[str, Any]:
-    """Episodes as iterations, of one episode of each environment."""
-    episodes = convert(value, int, "logger_cfgs.window_lens")
-    return {"algo.cost_window": max(1, round(episodes / facts.batch()["num_envs"]))}
-
-
 def budget(value: Any, facts: Facts) -> dict[str, Any]:
     if "simmer" not in facts.algo:
         return {"algo.cost_limit": value}
@@ -153,9 +155,9 @@ OMNISAFE: dict[str, Key] = {  # later keys win
     "train_cfgs.total_steps": Key("total_steps"),
     "train_cfgs.epochs": Key("", "total_steps / steps_per_epoch", same=None),
     "algo_cfgs.steps_per_epoch": Key(
-        "num_envs algo.horizon algo.minibatches",
+        "num_envs algo.horizon algo.minibatches algo.cost_window",
         "whole episodes of 1,000 steps, side by side",
-        batch("num_envs algo.horizon algo.minibatches"),
+        batch("num_envs algo.horizon algo.minibatches algo.cost_window"),
     ),
     "algo_cfgs.batch_size": Key(
         "algo.minibatches",
@@ -165,7 +167,7 @@ OMNISAFE: dict[str, Key] = {  # later keys win
     "algo_cfgs.update_iters": Key(
         "algo.epochs algo.critic_epochs", "with trust regions of the critics alone", passes
     ),
-    "algo_cfgs.target_kl": Key("algo.target_kl", "with compat=omnisafe of trust regions per action"),
+    "algo_cfgs.target_kl": Key("algo.target_kl", "of trust regions per action, as there"),
     "algo_cfgs.kl_early_stop": Key(
         "algo.target_kl",
         "false is inf; trust regions never stop early",
@@ -228,7 +230,9 @@ OMNISAFE: dict[str, Key] = {  # later keys win
     "logger_cfgs.use_tensorboard": Key("", "always written", same=(True,)),
     "logger_cfgs.save_model_freq": Key("", "a run is saved each minute, whole, for resume", same=None),
     "logger_cfgs.log_dir": Key("", "run_dir names a run's folder; default runs/ENV-ALGO/", same=None),
-    "logger_cfgs.window_lens": Key("algo.cost_window", "episodes; here iterations", window),
+    "logger_cfgs.window_lens": Key(
+        "algo.cost_window", "in episodes there, in iterations here", batch("algo.cost_window")
+    ),
     "model_cfgs.weight_initialization_mode": Key(
         "algo.init",
         "kaiming_uniform is torch",

@@ -23,7 +23,14 @@ from jaxsafe.constraints import Names, check_names, each, limit, signal, spread,
 from jaxsafe.gaussian import Gaussian, entropy, log_prob, sample
 from jaxsafe.networks import init_params, policy, share_trunk, stack, stack_critics, values
 from jaxsafe.normalise import init_normaliser, merge, normalise
-from jaxsafe.returns import Estimator, advantages, mean_length
+from jaxsafe.returns import (
+    Estimator,
+    Window,
+    advantages,
+    empty_window,
+    mean_length,
+    window_mean,
+)
 from jaxsafe.rollout import RolloutState, Trajectory, collect, init_rollout
 from jaxsafe.steps import Step, adam, fit_critic, stops_critics
 from jaxsafe.surrogates import Surrogate, with_entropy
@@ -91,7 +98,7 @@ class TrainState:
     signals: Normaliser of [reward, costs ...], or () without `reward_normalize` and `cost_normalize`.
     rollout: this device's environments.
     episode_length: float [], running mean length of an episode, in steps.
-    past_costs: J_c of the last `cost_window` iterations, the newest last, float [W] or [W, K].
+    past_costs: J_c of the last `cost_window` iterations, float [W] or [W, K].
     """
 
     config: Any
@@ -102,7 +109,7 @@ class TrainState:
     signals: PyTree
     rollout: RolloutState
     episode_length: jax.Array
-    past_costs: jax.Array
+    past_costs: Window
     key: jax.Array
     iteration: jax.Array
 
@@ -257,7 +264,7 @@ def loop(
             signals=init_signals(cfg, len(named(cfg)) or 1),
             rollout=init_rollout(wrapped, own(rollout_key, axis_name), cfg.num_envs, cfg.stagger),
             episode_length=jnp.float32(env.episode_length),
-            past_costs=jnp.zeros((cfg.cost_window, *jnp.shape(limit(cfg, named(cfg))))),
+            past_costs=empty_window(cfg.cost_window, jnp.shape(limit(cfg, named(cfg)))),
             key=key,
             iteration=jnp.int32(0),
         )
@@ -291,8 +298,7 @@ def loop(
         length = mean_length(ts.episode_length, traj.ended, traj.length, axis_name)
         cost_rate = batch_mean(traj.cost, axis_name)
         episode_cost = batch_mean(charged, axis_name, (0, 1)) * length
-        past_costs = jnp.concatenate([ts.past_costs[1:], episode_cost[None]])
-        recent = past_costs.sum(0) / jnp.minimum(ts.iteration + 1, cfg.cost_window)
+        recent, past_costs = window_mean(ts.past_costs, episode_cost)
 
         actor, opt_actor, dual, metrics = improve(ts, batch, recent, length, step_key)
         critics, opt_critics, skipped = {}, (), 0
@@ -315,7 +321,7 @@ def loop(
         metrics = spread(metrics, names) | episode_metrics(env, traj, axis_name)
         metrics |= {
             "train/cost_rate": cost_rate,  # per environment step
-            "train/cost_estimate": cost_rate * length,  # J_c, what a constraint on `cost` sees
+            "train/cost_estimate": cost_rate * length,  # J_c of this iteration
             "train/return_estimate": batch_mean(traj.reward, axis_name) * length,  # likewise
             "train/entropy": batch_mean(entropy(policy(actor, batch.obs, cfg)), axis_name),
             "train/nonfinite": metrics["train/nonfinite"] + skipped + ~finite,

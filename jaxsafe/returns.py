@@ -1,7 +1,7 @@
 """Advantages, and what an episode costs."""
 
 from functools import partial
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import chex
 import jax
@@ -139,6 +139,24 @@ def advantages(
                 reward, value, next_value, terminated, done, ratio, discount=discount
             )
     return advantage, error
+
+
+class Window(NamedTuple):
+    """The last W of some values, float [W, ...], the newest last, and how many there are, int32 []."""
+
+    values: jax.Array
+    count: jax.Array
+
+
+def empty_window(size: int, shape: tuple[int, ...]) -> Window:
+    return Window(jnp.zeros((size, *shape)), jnp.int32(0))
+
+
+def window_mean(window: Window, value: jax.Array) -> tuple[jax.Array, Window]:
+    """The mean of the last W values, of which `value` is one, and the window with it."""
+    values = jnp.concatenate([window.values[1:], value[None]])
+    count = jnp.minimum(window.count + 1, len(values))
+    return values.sum(0) / count, Window(values, count)
 
 
 def mean_length(

@@ -145,7 +145,8 @@ def collect(
         )
         rollout = dataclasses.replace(rollout, state=state, steps=steps, episode=episode)
         rollout = restart(env, rollout, done, reset_key)
-        kept_cost = jnp.where(stopped, 0.0, episode.kept_cost)
+        kept = episode.kept_cost  # NaN would stay for good
+        kept_cost = jnp.where(stopped | ~jnp.isfinite(kept), 0.0, kept)
         episode = dataclasses.replace(rollout.episode, kept_cost=kept_cost)
         return dataclasses.replace(rollout, episode=episode), record
 

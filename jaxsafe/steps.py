@@ -186,8 +186,8 @@ def fit_critic(
         obs, target: float [B, O] and [B].
         passes: whose change counts, the first of them.
     Returns:
-        critic, opt_state, the mean squared error during the last pass, and the number of
-        minibatch steps skipped because their gradient was not finite.
+        critic, opt_state, the mean squared error during the last pass that counts, and the number
+        of its and earlier minibatch steps skipped because their gradient was not finite.
     """
     optimiser = adam(cfg.critic_lr, cfg)
 
@@ -205,10 +205,12 @@ def fit_critic(
         after, metrics = one_pass(minibatch_step, before, (obs, target), key, cfg.minibatches)
         return (select(done < passes, after, before), done + 1), metrics
 
-    ((critic, opt_state), _), (error, skipped) = jax.lax.scan(
+    ((critic, opt_state), _), (errors, skipped) = jax.lax.scan(
         next_pass, ((critic, opt_state), 0), jax.random.split(key, cfg.critic_epochs)
     )
-    return critic, opt_state, batch_mean(error[-1], axis_name), skipped.sum()
+    counted = jnp.arange(cfg.critic_epochs) < passes
+    error = errors[jnp.maximum(counted.sum(), 1) - 1]
+    return critic, opt_state, batch_mean(error, axis_name), (skipped * counted[:, None]).sum()
 
 
 def stops_critics(cfg: Any) -> bool:

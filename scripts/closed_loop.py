@@ -77,8 +77,8 @@ def interval(x: np.ndarray) -> float:
 
 
 def table(rows: list[dict]) -> str:
-    """Markdown; a row a task and variant, the first variant of a task being its reference, the last time
-    that it was run."""
+    """Markdown; a row a task and variant. The first variant of a task is the reference of those after
+    it, anew each time that it was run."""
     names = ("return", "cost", "goal_met", "cost_hazards", "cost_vases_contact", "cost_vases_velocity")
     names += ("cost_gremlins", "cost_buttons", "cost_pillars")
     lines = [f"| task | variant | {' | '.join(names)} |", "|---|---|" + "---:|" * len(names)]

@@ -9,7 +9,7 @@ import pytest
 from tasks import FAST
 from toys import Clock, Lever
 
-from jaxsafe import augment, checkpoint, evaluation
+from jaxsafe import augment, checkpoint, compat, evaluation
 from jaxsafe.algos import ALGOS
 from jaxsafe.augment import Budget, control_budget, full_budget, init_schedule
 from jaxsafe.normalise import normalise
@@ -198,6 +198,15 @@ def test_omnisafes_controller_adds_to_the_last_budget_by_hand():
     shown: Any = augment.simmer.wrap(env, cfg, dual)
     assert shown.start == 1.0
     np.testing.assert_allclose(shown.budget, full_budget(env, cfg) * 0.48, rtol=1e-6)
+
+
+def test_omnisafes_controller_keeps_most_of_its_budget_where_costs_are_too_high():
+    config = ALGOS["ppo_simmer_pid"].config
+    dual = init_schedule(cfg := config(**compat.overrides("omnisafe", config)))
+    assert dual.budget == cfg.cost_limit == 25
+    for _ in range(500):
+        dual = control_budget(dual, jnp.float32(40.0), cfg)
+    assert 10 < dual.budget < 25
 
 
 def test_new_episodes_start_with_the_present_budget_and_running_ones_keep_theirs():

@@ -101,8 +101,18 @@ def test_the_defaults_are_the_published_preset(config, theirs, ours):
 CHANGES = [  # algorithm, key, value, options
     ("PPOLag", "seed", 5, "seed=5"),
     ("PPOLag", "train_cfgs.total_steps", 1000000, "total_steps=1000000"),
-    ("PPOLag", "algo_cfgs.steps_per_epoch", 10000, "num_envs=10 algo.minibatches=125"),
-    ("PPOLag", "algo_cfgs.steps_per_epoch", 512, "num_envs=1 algo.horizon=512 algo.minibatches=8"),
+    (
+        "PPOLag",
+        "algo_cfgs.steps_per_epoch",
+        10000,
+        "num_envs=10 algo.minibatches=125 algo.cost_window=10",
+    ),
+    (
+        "PPOLag",
+        "algo_cfgs.steps_per_epoch",
+        512,
+        "num_envs=1 algo.horizon=512 algo.minibatches=8 algo.cost_window=100",
+    ),
     ("PPOLag", "algo_cfgs.batch_size", 200, "algo.minibatches=100"),
     ("PPOLag", "algo_cfgs.update_iters", 20, "algo.epochs=20 algo.critic_epochs=20"),
     ("CPO", "algo_cfgs.update_iters", 20, "algo.critic_epochs=20"),

@@ -17,6 +17,7 @@ from jaxsafe import compat, evaluation
 from jaxsafe.algos import ALGOS
 from jaxsafe.config import ConfigError
 from jaxsafe.on_policy import learned
+from jaxsafe.returns import Window
 
 NAMES = sorted(ALGOS)
 TINY: dict[str, Any] = {"num_envs": 8, "horizon": 25, "minibatches": 2, "hidden": (8,)}
@@ -149,13 +150,18 @@ def test_the_constraint_sees_the_mean_cost_of_the_window():
     for _ in range(4):  # an episode costs 10: above the limit of 6, and its tolerance of 2
         ts, metrics = update(ts)
         assert metrics["train/cost_estimate"] == 10
-        seen.append(ts.past_costs.tolist())
+        seen.append(ts.past_costs.values.tolist())
         assert metrics["train/over_limit"] == 1
     assert seen == [[0, 0, 10], [0, 10, 10], [10, 10, 10], [10, 10, 10]]
     # the next J_c is 10 again: with 1 and 4 before it the mean is 5, with 7 and 10 it is 9
     for past, over in (((9.0, 1.0, 4.0), 0), ((0.0, 7.0, 10.0), 1)):
-        _, metrics = update(dataclasses.replace(ts, past_costs=jnp.array(past)))
+        before = dataclasses.replace(ts, past_costs=Window(jnp.array(past), jnp.int32(3)))
+        _, metrics = update(before)
         assert metrics["train/over_limit"] == over
+    # of three with but one before it the mean is (4 + 10) / 2
+    before = dataclasses.replace(ts, past_costs=Window(jnp.array([0.0, 0.0, 4.0]), jnp.int32(1)))
+    after, metrics = update(before)
+    assert metrics["train/over_limit"] == 0 and after.past_costs.count == 2
 
 
 def test_a_batch_that_is_not_finite_leaves_the_statistics_of_rewards_alone():

@@ -28,13 +28,10 @@ PUBLISHED = compare.read_published(HERE / "published.csv")
 SWEEP = "jaxsafe, and dynamics"  # `solver` of the rows that are compared with each other
 # Why cells lie outside the published spread, by algorithm, or of one task alone.
 FIRST = "first-order learners earn less there (see below)"
-ADDS = "there Simmer's controller adds up and its episodes start full (see below)"
 SAMPLED = "sampled actions while training; the final policy is within"
 BUTTON = "not known; unconstrained learners earn up to 3 more here on Button, and cost less on Car's"
-PRICE = "there J_c is a mean over 100 episodes (see below)"
-UNSAFE = (
-    "at these settings nobody earns on Button; theirs lose more, by OmniSafe's conventions (see below)"
-)
+PRICE = "OmniSafe's conventions, which make up most of it on Goal 1 (see below)"
+UNSAFE = "at these settings nobody earns on Button: theirs lose 0.6 to 3.1, ours 1.3 at most"
 WHOLE = "training ends an episode once its cost exceeds the limit; their evaluation, once it reaches it"
 GAIN_TASKS = ["car_goal2", "point_button1", "point_goal2"]
 BUTTONS = [f"{robot}_button{level}" for robot in ("point", "car") for level in (1, 2)]
@@ -44,7 +41,7 @@ REASONS = {
     "cppo_pid": FIRST,
     "p3o": f"{FIRST}, and little of that is the penalty per episode",
     "ppo_saute": FIRST,
-    "ppo_simmer_pid": ADDS,
+    "ppo_simmer_pid": FIRST,
     "ppo_early_terminated": WHOLE,
     "trpo_early_terminated": WHOLE,
     "trpo": SAMPLED,
