@@ -140,7 +140,7 @@ class SimmerConfig(SauteConfig):
 
 
 # OmniSafe @15603dd, PPOSimmerPID.yaml and TRPOSimmerPID.yaml: a budget that starts at its bound, and
-# steps of at most 1 of 25. With `simmer_adds` far larger gains drive the budget to 0, and keep it there.
+# steps of at most 1 of 25. With `simmer_adds` far larger gains drive the budget to 0 for good.
 OMNISAFE_SIMMER: dict[str, Any] = {
     "budget_init": 1.0,
     "budget_reach": 0.04,

@@ -26,7 +26,7 @@ class Convention(NamedTuple):
 OMNISAFE = (
     Convention(
         {"cost_window": 5},
-        "J_c is the mean of the last 100 episodes, those of 5 iterations (of 50 up to release 0.5.0 and "
+        "J_c is the mean of the last 100 episodes, those of 5 iterations (of 50 in release 0.5.0 and "
         "in the published figures)",
         "of the last iteration",
     ),
