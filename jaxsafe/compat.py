@@ -38,7 +38,7 @@ OMNISAFE = (
     Convention(
         {"kl_per_action": True, "target_kl": 0.01},
         "the KL of the trust region, and H with it, is a mean over action dimensions",
-        "their sum, with a bound for 2 dimensions; there what is left is the damping, half as large",
+        "their sum, with a bound for 2 dimensions; beside H our damping is then half as large",
     ),
     Convention(
         {"per_step": False, "violation_gain": 1.0, "margin_lr": 0.0},

@@ -230,11 +230,10 @@ def throughput_table() -> str:
 def engine_jax() -> str:
     """Environment steps a second of MJX on its own, beside the other engines."""
     lines = ["| | device | environments | steps/s | compiled in, s |", "|---|---|---:|---:|---:|"]
-    for file in ("benchmark_h200.jsonl", "benchmark_cpu.jsonl"):
-        rows = [r for r in benchmark_rows(file) if r.get("engine") == "jax"]
-        for (env, size), r in sorted(latest(rows, "env", "num_envs").items()):
-            cells = f"{size:,} | {r['env_steps_per_s']:,.0f} | {r['compile_s']:.0f}"
-            lines.append(f"| {env} | {r['device']} | {cells} |")
+    rows = [r for r in benchmark_rows("benchmark_h200.jsonl") if r.get("engine") == "jax"]
+    for (env, size), r in sorted(latest(rows, "env", "num_envs").items()):
+        cells = f"{size:,} | {r['env_steps_per_s']:,.0f} | {r['compile_s']:.0f}"
+        lines.append(f"| {env} | {r['device']} | {cells} |")
     return "\n".join(lines)
 
 
@@ -322,8 +321,7 @@ def throughput(path: Path) -> None:
     for file, style in (("benchmark_h200.jsonl", "o-"), ("benchmark_cpu.jsonl", "s--")):
         found: dict[str, dict[int, float]] = {}
         for row in benchmark_rows(file):
-            alike = row.get("engine") == "c" if "cpu" in file else whole_sweep(row)
-            if row["algo"] is None and ("peer" in row or alike):
+            if row["algo"] is None and ("peer" in row or "cpu" in file or whole_sweep(row)):
                 what = f"{row['peer']}: {row['env']}" if "peer" in row else row["env"]
                 points = found.setdefault(what, {})
                 points[row["num_envs"]] = row["env_steps_per_s"]  # the last, if measured again

@@ -63,7 +63,7 @@ def main() -> int:
     parser.add_argument("options", nargs="*", metavar="key=value", help="of train.py, for a trial")
     parser.add_argument("--tasks", nargs="+", default=TASKS)
     parser.add_argument("--algos", nargs="+", default=ALGOS)
-    parser.add_argument("--compat", default="none", help="none, or omnisafe")
+    parser.add_argument("--compat", default="none", choices=["none", "omnisafe"])
     parser.add_argument("--gpus", default="0", help="their indices, with commas between")
     parser.add_argument("--at-once", type=int, default=1, help="commands on each GPU")
     parser.add_argument("--minutes", type=float, default=float("inf"), help="then stop")
