@@ -262,26 +262,24 @@ def warp_engine(
     return engine(max_substeps), engine(0)
 
 
-def batched(run_batch: Run) -> Run:
+def batched(run_batch: Callable) -> Callable:
     """A function of one world from one of a batch: every `vmap` adds to the batch."""
 
     @jax.custom_batching.custom_vmap
-    def flat(physics: Physics, ctrl: jax.Array, substeps: jax.Array):
-        return run_batch(physics, ctrl, substeps)
+    def flat(*args: Any) -> Any:
+        return run_batch(*args)
 
     @flat.def_vmap
     def _(axis_size: int, in_batched: Any, *args: Any) -> Any:
         args = spread(axis_size, in_batched, args)
-        worlds = axis_size * args[1].shape[1]
-        joined = jax.tree.map(lambda x: x.reshape(worlds, *x.shape[2:]), args)
-        out = flat(*joined)
-        out = jax.tree.map(lambda x: x.reshape(axis_size, worlds // axis_size, *x.shape[1:]), out)
+        each = jax.tree.leaves(args)[0].shape[1]
+        out = flat(*jax.tree.map(lambda x: x.reshape(axis_size * each, *x.shape[2:]), args))
+        out = jax.tree.map(lambda x: x.reshape(axis_size, each, *x.shape[1:]), out)
         return out, jax.tree.map(lambda _: True, out)
 
     @jax.custom_batching.custom_vmap
-    def run(physics: Physics, ctrl: jax.Array, substeps: jax.Array):
-        lone = jax.tree.map(lambda x: x[None], (physics, ctrl, substeps))
-        return jax.tree.map(lambda x: x[0], flat(*lone))
+    def run(*args: Any) -> Any:
+        return jax.tree.map(lambda x: x[0], flat(*jax.tree.map(lambda x: x[None], args)))
 
     @run.def_vmap
     def _(axis_size: int, in_batched: Any, *args: Any) -> Any:

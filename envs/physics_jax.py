@@ -2,9 +2,9 @@
 
 MJX has no collision of a cylinder with a box, misses most of a box with an upright capsule, and is
 centimetres off where a cylinder meets a sphere or a capsule. Of a plane with an upright capsule its
-contact frame is another, of a box with a plane or a box its points are; and its line search gives up
-in float32. All are registered with MJX when this module is imported, which is by the engine itself
-only, and hold for every user of MJX in the process.
+contact frame is another, of a box with a plane or a box its points are. Our collisions are registered
+with MJX when this module is imported, which is by the engine itself only, and hold for every user of
+MJX in the process. The solver is ours, too (`solver_jax.py`), and is the engine's alone.
 """
 
 from typing import Any
@@ -14,13 +14,15 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from mujoco import mjx
-from mujoco.mjx._src import collision_driver, collision_primitive, math, solver
+from mujoco.mjx._src import collision_driver, collision_primitive, forward, math, sensor
 from mujoco.mjx._src.types import GeomType
 
 from jaxsafe.envs.physics import STATE, Physics, Readings, Run, mocap_at
 from jaxsafe.envs.scene import Scene
+from jaxsafe.envs.solver_jax import solve
 
 collider: Any = collision_primitive.collider  # (pose and size of each) -> contacts, for MJX
+State = dict[str, jax.Array]  # of a world between two substeps
 Collision = tuple[jax.Array, jax.Array, jax.Array]  # distance (m), position [3], frame [3, 3]
 FLAT = 0.02  # rad between normal and side (or end) within which it lies flat
 PROJECTIONS = 8  # between cylinder and box, towards their closest points
@@ -336,20 +338,11 @@ collision_driver._COLLISION_FUNC[GeomType.CAPSULE, GeomType.BOX] = capsule_box
 collision_driver._COLLISION_FUNC[GeomType.BOX, GeomType.BOX] = box_box
 
 
-class LinePoint(solver._LSPoint):
-    """A point of the solver's line search, judged by its slope.
-
-    MJX takes a step only if the cost falls, which in float32 is rounding where the cost is large, and
-    stops with accelerations that are wrong by 0.1% now and then. The cost is convex: its slope tells.
-    """
-
-    @classmethod
-    def create(cls, *args: Any) -> Any:
-        point = super().create(*args)
-        return point.replace(cost=jnp.abs(point.deriv_0))
-
-
-solver._LSPoint = LinePoint  # type: ignore[misc]  # a class, found there by name at each solve
+def forward_pass(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """`data` with what follows from its positions and velocities, to the accelerations."""
+    data = forward.fwd_velocity(model, forward.fwd_position(model, data))
+    data = forward.fwd_acceleration(model, forward.fwd_actuation(model, data))
+    return solve(model, data)
 
 
 def jax_engine(scene: Scene, max_substeps: int, outputs: tuple[str, ...]) -> Run:
@@ -358,53 +351,53 @@ def jax_engine(scene: Scene, max_substeps: int, outputs: tuple[str, ...]) -> Run
         template = mjx.make_data(scene.model, impl="jax")
     robot, watched = map(jnp.asarray, contact_geoms(scene))
     timestep = scene.model.opt.timestep
-    carried = (*STATE, "mocap_pos")
 
-    # GPUs would multiply matrices with 10 bits of mantissa, TPUs with 7
-    @jax.default_matmul_precision("highest")
-    def run(physics: Physics, ctrl: jax.Array, substeps: jax.Array) -> tuple[Physics, Readings]:
-        data = template.replace(
-            qpos=physics.qpos,
-            qvel=physics.qvel,
-            qacc_warmstart=physics.warmstart,
-            ctrl=ctrl,
-            mocap_pos=physics.mocap_pos,
-            mocap_quat=physics.mocap_quat,
-        )
-
-        def substep(data: mjx.Data, k: jax.Array) -> tuple[mjx.Data, None]:
-            moving = data
-            if scene.orbit.any():
-                time = (physics.substeps + k) * timestep
-                moving = data.replace(mocap_pos=mocap_at(physics.mocap_pos, scene.orbit, time, jnp))
-            stepped = mjx.step(model, moving)
-            stepped = stepped.replace(mocap_pos=moving.mocap_pos)
-            kept = {f: jnp.where(k < substeps, getattr(stepped, f), getattr(data, f)) for f in carried}
-            return stepped.replace(**kept), None
-
-        data, _ = jax.lax.scan(substep, data, jnp.arange(max_substeps))
-        data = mjx.forward(model, data)
+    def readings(data: mjx.Data) -> Readings:
+        for sense in (sensor.sensor_pos, sensor.sensor_vel, sensor.sensor_acc):
+            data = sense(model, data)
         contact = data._impl.contact  # type: ignore[union-attr]
         first, second = contact.geom[:, 0], contact.geom[:, 1]
-        touching = contact.dist <= 0
         met = robot[first][:, None] & watched[second] | robot[second][:, None] & watched[first]
-        contacts = (met & touching[:, None]).sum(0).astype(jnp.float32)
-        physics = physics.replace(
-            qpos=data.qpos,
-            qvel=data.qvel,
-            warmstart=data.qacc_warmstart,
-            substeps=physics.substeps + substeps,
-        )
+        contacts = (met & (contact.dist <= 0)[:, None]).sum(0).astype(jnp.float32)
         poses = {
             name: getattr(data, name) if name in outputs else jnp.zeros((0,))
             for name in ("geom_xpos", "geom_xmat", "xquat")
         }
-        return physics, Readings(
-            sensors=jnp.concatenate([data.sensordata, contacts]),
-            contacts=contacts,
-            overflow=jnp.zeros(()),
-            **poses,
+        sensors = jnp.concatenate([data.sensordata, contacts])
+        return Readings(sensors=sensors, contacts=contacts, overflow=jnp.zeros(()), **poses)
+
+    # GPUs would multiply matrices with 10 bits of mantissa, TPUs with 7
+    @jax.default_matmul_precision("highest")
+    def run(physics: Physics, ctrl: jax.Array, substeps: jax.Array) -> tuple[Physics, Readings]:
+        base = physics.mocap_pos
+        start = template.replace(ctrl=ctrl, mocap_pos=base, mocap_quat=physics.mocap_quat)
+
+        def after(state: State, k: jax.Array) -> mjx.Data:
+            """`state` and the guides, k substeps from the start."""
+            data = start.replace(**state)
+            if not scene.orbit.any():
+                return data
+            time = (physics.substeps + k) * timestep
+            return data.replace(mocap_pos=mocap_at(base, scene.orbit, time, jnp))
+
+        def substep(state: State, k: jax.Array) -> tuple[State, None]:
+            moved = forward.euler(model, forward_pass(model, after(state, k)))
+            return {f: jnp.where(k < substeps, getattr(moved, f), state[f]) for f in STATE}, None
+
+        state: State = dict(zip(STATE, (physics.qpos, physics.qvel, physics.warmstart), strict=True))
+        if max_substeps:
+            state, _ = jax.lax.scan(substep, state, jnp.arange(max_substeps))
+            data = after(state, substeps - 1)  # guides stay where the last substep had them
+        else:
+            data = start.replace(**state)
+        shown = readings(forward_pass(model, data))
+        moved = physics.replace(
+            qpos=state["qpos"],
+            qvel=state["qvel"],
+            warmstart=state["qacc_warmstart"],
+            substeps=physics.substeps + substeps,
         )
+        return moved, shown
 
     return run
 

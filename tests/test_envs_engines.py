@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 import pytest
 from mujoco import mjx
-from mujoco.mjx._src import math
+from mujoco.mjx._src import forward, math
 from tasks import FAST, task
 
 from jaxsafe import envs
@@ -70,8 +70,13 @@ def agree(name: str, steps: int, tolerance: float) -> None:
 
 def test_the_jax_engine_multiplies_matrices_in_full_float32_on_every_device():
     env = envs.make("point_goal0", engine="jax")
-    state = jax.eval_shape(env.reset, jax.random.key(0))
-    program = jax.jit(env.step).lower(state, jnp.zeros(2)).as_text()
+
+    def train(key):
+        state = jax.vmap(env.reset)(jax.random.split(key, 2))
+        step = lambda state, action: (jax.vmap(env.step)(state, action), None)  # noqa: E731
+        return jax.lax.scan(step, state, jnp.zeros((3, 2, 2)))
+
+    program = jax.jit(jax.vmap(train)).lower(jax.random.split(jax.random.key(0), 2)).as_text()
     products = [line for line in program.splitlines() if "dot_general" in line]
     assert len(products) > 10 and all("precision = [HIGHEST, HIGHEST]" in line for line in products)
 
@@ -333,8 +338,8 @@ def test_an_observation_after_a_reset_is_that_of_the_new_episode(rollout):
 
 
 def test_jax_solves_contacts_as_c_does():
-    """MJX's own line search gives up on some of these states, with velocities 0.03 to 0.2 off."""
-    from jaxsafe.envs import physics_jax  # noqa: F401, importing it mends MJX
+    """MJX's own solver gives up on some of these states, with velocities 0.03 to 0.2 off."""
+    from jaxsafe.envs import physics_jax
 
     record = recording.Recording(DATA / "doggo_goal1.npz")
     config = read_config(record.meta["config"])
@@ -342,7 +347,11 @@ def test_jax_solves_contacts_as_c_does():
     start = {k: record[f"state.{k}"][record.rows] for k in ("qpos", "qvel", "qacc_warmstart")}
     ctrl = np.clip(record["step.action"], *model.actuator_ctrlrange.T)
     m, d = mjx.put_model(mjx_model, impl="jax"), mjx.make_data(mjx_model, impl="jax")
-    step = jax.jit(jax.vmap(lambda state, ctrl: mjx.step(m, d.replace(ctrl=ctrl, **state)).qvel))
+
+    @jax.jit
+    @jax.vmap
+    def step(state, ctrl):
+        return forward.euler(m, physics_jax.forward_pass(m, d.replace(ctrl=ctrl, **state))).qvel
 
     data = mujoco.MjData(model)
     for _ in range(3):
@@ -357,3 +366,49 @@ def test_jax_solves_contacts_as_c_does():
         got = step({k: np.float32(x) for k, x in start.items()}, np.float32(ctrl))
         np.testing.assert_allclose(got, after["qvel"], rtol=0, atol=2e-4)
         start = after
+
+
+def test_jax_solves_equalities_dry_friction_limits_and_contacts_as_c_does():
+    """A chain of two hinges with all of these, its end tied to a cube that lies on the floor."""
+    from jaxsafe.envs import physics_jax
+
+    model = mujoco.MjModel.from_xml_string("""
+    <mujoco>
+      <option cone="pyramidal"/>
+      <worldbody>
+        <geom type="plane" size="1 1 1" condim="6"/>
+        <body pos="0 0 .5">
+          <joint type="hinge" axis="0 1 0" range="-20 20" limited="true" frictionloss=".05"/>
+          <geom type="capsule" fromto="0 0 0 .2 0 0" size=".03" contype="0"/>
+          <body name="hand" pos=".2 0 0">
+            <joint type="hinge" axis="0 1 0" range="-20 20" limited="true" frictionloss=".02"/>
+            <geom type="capsule" fromto="0 0 0 .2 0 0" size=".03" contype="0"/>
+          </body>
+        </body>
+        <body name="cube" pos=".4 0 .1">
+          <freejoint/>
+          <geom type="box" size=".1 .1 .1" condim="6" conaffinity="2"/>
+        </body>
+      </worldbody>
+      <equality> <connect body1="hand" body2="cube" anchor=".2 0 0"/> </equality>
+    </mujoco>""")
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    model.opt.tolerance = 1e-12
+    states, accelerations, kinds = [], [], set()
+    for _ in range(64):
+        mujoco.mj_resetData(model, data)
+        data.qpos += rng.normal(size=model.nq) * np.array([0.4, 0.4] + [0.003] * 7)
+        data.qvel[:] = rng.normal(size=model.nv) * 0.01  # MJX lacks what speed squared does to a tie
+        state = {k: np.float32(getattr(data, k)) for k in ("qpos", "qvel", "qacc_warmstart")}
+        data.qpos[:], data.qvel[:] = state["qpos"], state["qvel"]
+        mujoco.mj_forward(model, data)
+        states.append(state)
+        accelerations.append(data.qacc.copy())
+        kinds |= set(data.efc_type)
+    assert len(kinds) == 4
+    model.opt.tolerance = 1e-8
+    m, d = mjx.put_model(model, impl="jax"), mjx.make_data(model, impl="jax")
+    batch = jax.tree.map(lambda *x: np.stack(x), *states)
+    solved = jax.jit(jax.vmap(lambda state: physics_jax.forward_pass(m, d.replace(**state))))(batch)
+    size = np.abs(accelerations).max(1, keepdims=True)
+    np.testing.assert_allclose(solved.qacc / size, accelerations / size, rtol=0, atol=1e-4)
