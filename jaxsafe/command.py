@@ -119,7 +119,7 @@ class Request(NamedTuple):
 
     argv: list[str]  # for Hydra: aliases replaced
     base: dict[str, Any]  # top-level defaults, or those of the run to continue
-    groups: dict[str, dict[str, dict[str, Any]]]  # 'env' and 'algo': name -> options
+    groups: dict[str, dict[str, dict[str, Any]]]  # 'env' and 'algo': name -> options, if chosen
 
 
 # ---- arguments -------------------------------------------------------------------------------
@@ -197,6 +197,9 @@ def read_arguments(argv: list[str], envs: Any, algos: Any) -> Request:
     # Hydra adds a name to a dict, or to what was null, only if told to, and after the dict itself
     alone = [text for text in texts if text.startswith(f"{NAMED}.")]
     texts = [text for text in texts if text not in alone] + [f"++{text}" for text in alone]
+    # Hydra copies them all again and again: the others are known by name
+    for group, names in chosen.items():
+        groups[group] = {k: node if k in names else {} for k, node in groups[group].items()}
     return Request([*flags, *texts], base, groups)
 
 
@@ -752,12 +755,7 @@ def policy_of(settings: Settings, env: Env, algos: Any, folder: Path) -> tuple[A
 def compose(texts: list[str], envs: Any, algos: Any) -> Settings:
     """The settings that train.py would have from these arguments."""
     request = read_arguments(texts, envs, algos)
-    named = {*DEFAULT.values(), *(text.partition("=")[2] for text in request.argv)}
-    groups = {
-        group: {name: node for name, node in options.items() if name in named} or options
-        for group, options in request.groups.items()
-    }
-    register(request._replace(groups=groups))  # all of them take a second
+    register(request)
     with hydra.initialize(version_base="1.3", config_path=None):
         config = hydra.compose("train", overrides=request.argv)
     return settle(OmegaConf.to_container(config, resolve=True), envs, algos)  # type: ignore[arg-type]

@@ -228,12 +228,20 @@ def throughput_table() -> str:
 
 
 def engine_jax() -> str:
-    """Environment steps a second of MJX on its own, beside the other engines."""
-    lines = ["| | device | environments | steps/s | compiled in, s |", "|---|---|---:|---:|---:|"]
-    rows = [r for r in benchmark_rows("benchmark_h200.jsonl") if r.get("engine") == "jax"]
-    for (env, size), r in sorted(latest(rows, "env", "num_envs").items()):
-        cells = f"{size:,} | {r['env_steps_per_s']:,.0f} | {r['compile_s']:.0f}"
-        lines.append(f"| {env} | {r['device']} | {cells} |")
+    """Environment steps a second of engine jax, with MJX's solver and with ours."""
+    lines = [
+        "| | device | environments | MJX's solver | ours | compiled in, s |",
+        "|---|---|---:|---:|---:|---:|",
+    ]
+    files = ("benchmark_h200.jsonl", "benchmark_cpu.jsonl")
+    rows = [r for file in files for r in benchmark_rows(file) if r.get("engine") == "jax"]
+    key = ("env", "device", "num_envs")
+    theirs = latest([r for r in rows if r["solver"].startswith("MJX")], *key)
+    for (env, device, size), r in sorted(latest(rows, *key).items()):
+        before = theirs.get((env, device, size))
+        shown = f"{before['env_steps_per_s']:,.0f}" if before else ""
+        cells = f"{size:,} | {shown} | {r['env_steps_per_s']:,.0f} | {r['compile_s']:.0f}"
+        lines.append(f"| {env} | {device} | {cells} |")
     return "\n".join(lines)
 
 
@@ -321,7 +329,8 @@ def throughput(path: Path) -> None:
     for file, style in (("benchmark_h200.jsonl", "o-"), ("benchmark_cpu.jsonl", "s--")):
         found: dict[str, dict[int, float]] = {}
         for row in benchmark_rows(file):
-            if row["algo"] is None and ("peer" in row or "cpu" in file or whole_sweep(row)):
+            whole = "peer" in row or ("cpu" in file and row["engine"] == "c") or whole_sweep(row)
+            if row["algo"] is None and whole:
                 what = f"{row['peer']}: {row['env']}" if "peer" in row else row["env"]
                 points = found.setdefault(what, {})
                 points[row["num_envs"]] = row["env_steps_per_s"]  # the last, if measured again
