@@ -17,6 +17,7 @@ from mujoco import mjx
 from mujoco.mjx._src import collision_driver, collision_primitive, forward, math, sensor
 from mujoco.mjx._src.types import GeomType
 
+from jaxsafe.config import ConfigError
 from jaxsafe.envs.physics import STATE, Physics, Readings, Run, mocap_at
 from jaxsafe.envs.scene import Scene
 from jaxsafe.envs.solver_jax import solve
@@ -24,6 +25,10 @@ from jaxsafe.envs.solver_jax import solve
 collider: Any = collision_primitive.collider  # (pose and size of each) -> contacts, for MJX
 State = dict[str, jax.Array]  # of a world between two substeps
 Collision = tuple[jax.Array, jax.Array, jax.Array]  # distance (m), position [3], frame [3, 3]
+INTEGRATORS = {
+    mujoco.mjtIntegrator.mjINT_EULER: forward.euler,
+    mujoco.mjtIntegrator.mjINT_IMPLICITFAST: forward.implicit,
+}
 FLAT = 0.02  # rad between normal and side (or end) within which it lies flat
 PROJECTIONS = 8  # between cylinder and box, towards their closest points
 HALVINGS = 24  # of a capsule's axis
@@ -346,6 +351,13 @@ def forward_pass(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 def jax_engine(scene: Scene, max_substeps: int, outputs: tuple[str, ...]) -> Run:
+    option = scene.model.opt
+    integrate = INTEGRATORS.get(option.integrator)
+    if integrate is None or option.cone != mujoco.mjtCone.mjCONE_PYRAMIDAL or scene.model.na:
+        raise ConfigError(
+            "env.engine='jax': expected a robot with integrator Euler or implicitfast, pyramidal "
+            "friction cones and motors without state; engines c and warp take others"
+        )
     with jax.ensure_compile_time_eval():
         model = mjx.put_model(scene.model, impl="jax")
         template = mjx.make_data(scene.model, impl="jax")
@@ -378,10 +390,11 @@ def jax_engine(scene: Scene, max_substeps: int, outputs: tuple[str, ...]) -> Run
             if not scene.orbit.any():
                 return data
             time = (physics.substeps + k) * timestep
-            return data.replace(mocap_pos=mocap_at(base, scene.orbit, time, jnp))
+            moved = mocap_at(base, scene.orbit, time, jnp)
+            return data.replace(mocap_pos=jnp.where(substeps > 0, moved, base))
 
         def substep(state: State, k: jax.Array) -> tuple[State, None]:
-            moved = forward.euler(model, forward_pass(model, after(state, k)))
+            moved = integrate(model, forward_pass(model, after(state, k)))
             return {f: jnp.where(k < substeps, getattr(moved, f), state[f]) for f in STATE}, None
 
         state: State = dict(zip(STATE, (physics.qpos, physics.qvel, physics.warmstart), strict=True))

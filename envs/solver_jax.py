@@ -4,7 +4,8 @@
 
 x: accelerations, x0: those without constraints, s_r: the cost of row r, convex and quadratic in pieces.
 An iteration solves H d = -g with the gradient g and the Hessian H = M + J' diag(s'') J, and goes along
-d to where the slope vanishes. It ends where g' H^-1 g, what the next one would gain, is small.
+d to where the slope vanishes. It ends where g' H^-1 g is small: what the step has gained or, if it
+stayed on a piece of the cost, what the next one would gain.
 
 The force -s_r' is that of a spring, cut off at its bounds: none of an equality, the loss of dry
 friction, 0 of what only pushes. MJX's own solver evaluates 150 points on every line, however soon it is
@@ -50,6 +51,7 @@ class Rows(NamedTuple):
     tolerance: float
     ls_tolerance: float
     iterations: int
+    trials: int  # of a step along a line
 
     def pull(self, D: jax.Array, residual: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Forces -s' and curvatures s''."""
@@ -90,7 +92,10 @@ def rows(model: mjx.Model, data: mjx.Data) -> Rows:
     most[equal:pushes] = losses[losses > 0][: impl.nf]
     least[:pushes] = -most[:pushes]
     opt = model.opt
-    return Rows(least, most, float(opt.tolerance), float(opt.ls_tolerance), opt.iterations)
+    # where a linear piece ends the slope jumps, and only halving finds that
+    trials = opt.ls_iterations if impl.nf else TRIALS
+    tolerances = float(opt.tolerance), float(opt.ls_tolerance)
+    return Rows(least, most, *tolerances, opt.iterations, int(trials))
 
 
 @jax.default_matmul_precision("highest")
@@ -127,11 +132,15 @@ def improve(rows: Rows, problem: Problem, at: Point) -> Point:
     force, curvature = rows.pull(problem.D, residual)
     gradient = inertial - J.T @ force
     # on one piece of the cost the gradient is now 1 - alpha of what it was; else there is more to gain
-    left = jnp.where((curvature == at.curvature).all(), (1 - alpha) ** 2, 1.0)
+    # (both linear pieces of dry friction have no curvature)
+    same = (curvature == at.curvature) & ((curvature > 0) | (force == at.force))
+    left = jnp.where(same.all(), (1 - alpha) ** 2, 1.0)
     gain = -at.gradient.dot(d) / (2 * jnp.trace(M)) * left
     count = at.iterations + 1
     done = ~(gain >= rows.tolerance) | (alpha < ROUNDING) | (count >= rows.iterations)  # also NaN
     after = Point(at.x + alpha * d, inertial, residual, force, curvature, gradient, count, done)
+    lost = (at.iterations > 0) & ~jnp.isfinite(d).all()  # then the last point is as good as it gets
+    at = at._replace(done=at.done | lost)
     return jax.tree.map(lambda old, new: jnp.where(at.done, old, new), at, after)
 
 
@@ -142,7 +151,7 @@ def step(
     rise0, bent0 = d.dot(at.inertial), d.dot(Md)
     flat = rows.tolerance * rows.ls_tolerance * jnp.linalg.norm(d) * jnp.trace(problem.M)
     low, high, alpha, found = jnp.zeros(()), jnp.array(jnp.inf), jnp.ones(()), jnp.bool(False)
-    for _ in range(TRIALS):
+    for _ in range(rows.trials):
         force, curvature = rows.pull(problem.D, at.residual + alpha * slope)
         rise = rise0 + alpha * bent0 - force.dot(slope)
         bent = bent0 + curvature.dot(slope**2)

@@ -160,6 +160,13 @@ def test_published_settings_are_defaults_that_the_command_line_overrides():
     assert request.groups["algo"]["cpo"].items() >= setting.items()
 
 
+def test_every_chosen_name_has_its_options_and_no_other():
+    texts = ["-m", "env=car_push1,Safexp-PointGoal1-v0", "algo=cpo,trpo"]
+    groups = command.read_arguments(texts, envs, algos).groups
+    chosen = {group: {name for name, options in g.items() if options} for group, g in groups.items()}
+    assert chosen == {"env": {"car_push1", "point_goal1"}, "algo": {"cpo", "trpo"}}
+
+
 def test_the_conventions_of_omnisafe_are_defaults_of_either_preset():
     for preset in ("fast", "published"):
         texts = [f"preset={preset}", "compat=omnisafe", "algo=cpo", "algo.margin_lr=0.1"]

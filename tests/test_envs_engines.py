@@ -368,6 +368,34 @@ def test_jax_solves_contacts_as_c_does():
         start = after
 
 
+@pytest.mark.parametrize("option", ['cone="elliptic"', 'integrator="RK4"'])
+def test_the_jax_engine_refuses_what_it_cannot_solve(option, tmp_path):
+    text = (Path(scene.__file__).parent / "assets" / "point.xml").read_text()
+    robot = tmp_path / "mine.xml"
+    robot.write_text(text.replace("<option ", f"<option {option} "))
+    assert option in robot.read_text()
+    with pytest.raises(ConfigError, match="integrator Euler or implicitfast, pyramidal"):
+        envs.make("point_goal0", engine="jax", robot_base=str(robot))
+
+
+def test_dry_friction_that_turns_round_is_not_taken_for_one_piece_of_the_cost():
+    """A stiff equality draws one degree of freedom; the other, held by dry friction, stays."""
+    from jaxsafe.envs import solver_jax
+
+    least, most = np.array([-np.inf, -1e-4]), np.array([np.inf, 1e-4])
+    bounds = solver_jax.Rows(least, most, 1e-8, 0.01, iterations=100, trials=50)
+    problem = solver_jax.Problem(
+        J=jnp.eye(2),
+        D=jnp.array([1e4, 1e4]),
+        aref=jnp.array([1000.0, 0]),
+        M=jnp.diag(jnp.array([1.0, 1e-3])),
+        smooth=jnp.zeros(2),
+        guess=jnp.array([0.0, 0.05]),
+    )
+    x, _ = solver_jax.minimise(bounds, jax.tree.map(lambda x: x[None], problem))
+    np.testing.assert_allclose(x[0], [1000 * 1e4 / (1e4 + 1), 0], rtol=1e-5, atol=1e-6)
+
+
 def test_jax_solves_equalities_dry_friction_limits_and_contacts_as_c_does():
     """A chain of two hinges with all of these, its end tied to a cube that lies on the floor."""
     from jaxsafe.envs import physics_jax
