@@ -30,7 +30,7 @@ from jaxsafe.algos import (
     trpo_saute,
     trpo_simmer_pid,
 )
-from jaxsafe.on_policy import Algorithm
+from jaxsafe.learn.on_policy import Algorithm
 
 
 class Entry(NamedTuple):

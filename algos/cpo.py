@@ -41,15 +41,15 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from jaxsafe.algos import trpo
-from jaxsafe.batch import all_finite, pmean
 from jaxsafe.config import config
-from jaxsafe.constraints import LimitsConfig, limit, named
-from jaxsafe.halfspaces import dot, furthest_point
-from jaxsafe.networks import policy
-from jaxsafe.on_policy import Algorithm, on_policy_pair
-from jaxsafe.steps import Objective, Step, own_trunk
-from jaxsafe.surrogates import plain
-from jaxsafe.trust_region import conjugate_gradient, distance, fisher_product, line_search
+from jaxsafe.learn.batch import all_finite, pmean
+from jaxsafe.learn.constraints import LimitsConfig, limit, named
+from jaxsafe.learn.halfspaces import dot, furthest_point
+from jaxsafe.learn.on_policy import Algorithm, on_policy_pair
+from jaxsafe.learn.steps import Objective, Step, own_trunk
+from jaxsafe.learn.surrogates import plain
+from jaxsafe.learn.trust_region import conjugate_gradient, distance, fisher_product, line_search
+from jaxsafe.nn.networks import policy
 from jaxsafe.types import Env, Metrics, PyTree
 
 

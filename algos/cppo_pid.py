@@ -13,10 +13,10 @@ from typing import Any
 
 from jaxsafe.algos import ppo
 from jaxsafe.config import config
-from jaxsafe.on_policy import Algorithm, on_policy
-from jaxsafe.steps import adam_epochs
-from jaxsafe.surrogates import clipped
-from jaxsafe.treatments import PIDConfig, pid
+from jaxsafe.learn.on_policy import Algorithm, on_policy
+from jaxsafe.learn.steps import adam_epochs
+from jaxsafe.learn.surrogates import clipped
+from jaxsafe.learn.treatments import PIDConfig, pid
 from jaxsafe.types import Env
 
 

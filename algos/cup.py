@@ -21,13 +21,13 @@ import jax.numpy as jnp
 
 from jaxsafe.algos import ppo
 from jaxsafe.config import config
-from jaxsafe.constraints import each, named
-from jaxsafe.gaussian import kl
-from jaxsafe.networks import policy
-from jaxsafe.on_policy import Algorithm, Batch, TrainState, loop
-from jaxsafe.steps import AdamState, adam_epochs
-from jaxsafe.surrogates import clipped, plain, with_entropy
-from jaxsafe.treatments import LagrangianConfig, lagrangian
+from jaxsafe.learn.constraints import each, named
+from jaxsafe.learn.on_policy import Algorithm, Batch, TrainState, loop
+from jaxsafe.learn.steps import AdamState, adam_epochs
+from jaxsafe.learn.surrogates import clipped, plain, with_entropy
+from jaxsafe.learn.treatments import LagrangianConfig, lagrangian
+from jaxsafe.nn.gaussian import kl
+from jaxsafe.nn.networks import policy
 from jaxsafe.types import Env, Metrics, PyTree
 
 

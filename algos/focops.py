@@ -15,10 +15,10 @@ from typing import Any
 
 from jaxsafe.algos import pg
 from jaxsafe.config import config
-from jaxsafe.on_policy import Algorithm, on_policy
-from jaxsafe.steps import adam_epochs
-from jaxsafe.surrogates import near_old
-from jaxsafe.treatments import LagrangianConfig, lagrangian
+from jaxsafe.learn.on_policy import Algorithm, on_policy
+from jaxsafe.learn.steps import adam_epochs
+from jaxsafe.learn.surrogates import near_old
+from jaxsafe.learn.treatments import LagrangianConfig, lagrangian
 from jaxsafe.types import Env
 
 

@@ -17,12 +17,12 @@ import jax
 import jax.numpy as jnp
 
 from jaxsafe.algos import ppo
-from jaxsafe.batch import pmean
 from jaxsafe.config import config
-from jaxsafe.gaussian import Gaussian
-from jaxsafe.on_policy import Algorithm, on_policy_pair
-from jaxsafe.steps import Objective, Step, adam_epochs
-from jaxsafe.surrogates import clipped, pessimistic, plain
+from jaxsafe.learn.batch import pmean
+from jaxsafe.learn.on_policy import Algorithm, on_policy_pair
+from jaxsafe.learn.steps import Objective, Step, adam_epochs
+from jaxsafe.learn.surrogates import clipped, pessimistic, plain
+from jaxsafe.nn.gaussian import Gaussian
 from jaxsafe.types import Env, Metrics, PyTree
 
 

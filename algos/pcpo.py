@@ -18,10 +18,10 @@ import jax.numpy as jnp
 
 from jaxsafe.algos import cpo
 from jaxsafe.config import config
-from jaxsafe.constraints import named
-from jaxsafe.halfspaces import dot, nearest_point
-from jaxsafe.on_policy import Algorithm, on_policy_pair
-from jaxsafe.surrogates import plain
+from jaxsafe.learn.constraints import named
+from jaxsafe.learn.halfspaces import dot, nearest_point
+from jaxsafe.learn.on_policy import Algorithm, on_policy_pair
+from jaxsafe.learn.surrogates import plain
 from jaxsafe.types import Env
 
 

@@ -11,10 +11,10 @@ KL(old || new) > target_kl.
 from typing import Any
 
 from jaxsafe.config import config
-from jaxsafe.on_policy import OMNISAFE, Algorithm, OnPolicyConfig, on_policy
-from jaxsafe.steps import adam_epochs
-from jaxsafe.surrogates import plain
-from jaxsafe.treatments import none
+from jaxsafe.learn.on_policy import OMNISAFE, Algorithm, OnPolicyConfig, on_policy
+from jaxsafe.learn.steps import adam_epochs
+from jaxsafe.learn.surrogates import plain
+from jaxsafe.learn.treatments import none
 from jaxsafe.types import Env
 
 

@@ -9,10 +9,10 @@ from typing import Any
 
 from jaxsafe.algos import ppo
 from jaxsafe.config import config
-from jaxsafe.on_policy import Algorithm, on_policy
-from jaxsafe.steps import adam_epochs
-from jaxsafe.surrogates import clipped
-from jaxsafe.treatments import penalty
+from jaxsafe.learn.on_policy import Algorithm, on_policy
+from jaxsafe.learn.steps import adam_epochs
+from jaxsafe.learn.surrogates import clipped
+from jaxsafe.learn.treatments import penalty
 from jaxsafe.types import Env
 
 

@@ -16,12 +16,12 @@ A cost critic is trained for its metrics alone.
 from typing import Any
 
 from jaxsafe.algos import ppo
-from jaxsafe.augment import SauteConfig, saute
 from jaxsafe.config import config
-from jaxsafe.on_policy import Algorithm, on_policy
-from jaxsafe.steps import adam_epochs
-from jaxsafe.surrogates import clipped
-from jaxsafe.treatments import none
+from jaxsafe.learn.augment import SauteConfig, saute
+from jaxsafe.learn.on_policy import Algorithm, on_policy
+from jaxsafe.learn.steps import adam_epochs
+from jaxsafe.learn.surrogates import clipped
+from jaxsafe.learn.treatments import none
 from jaxsafe.types import Env
 
 

@@ -18,11 +18,11 @@ z = 1, the share of B (`simmer_full`).
 from typing import Any
 
 from jaxsafe.algos import ppo
-from jaxsafe.augment import OMNISAFE_SIMMER, SimmerConfig, schedule, simmer
 from jaxsafe.config import config
-from jaxsafe.on_policy import Algorithm, on_policy
-from jaxsafe.steps import adam_epochs
-from jaxsafe.surrogates import clipped
+from jaxsafe.learn.augment import OMNISAFE_SIMMER, SimmerConfig, schedule, simmer
+from jaxsafe.learn.on_policy import Algorithm, on_policy
+from jaxsafe.learn.steps import adam_epochs
+from jaxsafe.learn.surrogates import clipped
 from jaxsafe.types import Env
 
 

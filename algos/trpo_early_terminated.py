@@ -10,12 +10,12 @@ Differs from it as early-terminated PPO does; evaluation runs whole episodes the
 from typing import Any
 
 from jaxsafe.algos import trpo
-from jaxsafe.augment import EarlyConfig, early
 from jaxsafe.config import config
-from jaxsafe.on_policy import Algorithm, on_policy
-from jaxsafe.surrogates import plain
-from jaxsafe.treatments import none
-from jaxsafe.trust_region import trust_region
+from jaxsafe.learn.augment import EarlyConfig, early
+from jaxsafe.learn.on_policy import Algorithm, on_policy
+from jaxsafe.learn.surrogates import plain
+from jaxsafe.learn.treatments import none
+from jaxsafe.learn.trust_region import trust_region
 from jaxsafe.types import Env
 
 

@@ -11,10 +11,10 @@ from typing import Any
 
 from jaxsafe.algos import trpo
 from jaxsafe.config import config
-from jaxsafe.on_policy import Algorithm, on_policy
-from jaxsafe.surrogates import plain
-from jaxsafe.treatments import PIDConfig, pid
-from jaxsafe.trust_region import trust_region
+from jaxsafe.learn.on_policy import Algorithm, on_policy
+from jaxsafe.learn.surrogates import plain
+from jaxsafe.learn.treatments import PIDConfig, pid
+from jaxsafe.learn.trust_region import trust_region
 from jaxsafe.types import Env
 
 

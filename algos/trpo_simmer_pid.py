@@ -12,11 +12,11 @@ from typing import Any
 
 from jaxsafe.algos import trpo
 from jaxsafe.algos.ppo_simmer_pid import SIMMER
-from jaxsafe.augment import SimmerConfig, schedule, simmer
 from jaxsafe.config import config
-from jaxsafe.on_policy import Algorithm, on_policy
-from jaxsafe.surrogates import plain
-from jaxsafe.trust_region import trust_region
+from jaxsafe.learn.augment import SimmerConfig, schedule, simmer
+from jaxsafe.learn.on_policy import Algorithm, on_policy
+from jaxsafe.learn.surrogates import plain
+from jaxsafe.learn.trust_region import trust_region
 from jaxsafe.types import Env
 
 

@@ -15,10 +15,11 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from jaxsafe import algos, command, compat, run_folder
+from jaxsafe import algos
 from jaxsafe.algos import ALGOS, Entry
 from jaxsafe.config import from_dict
 from jaxsafe.envs import ENVS
+from jaxsafe.run import command, compat, run_folder
 
 HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE), str(HERE / "results")]

@@ -7,10 +7,10 @@ import functools
 from collections.abc import Mapping
 from pathlib import Path
 
-from jaxsafe import compat
 from jaxsafe.algos import ALGOS
 from jaxsafe.envs import ENVS, SafetyGym, make
-from jaxsafe.migrate import ALGORITHMS, OMNISAFE
+from jaxsafe.interop.migrate import ALGORITHMS, OMNISAFE
+from jaxsafe.run import compat
 
 HERE = Path(__file__).parent
 ROBOTS = ("point", "car", "doggo")

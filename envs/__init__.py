@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from jaxsafe.config import ConfigError, convert, nearest
-from jaxsafe.env_check import check_env
-from jaxsafe.envs import layout, suite
-from jaxsafe.envs.config import SafetyGymConfig, defaults, read
-from jaxsafe.envs.safety_gym import SafetyGym
+from jaxsafe.envs.check import check_env
+from jaxsafe.envs.safety_gym import layout, suite
+from jaxsafe.envs.safety_gym.config import SafetyGymConfig, defaults, read
+from jaxsafe.envs.safety_gym.task import SafetyGym
 from jaxsafe.types import Env
 
 # name -> options that differ from Safety Gym's defaults, or what makes an environment of another kind

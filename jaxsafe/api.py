@@ -23,13 +23,15 @@ import numpy as np
 from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
-from jaxsafe import algos, command, compare, distributed, envs, run_folder, runner, sweeps
+from jaxsafe import algos, envs
 from jaxsafe.config import ConfigError, flat, nearest
-from jaxsafe.env_check import check_env
 from jaxsafe.envs import SafetyGym, SafetyGymConfig
-from jaxsafe.envs.physics import default_engine
-from jaxsafe.on_policy import Algorithm
-from jaxsafe.progress import Report
+from jaxsafe.envs.check import check_env
+from jaxsafe.envs.engines.physics import default_engine
+from jaxsafe.learn.on_policy import Algorithm
+from jaxsafe.report import compare
+from jaxsafe.run import command, distributed, run_folder, runner, sweeps
+from jaxsafe.run.progress import Report
 from jaxsafe.types import Env, PyTree
 
 __all__ = ["ConfigError", "Run", "SweepResult", "evaluate", "make", "render", "sweep", "train"]

@@ -21,10 +21,11 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
-from jaxsafe import algos, envs, run_folder, runner
+from jaxsafe import algos, envs
 from jaxsafe.config import ConfigError
-from jaxsafe.rollout import collect, init_rollout
-from jaxsafe.runner import device_name, use_compilation_cache
+from jaxsafe.learn.rollout import collect, init_rollout
+from jaxsafe.run import run_folder, runner
+from jaxsafe.run.runner import device_name, use_compilation_cache
 
 
 def timed(fn, *args, before: int, repeats: int) -> tuple[float, list[float]]:

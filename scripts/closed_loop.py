@@ -19,7 +19,7 @@ from benchmark import versions
 
 from jaxsafe import envs
 from jaxsafe.config import ConfigError
-from jaxsafe.rollout import collect, init_rollout
+from jaxsafe.learn.rollout import collect, init_rollout
 
 TURN, NOISE = 4.0, 0.3  # action per radian, and its standard deviation
 

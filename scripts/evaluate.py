@@ -3,7 +3,7 @@
 import sys
 
 from jaxsafe import algos, envs
-from jaxsafe.command import evaluate_main
+from jaxsafe.run.command import evaluate_main
 
 if __name__ == "__main__":
     sys.exit(evaluate_main(envs, algos))

@@ -3,7 +3,7 @@
 import sys
 
 from jaxsafe import algos, envs
-from jaxsafe.migrate import main
+from jaxsafe.interop.migrate import main
 
 if __name__ == "__main__":
     sys.exit(main(envs, algos))

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from jaxsafe.config import ConfigError
-from jaxsafe.envs.recording import Comparison, Recording, compare
+from jaxsafe.envs.safety_gym.recording import Comparison, Recording, compare
 
 FORCES = ("accelerometer", "touch")
 BODIES = ("robot pose", "robot velocity", "object pose", "object velocity", "reward")

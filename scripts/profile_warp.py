@@ -21,9 +21,9 @@ import numpy as np
 
 from jaxsafe import envs
 from jaxsafe.config import ConfigError
-from jaxsafe.envs import scene as scenes
-from jaxsafe.envs import sleeping
-from jaxsafe.envs.physics import contact_budget
+from jaxsafe.envs.engines.physics import contact_budget
+from jaxsafe.envs.safety_gym import scene as scenes
+from jaxsafe.envs.safety_gym import sleeping
 
 VARIANTS = {  # name -> options of the model, factors on the room for contacts and for rows
     "as it is": ({}, 1.0, 1.0),
@@ -74,7 +74,7 @@ def main() -> int:
     import warp as wp
     from mujoco.mjx.third_party import mujoco_warp
 
-    from jaxsafe.envs import dynamics_warp
+    from jaxsafe.envs.engines import dynamics_warp
 
     worlds = args.num_envs
     small = scenes.build(sleeping.small_config(env.config, sleeping.awake(env.config, "warp")))

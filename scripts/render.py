@@ -3,7 +3,7 @@
 import sys
 
 from jaxsafe import algos, envs
-from jaxsafe.viewing import render_main
+from jaxsafe.run.viewing import render_main
 
 if __name__ == "__main__":
     sys.exit(render_main(envs, algos))

@@ -3,7 +3,7 @@
 import sys
 
 from jaxsafe import algos, envs
-from jaxsafe.sweeps import main
+from jaxsafe.run.sweeps import main
 
 if __name__ == "__main__":
     sys.exit(main(envs, algos))

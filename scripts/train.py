@@ -3,7 +3,7 @@
 import sys
 
 from jaxsafe import algos, envs
-from jaxsafe.command import train_main
+from jaxsafe.run.command import train_main
 
 if __name__ == "__main__":
     sys.exit(train_main(envs, algos))

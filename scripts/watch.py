@@ -3,7 +3,7 @@
 import sys
 
 from jaxsafe import algos, envs
-from jaxsafe.viewing import watch_main
+from jaxsafe.run.viewing import watch_main
 
 if __name__ == "__main__":
     sys.exit(watch_main(envs, algos))

@@ -3,7 +3,7 @@ from collections.abc import Iterator
 import jax
 import pytest
 
-from jaxsafe.envs import render
+from jaxsafe.envs.view import render
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -13,7 +13,7 @@ def forgotten_programs(request: pytest.FixtureRequest) -> Iterator[None]:
     A process that keeps some thousands of them runs out of memory maps, and XLA crashes.
     """
     yield
-    if not request.module.__name__.startswith("test_envs"):
+    if request.path.parent.name != "envs":
         jax.clear_caches()
 
 

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 from toys import Corridor
 
 from jaxsafe import algos
-from jaxsafe.command import train_main
+from jaxsafe.run.command import train_main
 
 
 @dataclasses.dataclass(frozen=True)

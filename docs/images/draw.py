@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 
 from jaxsafe import envs
-from jaxsafe.envs import render
-from jaxsafe.envs.suite import ROBOTS, TASKS
+from jaxsafe.envs.safety_gym.suite import ROBOTS, TASKS
+from jaxsafe.envs.view import render
 
 HERE = Path(__file__).parent
 SCENES = {  # name: seed, steps into the episode, where the camera looks (m), its distance (m)

@@ -18,7 +18,9 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 
-from jaxsafe import algos, compare, envs, plots, run_folder, scores, stats, tables
+from jaxsafe import algos, envs
+from jaxsafe.report import compare, plots, scores, stats, tables
+from jaxsafe.run import run_folder
 
 HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE), str(HERE.parent)]

@@ -1,0 +1,74 @@
+"""Whether an environment that someone else wrote is an `Env` that learners can use."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxsafe.config import ConfigError
+from jaxsafe.types import Env, State
+
+SIZES = ("obs_size", "action_size", "episode_length")
+MEMBERS = (*SIZES, "cost_names", "reset", "step")
+
+
+def check_env(env: Any, name: str) -> Env:
+    """`env` itself. Shapes and types are traced, nothing is simulated.
+
+    Args:
+        env: what should be an `Env`.
+        name: what to call it in messages.
+    Raises:
+        ConfigError: something is missing, has another shape, or changes its type from reset to step.
+    """
+    missing = [member for member in MEMBERS if getattr(env, member, None) is None]
+    if missing:
+        raise ConfigError(
+            f"{name} ({type(env).__name__}) is no Env of jaxsafe.types: it lacks {', '.join(missing)}; "
+            "an environment of Brax or Playground goes through jaxsafe.interop.brax.from_brax"
+        )
+    for member in SIZES:
+        size = getattr(env, member)
+        if not isinstance(size, int) or size < 1:
+            raise ConfigError(f"{name}: {member} is {size!r}, expected a whole number above 0")
+    if isinstance(env.cost_names, str):
+        raise ConfigError(f"{name}: cost_names is {env.cost_names!r}, expected a tuple of names")
+    first = jax.eval_shape(env.reset, jax.random.key(0))
+    check_state(first, env, f"{name}.reset")
+    action = jax.ShapeDtypeStruct((env.action_size,), jnp.float32)
+    after = jax.eval_shape(env.step, first, action)
+    check_state(after, env, f"{name}.step")
+    old, new = (dict(jax.tree_util.tree_leaves_with_path(x)) for x in (first, after))
+    for path in dict.fromkeys([*old, *new]):
+        if (was := form(old.get(path))) != (now := form(new.get(path))):
+            where = jax.tree_util.keystr(path)
+            raise ConfigError(f"{name}: state{where} is {was} after reset but {now} after step")
+    return env
+
+
+def check_state(state: Any, env: Env, where: str) -> None:
+    if not isinstance(state, State):
+        raise ConfigError(f"{where} gives a {type(state).__name__}, expected jaxsafe.types.State")
+    scalar = jax.ShapeDtypeStruct((), jnp.float32)
+    expected = {
+        "obs": jax.ShapeDtypeStruct((env.obs_size,), jnp.float32),
+        "reward": scalar,
+        "cost": scalar,
+        "costs": jax.ShapeDtypeStruct((len(env.cost_names),), jnp.float32),
+        "terminated": jax.ShapeDtypeStruct((), jnp.bool_),
+        **{f"info[{name!r}]": scalar for name in state.info},
+    }
+    found = {field: getattr(state, field) for field in expected if not field.startswith("info")}
+    found |= {f"info[{name!r}]": x for name, x in state.info.items()}
+    for field, like in expected.items():
+        if form(found[field]) != form(like):
+            raise ConfigError(f"{where}: {field} is {form(found[field])}, expected {form(like)}")
+
+
+def form(x: Any) -> str:
+    """'float32[3]': type and shape of a traced leaf."""
+    if x is None:
+        return "nothing"
+    if not isinstance(x, jax.ShapeDtypeStruct):
+        return type(x).__name__
+    return f"{x.dtype}{list(x.shape)}"

@@ -1,0 +1,1 @@
+"""Physics engines: MuJoCo models in, batched steps out."""

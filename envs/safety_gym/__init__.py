@@ -1,0 +1,1 @@
+"""Safety Gym's tasks."""

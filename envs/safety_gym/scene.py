@@ -1,0 +1,328 @@
+"""The MuJoCo model of a task, shared by all its layouts, and where things are in it.
+
+Only what can push is physics. Hazards, goals and circles never collide, so they are arrays; the
+robot, vases, gremlins and the box are bodies; pillars, walls and buttons are mocap bodies, so that
+one compiled model serves every layout. `drawn=True` adds light, cameras and colours for the renderer,
+which draws the arrays over it.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from jaxsafe.config import ConfigError, nearest
+from jaxsafe.envs.safety_gym.config import SafetyGymConfig
+
+ASSETS = Path(__file__).parent / "assets"
+OBJECT = {"condim": 6, "friction": (1.0, 0.005, 0.0001)}
+RGBA = {
+    "goal": (0, 1, 0, 0.25),
+    "hazard": (0, 0, 1, 0.25),
+    "vase": (0, 1, 1, 1),
+    "pillar": (0.5, 0.5, 1, 1),
+    "wall": (0.5, 0.5, 0.5, 1),
+    "gremlin": (0.5, 0, 1, 1),
+    "button": (1, 0.5, 0, 1),
+    "box": (1, 1, 0, 1),
+    "circle": (0, 1, 0, 0.1),
+}
+ROBOT = (0.9, 0.15, 0.15, 1)  # where its file gives no colour
+GROUP = {
+    "goal": 0,
+    "box": 1,
+    "button": 1,
+    "wall": 2,
+    "pillar": 2,
+    "hazard": 3,
+    "vase": 4,
+    "gremlin": 5,
+    "circle": 6,
+}
+MOCAPS = ("gremlins", "pillars", "walls", "buttons")  # in the order of their mocap ids
+MJX_LIMITS = {"max_geom_pairs": 16, "max_contact_points": 48}  # nearest pairs a type, deepest contacts
+FREES = ("vases", "gremlins", "box")  # in the order of their free joints
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A compiled task. Counts are those of the config; addresses index the model's arrays."""
+
+    model: mujoco.MjModel
+    planar: bool  # the robot slides and turns (Point), else it has a free joint
+    robot_height: float  # of body `robot` at the start, m
+    robot_nq: int
+    robot_nv: int
+    frees: dict[str, int]  # kind -> number of free bodies
+    mocaps: dict[str, int]  # kind -> number of mocap bodies
+    orbit: np.ndarray  # [nmocap] radius of each mocap body's circle; 0 for those at rest
+    watched: dict[str, list[str]]  # kind -> bodies whose contacts with the robot are counted
+
+    @property
+    def contact_count(self) -> int:
+        return sum(map(len, self.watched.values()))
+
+    def contact_slice(self, kind: str) -> slice:
+        kinds = list(self.watched)
+        start = sum(len(self.watched[k]) for k in kinds[: kinds.index(kind)])
+        return slice(start, start + len(self.watched[kind]))
+
+    def qpos_slice(self, kind: str) -> slice:
+        start = self.robot_nq + 7 * sum(self.frees[k] for k in FREES[: FREES.index(kind)])
+        return slice(start, start + 7 * self.frees[kind])
+
+    def qvel_slice(self, kind: str) -> slice:
+        start = self.robot_nv + 6 * sum(self.frees[k] for k in FREES[: FREES.index(kind)])
+        return slice(start, start + 6 * self.frees[kind])
+
+    def mocap_slice(self, kind: str) -> slice:
+        start = sum(self.mocaps[k] for k in MOCAPS[: MOCAPS.index(kind)])
+        return slice(start, start + self.mocaps[kind])
+
+
+def robot_file(base: str) -> Path:
+    """The MJCF file of a robot: point, car, doggo (also as the original's xmls/car.xml) or a path."""
+    name = base.removeprefix("xmls/").removesuffix(".xml")
+    if (ASSETS / f"{name}.xml").exists():
+        return ASSETS / f"{name}.xml"
+    if base.endswith(".xml") and Path(base).is_file():
+        return Path(base)
+    robots = [path.stem for path in ASSETS.glob("*.xml")]
+    raise ConfigError(f"env.robot_base={base!r}: no such robot{nearest(name, robots)}")
+
+
+def build(cfg: SafetyGymConfig, mjx: bool = False, drawn: bool = False) -> Scene:
+    """Compile the scene of `cfg`.
+
+    Args:
+        mjx: for MJX in JAX, which has no contact sensors, collides a capsule better than a cylinder
+            (pillars become capsules, with caps out of reach), would let what is fixed meet what is
+            fixed, and has room for `MJX_LIMITS` only.
+        drawn: add what only rendering needs (light, cameras, colours, the gremlins' guides).
+    Raises:
+        ConfigError: an unknown robot, sensor or body.
+    """
+    path = robot_file(cfg.robot_base)
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+        robot = spec.compile()
+    except ValueError as error:
+        raise ConfigError(f"env.robot_base={cfg.robot_base!r}: {str(error).splitlines()[0]}") from error
+    body = spec.body("robot")
+    if body is None or not any(site.name == "robot" for site in spec.sites):
+        raise ConfigError(f"env.robot_base={cfg.robot_base!r}: it has no body and site named 'robot'")
+    planar = robot.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE
+    check_names(cfg, robot)
+
+    world = spec.worldbody
+    half = max(map(abs, cfg.placements_extents)) + 0.1 if cfg.floor_display_mode else 3.5
+    fixed = OBJECT | ({"contype": 0} if mjx else {})
+    floor = world.add_geom(
+        name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(half, half, 0.1), **fixed
+    )
+    if drawn:
+        decorate(spec, floor)
+    frees = {
+        "vases": cfg.vases_num,
+        "gremlins": cfg.gremlins_num,
+        "box": int(cfg.task == "push"),
+    }
+    mocaps = {
+        "gremlins": cfg.gremlins_num,
+        "pillars": cfg.pillars_num,
+        "walls": cfg.walls_num,
+        "buttons": cfg.buttons_num,
+    }
+    for i in range(cfg.vases_num):
+        add_cube(spec, f"vase{i}", "vase", cfg.vases_size, cfg.vases_density)
+    for i in range(cfg.gremlins_num):
+        add_cube(spec, f"gremlin{i}obj", "gremlin", cfg.gremlins_size, cfg.gremlins_density)
+    if cfg.task == "push":
+        add_box(spec, cfg)
+    for i in range(cfg.gremlins_num):
+        add_gremlin_guide(spec, i, cfg.gremlins_size if drawn else None)
+    for i in range(cfg.pillars_num):
+        size = (cfg.pillars_size, cfg.pillars_height, 0)
+        shape = mujoco.mjtGeom.mjGEOM_CAPSULE if mjx else mujoco.mjtGeom.mjGEOM_CYLINDER
+        add_fixed(spec, f"pillar{i}", "pillar", fixed, shape, size)
+    for i in range(cfg.walls_num):
+        add_fixed(spec, f"wall{i}", "wall", fixed, mujoco.mjtGeom.mjGEOM_BOX, (cfg.walls_size,) * 3)
+    for i in range(cfg.buttons_num):
+        add_fixed(
+            spec, f"button{i}", "button", fixed, mujoco.mjtGeom.mjGEOM_SPHERE, (cfg.buttons_size, 0, 0)
+        )
+
+    kept = needed_sensors(cfg)
+    for sensor in list(spec.sensors):
+        if sensor.name not in kept and not sensor.name.startswith(("jointpos_", "jointvel_", "ball")):
+            spec.delete(sensor)
+    watched = {
+        "vases": [f"vase{i}" for i in range(cfg.vases_num)] if cfg.constrain_vases else [],
+        "pillars": [f"pillar{i}" for i in range(cfg.pillars_num)] if cfg.constrain_pillars else [],
+        "gremlins": [f"gremlin{i}obj" for i in range(cfg.gremlins_num)]
+        if cfg.constrain_gremlins
+        else [],
+        "buttons": [f"button{i}" for i in range(cfg.buttons_num)]
+        if cfg.constrain_buttons or cfg.task == "button"
+        else [],
+    }
+    if mjx:
+        for name, value in MJX_LIMITS.items():
+            spec.add_numeric(name=name, data=[value], size=1)
+    elif not drawn:
+        for name in (name for names in watched.values() for name in names):
+            spec.add_sensor(
+                name=f"contact_{name}",
+                type=mujoco.mjtSensor.mjSENS_CONTACT,
+                objtype=mujoco.mjtObj.mjOBJ_XBODY,
+                objname="robot",
+                reftype=mujoco.mjtObj.mjOBJ_BODY,
+                refname=name,
+                intprm=[1 << mujoco.mjtConDataField.mjCONDATA_FOUND.value, 0, 1],
+            )
+    model = spec.compile()
+    orbit = np.zeros(model.nmocap)
+    orbit[: cfg.gremlins_num] = cfg.gremlins_travel
+    return Scene(
+        model=model,
+        planar=bool(planar),
+        robot_height=float(robot.body("robot").pos[2]),
+        robot_nq=robot.nq,
+        robot_nv=robot.nv,
+        frees=frees,
+        mocaps=mocaps,
+        orbit=orbit,
+        watched=watched,
+    )
+
+
+def check_names(cfg: SafetyGymConfig, robot: mujoco.MjModel) -> None:
+    sensors = [robot.sensor(i).name for i in range(robot.nsensor)]
+    for name in cfg.sensors_obs:
+        if name not in sensors:
+            raise ConfigError(
+                f"env.sensors_obs: {cfg.robot_base} has no sensor {name!r}{nearest(name, sensors)}"
+            )
+    bodies = [robot.body(i).name for i in range(robot.nbody) if robot.body(i).name]
+    if cfg.reward_orientation and cfg.reward_orientation_body not in bodies:
+        name = cfg.reward_orientation_body
+        raise ConfigError(f"env.reward_orientation_body={name!r}{nearest(name, bodies)}")
+    if cfg.observe_freejoint and robot.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
+        raise ConfigError(f"env.observe_freejoint=true: {cfg.robot_base} has no free joint")
+
+
+def needed_sensors(cfg: SafetyGymConfig) -> set[str]:
+    names = set(cfg.sensors_obs)
+    if cfg.observe_com or cfg.task in ("x", "z", "circle"):
+        names.add("subtreecom")
+    return names
+
+
+def look(kind: str) -> dict:
+    return {"rgba": RGBA[kind], "group": min(GROUP[kind], 5)}
+
+
+def add_cube(spec: mujoco.MjSpec, name: str, kind: str, size: float, density: float) -> None:
+    """A free cube. Its pose comes from the layout."""
+    body = spec.worldbody.add_body(name=name)
+    body.add_freejoint(name=name)
+    body.add_geom(
+        name=name,
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=(size,) * 3,
+        density=density,
+        **OBJECT,
+        **look(kind),
+    )
+
+
+def add_box(spec: mujoco.MjSpec, cfg: SafetyGymConfig) -> None:
+    """The box to push: a cube with four overlapping corner posts that a robot can catch."""
+    add_cube(spec, "box", "box", cfg.box_size, cfg.box_density)
+    s = cfg.box_size
+    for i, (x, y) in enumerate([(s, s), (-s, s), (s, -s), (-s, -s)]):
+        spec.body("box").add_geom(
+            name=f"col{i + 1}",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=(s / 2, s / 2, s),
+            pos=(x, y, 0),
+            density=cfg.box_density,
+            **OBJECT,
+            **look("box"),
+        )
+
+
+def add_gremlin_guide(spec: mujoco.MjSpec, i: int, drawn_size: float | None) -> None:
+    """The mocap body that leads gremlin i along its circle, through a soft weld."""
+    body = spec.worldbody.add_body(name=f"gremlin{i}mocap", mocap=True)
+    if drawn_size is not None:
+        body.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=(drawn_size,) * 3,
+            contype=0,
+            conaffinity=0,
+            rgba=(*RGBA["gremlin"][:3], 0.1),
+            group=GROUP["gremlin"],
+        )
+    spec.add_equality(
+        type=mujoco.mjtEq.mjEQ_WELD,
+        objtype=mujoco.mjtObj.mjOBJ_BODY,
+        name1=f"gremlin{i}mocap",
+        name2=f"gremlin{i}obj",
+        solref=(0.02, 1.5),
+        data=[0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1, 1],
+    )
+
+
+def add_fixed(
+    spec: mujoco.MjSpec, name: str, kind: str, options: dict, shape: mujoco.mjtGeom, size: tuple
+) -> None:
+    body = spec.worldbody.add_body(name=name, mocap=True)
+    body.add_geom(name=name, type=shape, size=size, **options, **look(kind))
+
+
+def decorate(spec: mujoco.MjSpec, floor: mujoco.MjsGeom) -> None:
+    """A checkered floor and the cameras of the original; softer light, and a robot that stands out."""
+    spec.add_texture(
+        name="checker",
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        rgb1=(0.85, 0.85, 0.85),
+        rgb2=(0.75, 0.75, 0.75),
+        width=300,
+        height=300,
+    )
+    spec.add_material(name="checker", texrepeat=(10, 10), texuniform=False).textures[
+        mujoco.mjtTextureRole.mjTEXROLE_RGB
+    ] = "checker"
+    floor.material = "checker"
+    spec.add_texture(
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=(0.5, 0.65, 0.8),
+        rgb2=(0.85, 0.9, 0.95),
+        width=128,
+        height=128,
+    )
+    for geom in spec.geoms:
+        if tuple(geom.rgba) == (0.5, 0.5, 0.5, 1) and not geom.material:  # MuJoCo's grey
+            geom.rgba = ROBOT
+    spec.visual.headlight.ambient[:] = 0.35
+    spec.visual.headlight.diffuse[:] = 0.35
+    spec.visual.headlight.specular[:] = 0
+    world = spec.worldbody
+    world.add_light(
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        pos=(0, 0, 4),
+        dir=(0.3, 0.4, -1),
+        diffuse=(0.5, 0.5, 0.5),
+        specular=(0.1, 0.1, 0.1),
+        castshadow=False,
+    )
+    down = (np.cos(np.pi / 8), np.sin(np.pi / 8), 0, 0)  # half of up's right angle to the horizon
+    for name, pos in (("fixednear", (0, -2, 2)), ("fixedfar", (0, -5, 5))):
+        world.add_camera(name=name, pos=pos, quat=down)
+    track = mujoco.mjtCamLight.mjCAMLIGHT_TRACK
+    spec.body("robot").add_camera(name="track", pos=(0, -2, 2), quat=down, mode=track)

@@ -1,0 +1,1 @@
+"""Pictures, films and a live view of environments."""

@@ -1,0 +1,485 @@
+"""From a config of OmniSafe, or of Safety Gym's Engine, to the command line that does the same here.
+
+    python scripts/migrate.py omnisafe CONFIG.json|.yaml [--algo PPOLag] [--env SafetyPointGoal1-v0]
+    python scripts/migrate.py safety_gym CONFIG.json|.yaml
+
+The command goes to stdout, what became of every key to stderr. Of OmniSafe it takes the config.json
+of a run, a file of its configs/on-policy, or a part of either; what a file leaves out has OmniSafe's
+default, which is `preset=published compat=omnisafe`. Of Safety Gym it takes the dict that
+Engine(config) is given.
+
+Source: the configs of OmniSafe after 0.5.0 (2025), and Safety Gym's Engine.
+"""
+
+import argparse
+import dataclasses
+import json
+import math
+import shlex
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import yaml
+
+from jaxsafe.config import ConfigError, convert, from_dict, nearest
+from jaxsafe.run import command
+
+ALGORITHMS = {
+    "CPO": "cpo",
+    "CPPOPID": "cppo_pid",
+    "CUP": "cup",
+    "FOCOPS": "focops",
+    "IPO": "ipo",
+    "NaturalPG": "npg",
+    "OnCRPO": "crpo",
+    "P3O": "p3o",
+    "PCPO": "pcpo",
+    "PDO": "pdo",
+    "PPO": "ppo",
+    "PPOEarlyTerminated": "ppo_early_terminated",
+    "PPOLag": "ppo_lag",
+    "PPOSaute": "ppo_saute",
+    "PPOSimmerPID": "ppo_simmer_pid",
+    "PolicyGradient": "pg",
+    "RCPO": "rcpo",
+    "TRPO": "trpo",
+    "TRPOEarlyTerminated": "trpo_early_terminated",
+    "TRPOLag": "trpo_lag",
+    "TRPOPID": "trpo_pid",
+    "TRPOSaute": "trpo_saute",
+    "TRPOSimmerPID": "trpo_simmer_pid",
+}
+MISSING = {  # OmniSafe's others
+    "off-policy": "DDPG DDPGLag DDPGPID TD3 TD3Lag TD3PID SAC SACLag SACPID CRABS",
+    "model-based": "PETS CAPPETS CCEPETS RCEPETS LOOP SafeLOOP",
+    "offline": "BCQ BCQLag CCRR CRR COptiDICE VAEBC",
+}
+EPISODE = 1000  # steps
+
+
+class Facts(NamedTuple):
+    """What the meaning of a key may depend on."""
+
+    values: Mapping[str, Any]  # all keys of the file
+    algo: str  # ours
+    trust_region: bool  # else the policy moves by epochs of Adam
+
+    def batch(self) -> dict[str, Any]:
+        """steps_per_epoch as environments side by side, batch_size as a divisor of the batch, and
+        window_lens, which are episodes, as iterations of one episode of each environment."""
+        steps = self.whole("algo_cfgs.steps_per_epoch", 20_000)
+        size = self.whole("algo_cfgs.batch_size", 128 if self.trust_region else 64)
+        horizon = min(steps, EPISODE)
+        num_envs = math.ceil(steps / horizon)
+        total = num_envs * horizon
+        divisors = [m for m in range(1, total + 1) if total % m == 0]
+        minibatches = min(divisors, key=lambda m: abs(math.log(m * size / total)))
+        episodes = self.whole("logger_cfgs.window_lens", 100)
+        return {
+            "num_envs": num_envs,
+            "algo.horizon": horizon,
+            "algo.minibatches": minibatches,
+            "algo.cost_window": max(1, round(episodes / num_envs)),
+        }
+
+    def whole(self, key: str, default: int) -> int:
+        value = convert(self.values.get(key, default), int, key)
+        if value < 1:
+            raise ConfigError(f"{key}={value}: expected at least 1")
+        return value
+
+
+Turn = Callable[[Any, Facts], dict[str, Any] | None]
+
+
+class Key(NamedTuple):
+    """What becomes of a key of OmniSafe.
+
+    ours: the options, separated by spaces; '' if there is none. note: how, or why not.
+    turn(value, facts): the options with their values; {} if jaxsafe does so anyway, None if it cannot.
+        Without, each of `ours` has the value as it is; those that the algorithm lacks are left out.
+    same: of a key without option: the values with which nothing is lost; None: any.
+    """
+
+    ours: str = ""
+    note: str = ""
+    turn: Turn | None = None
+    same: tuple[Any, ...] | None = ()
+
+
+def batch(names: str) -> Turn:
+    return lambda value, facts: {k: v for k, v in facts.batch().items() if k in names.split()}
+
+
+def unless_on(option: str, off: float) -> Turn:
+    """For OmniSafe's switches: on, another key says how much."""
+    return lambda on, facts: {} if on else {option: off}
+
+
+def one_of(option: str, names: dict[str, str]) -> Turn:
+    return lambda value, facts: {option: names[value]} if value in names else None
+
+
+def without_trust_region(turn: Turn) -> Turn:
+    return lambda value, facts: {} if facts.trust_region else turn(value, facts)
+
+
+def passes(value: Any, facts: Facts) -> dict[str, Any]:
+    both = {"algo.epochs": value, "algo.critic_epochs": value}
+    return {"algo.critic_epochs": value} if facts.trust_region else both
+
+
+def budget(value: Any, facts: Facts) -> dict[str, Any]:
+    if "simmer" not in facts.algo:
+        return {"algo.cost_limit": value}
+    upper = convert(facts.values.get("algo_cfgs.upper_budget", 25.0), float, "algo_cfgs.upper_budget")
+    return {"algo.budget_init": convert(value, float, "algo_cfgs.safety_budget") / upper}
+
+
+DEFAULTS = "preset=published compat=omnisafe"  # OmniSafe's settings, and its conventions
+NETWORK = "one option for policy and critics"
+OMNISAFE: dict[str, Key] = {  # later keys win
+    "algo": Key("algo", "see the names"),
+    "env_id": Key("env env.rules", "see the names"),
+    "exp_name": Key("", "run_dir names a run's folder", same=None),
+    "exp_increment_cfgs": Key("", "a copy of what was changed, for OmniSafe's records", same=None),
+    "seed": Key("seed", "num_seeds=8 trains 8 at once"),
+    "train_cfgs.device": Key(
+        "", "JAX takes a GPU if there is one; JAX_PLATFORMS=cpu forbids", same=None
+    ),
+    "train_cfgs.torch_threads": Key("", "XLA takes the cores there are", same=None),
+    "train_cfgs.vector_env_nums": Key("", "num_envs follows from steps_per_epoch", same=None),
+    "train_cfgs.parallel": Key("", "devices=N splits one program over N devices", same=(1,)),
+    "train_cfgs.total_steps": Key("total_steps"),
+    "train_cfgs.epochs": Key("", "total_steps / steps_per_epoch", same=None),
+    "algo_cfgs.steps_per_epoch": Key(
+        "num_envs algo.horizon algo.minibatches algo.cost_window",
+        "whole episodes of 1,000 steps, side by side",
+        batch("num_envs algo.horizon algo.minibatches algo.cost_window"),
+    ),
+    "algo_cfgs.batch_size": Key(
+        "algo.minibatches",
+        "steps_per_epoch / batch_size, made a divisor of the batch",
+        batch("algo.minibatches"),
+    ),
+    "algo_cfgs.update_iters": Key(
+        "algo.epochs algo.critic_epochs", "with trust regions of the critics alone", passes
+    ),
+    "algo_cfgs.target_kl": Key("algo.target_kl", "of trust regions per action, as there"),
+    "algo_cfgs.kl_early_stop": Key(
+        "algo.target_kl",
+        "false is inf; trust regions never stop early",
+        without_trust_region(unless_on("algo.target_kl", math.inf)),
+    ),
+    "algo_cfgs.entropy_coef": Key("algo.entropy_coef"),
+    "algo_cfgs.obs_normalize": Key("algo.obs_normalize"),
+    "algo_cfgs.reward_normalize": Key("algo.reward_normalize"),
+    "algo_cfgs.cost_normalize": Key("algo.cost_normalize"),
+    "algo_cfgs.max_grad_norm": Key("algo.max_grad_norm"),
+    "algo_cfgs.use_max_grad_norm": Key(
+        "algo.max_grad_norm", "false is inf", unless_on("algo.max_grad_norm", math.inf)
+    ),
+    "algo_cfgs.critic_norm_coef": Key("algo.critic_norm_coef"),
+    "algo_cfgs.use_critic_norm": Key(
+        "algo.critic_norm_coef", "false is 0", unless_on("algo.critic_norm_coef", 0.0)
+    ),
+    "algo_cfgs.gamma": Key("algo.discount algo.cost_discount", "OmniSafe has one for both"),
+    "algo_cfgs.cost_gamma": Key("", "OmniSafe does not read it", same=None),
+    "algo_cfgs.lam": Key("algo.gae_lambda"),
+    "algo_cfgs.lam_c": Key("algo.cost_gae_lambda"),
+    "algo_cfgs.clip": Key("algo.clip"),
+    "algo_cfgs.adv_estimation_method": Key(
+        "algo.estimator",
+        "gae, plain and vtrace; gae-rtg is gae_rtg",
+        one_of(
+            "algo.estimator",
+            {"gae": "gae", "gae-rtg": "gae_rtg", "plain": "plain", "vtrace": "vtrace"},
+        ),
+    ),
+    "algo_cfgs.standardized_rew_adv": Key("", "reward advantages always are", same=(True,)),
+    "algo_cfgs.standardized_cost_adv": Key("", "cost advantages are always centred", same=(True,)),
+    "algo_cfgs.penalty_coef": Key(
+        "", "algo=ppo_penalty has a fixed price, on advantages instead of rewards", same=(0,)
+    ),
+    "algo_cfgs.use_cost": Key("", "the algorithm decides", same=None),
+    "algo_cfgs.cg_damping": Key("algo.damping"),
+    "algo_cfgs.cg_iters": Key("algo.cg_iterations"),
+    "algo_cfgs.fvp_sample_freq": Key("", "the Fisher matrix is of all samples", same=(1,)),
+    "algo_cfgs.fvp_obs": Key("", "the Fisher matrix is of the batch", same=None),
+    "algo_cfgs.cost_limit": Key("algo.cost_limit"),
+    "algo_cfgs.distance": Key("algo.tolerance"),
+    "algo_cfgs.focops_lam": Key("algo.temperature"),
+    "algo_cfgs.focops_eta": Key("algo.near_kl"),
+    "algo_cfgs.kappa": Key("algo.kappa algo.barrier", "kappa of P3O, barrier of IPO"),
+    "algo_cfgs.penalty_max": Key("algo.price_max"),
+    "algo_cfgs.saute_gamma": Key("algo.saute_discount"),
+    "algo_cfgs.unsafe_reward": Key("algo.unsafe_reward"),
+    "algo_cfgs.max_ep_len": Key("", "a budget is for env.num_steps", same=(EPISODE,)),
+    "algo_cfgs.upper_budget": Key("algo.cost_limit"),
+    "algo_cfgs.safety_budget": Key(
+        "algo.cost_limit algo.budget_init", "of Simmer a share of upper_budget", budget
+    ),
+    "control_cfgs.kp": Key("algo.simmer_kp"),
+    "control_cfgs.ki": Key("algo.simmer_ki"),
+    "control_cfgs.kd": Key("algo.simmer_kaw", "it acts against wind-up"),
+    "control_cfgs.polyak": Key("algo.simmer_smoothing"),
+    "logger_cfgs.use_wandb": Key("", "metrics.csv and TensorBoard files", same=(False,)),
+    "logger_cfgs.wandb_project": Key("", "metrics.csv and TensorBoard files", same=None),
+    "logger_cfgs.use_tensorboard": Key("", "always written", same=(True,)),
+    "logger_cfgs.save_model_freq": Key("", "a run is saved each minute, whole, for resume", same=None),
+    "logger_cfgs.log_dir": Key("", "run_dir names a run's folder; default runs/ENV-ALGO/", same=None),
+    "logger_cfgs.window_lens": Key(
+        "algo.cost_window", "in episodes there, in iterations here", batch("algo.cost_window")
+    ),
+    "model_cfgs.weight_initialization_mode": Key(
+        "algo.init",
+        "kaiming_uniform is torch",
+        one_of("algo.init", {"kaiming_uniform": "torch", "orthogonal": "orthogonal"}),
+    ),
+    "model_cfgs.actor_type": Key("", "a Gaussian with a learnt deviation", same=("gaussian_learning",)),
+    "model_cfgs.linear_lr_decay": Key(
+        "algo.lr_decay",
+        "trust regions have no rate",
+        without_trust_region(lambda on, facts: {"algo.lr_decay": on}),
+    ),
+    "model_cfgs.exploration_noise_anneal": Key("", "the deviation is learnt", same=(False,)),
+    "model_cfgs.std_range": Key("", "only read with exploration_noise_anneal", same=None),
+    "model_cfgs.critic.hidden_sizes": Key("algo.hidden", NETWORK),
+    "model_cfgs.actor.hidden_sizes": Key("algo.hidden", NETWORK),
+    "model_cfgs.critic.activation": Key(
+        "algo.activation", NETWORK, one_of("algo.activation", {"tanh": "tanh", "relu": "relu"})
+    ),
+    "model_cfgs.actor.activation": Key(
+        "algo.activation", NETWORK, one_of("algo.activation", {"tanh": "tanh", "relu": "relu"})
+    ),
+    "model_cfgs.actor.lr": Key(
+        "algo.lr",
+        "trust regions have none",
+        without_trust_region(lambda lr, facts: {"algo.lr": lr}),
+    ),
+    "model_cfgs.critic.lr": Key("algo.critic_lr"),
+    "lagrange_cfgs.cost_limit": Key("algo.cost_limit"),
+    "lagrange_cfgs.lagrangian_multiplier_init": Key("algo.lam_init"),
+    "lagrange_cfgs.lambda_lr": Key("algo.dual_lr"),
+    "lagrange_cfgs.lambda_optimizer": Key("", "always Adam", same=("Adam",)),
+    "lagrange_cfgs.lagrangian_upper_bound": Key("algo.lam_max"),
+    "lagrange_cfgs.pid_kp": Key("algo.pid_kp"),
+    "lagrange_cfgs.pid_ki": Key("algo.pid_ki"),
+    "lagrange_cfgs.pid_kd": Key("algo.pid_kd"),
+    "lagrange_cfgs.pid_delta_d_ema_alpha": Key("algo.pid_smoothing", "one for both"),
+    "lagrange_cfgs.pid_delta_p_ema_alpha": Key("algo.pid_smoothing", "one for both"),
+    "lagrange_cfgs.pid_d_delay": Key("algo.pid_delay"),
+    "lagrange_cfgs.sum_norm": Key("", "always (A_r - lam A_c) / (1 + lam)", same=(True,)),
+    "lagrange_cfgs.diff_norm": Key("", "always (A_r - lam A_c) / (1 + lam)", same=(False,)),
+    "lagrange_cfgs.penalty_max": Key("", "OmniSafe does not read it with sum_norm", same=None),
+}
+
+OURS_ALONE = ("rules", "awake", "contact_room")  # options that Engine does not have
+# Engine's options that ours takes, and does not use yet.
+VISION = ("observe_vision", "vision_size", "vision_render", "vision_render_size")
+
+
+class Line(NamedTuple):
+    """What became of a key: `text` is its options, or why it has none; `lost` if it asked for more."""
+
+    key: str
+    value: Any
+    text: str
+    lost: bool = False
+
+
+class Migrated(NamedTuple):
+    argv: list[str]  # after scripts/train.py
+    lines: list[Line]
+
+
+def omnisafe(config: dict[str, Any], envs: Any, algos: Any, algo: str = "", env: str = "") -> Migrated:
+    """The command line for a config of OmniSafe.
+
+    Args:
+        config: its tree, as in a run's config.json, or with `defaults` as in OmniSafe's own files.
+        envs, algos: the registries, as modules.
+        algo, env: OmniSafe's names, if the config has none; an env may be one of ours.
+    Raises:
+        ConfigError: a key, an algorithm or an environment that is unknown or has no counterpart, or a
+            value of the wrong type.
+    """
+    if "defaults" in config:
+        config = flatten(config["defaults"]) | flatten(config.get(env) or {})
+    values = {k: v for k, v in flatten(config).items() if not k.startswith("exp_increment_cfgs.")}
+    for key in values:
+        if key not in OMNISAFE:
+            raise ConfigError(f"unknown key {key} of OmniSafe{nearest(key, OMNISAFE)}")
+    name = find_algorithm(algo or values.get("algo"))
+    target = find_environment(env or values.get("env_id"), envs)
+    entry = algos.ALGOS[name]
+    preset = command.algo_options(algos, name, "published", "omnisafe")
+    start = {f"algo.{k}": v for k, v in preset.items() if k != "name"}
+    start |= {"num_envs": preset["num_envs"], "seed": 0, "total_steps": 10_000_000}
+    facts = Facts(values, name, "epochs" not in preset)
+    found: dict[str, Any] = {}
+    lines = [Line("algo", algo or values.get("algo"), f"algo={name} {DEFAULTS}")]
+    lines.append(Line("env_id", env or values.get("env_id"), " ".join(target)))
+    for key in [k for k in OMNISAFE if k in values and k not in ("algo", "env_id")]:
+        rule, value = OMNISAFE[key], values[key]
+        if not rule.ours:
+            lost = rule.same is not None and value not in rule.same
+            lines.append(Line(key, value, rule.note, lost))
+            continue
+        turned = dict.fromkeys(rule.ours.split(), value)
+        turned = rule.turn(value, facts) if rule.turn else turned
+        if not turned:
+            lines.append(Line(key, value, rule.note if turned is None else "so it is", turned is None))
+            continue
+        fits = {k: v for k, v in turned.items() if k in start}
+        if not fits:
+            lines.append(Line(key, value, f"{name} has no {' or '.join(turned)}", lost=True))
+            continue
+        replaced = [written(k, found[k]) for k, v in fits.items() if found.get(k, v) != v]
+        found |= fits
+        text = " ".join(written(k, v) for k, v in fits.items())
+        lines.append(Line(key, value, text + "".join(f" in place of {r}" for r in replaced)))
+    checked = from_dict(
+        entry.config, {k[5:]: v for k, v in found.items() if k.startswith("algo.")}, "algo."
+    )
+    for key, value in found.items():
+        found[key] = getattr(checked, key[5:]) if key.startswith("algo.") else convert(value, int, key)
+    changed = [written(k, v) for k, v in found.items() if v != start[k]]
+    return Migrated([*target, f"algo={name}", *DEFAULTS.split(), *changed], lines)
+
+
+def find_algorithm(theirs: Any) -> str:
+    if not theirs:
+        raise ConfigError(f"no algorithm in the file: add --algo, one of {', '.join(ALGORITHMS)}")
+    for kind, names in MISSING.items():
+        if theirs in names.split():
+            raise ConfigError(f"{theirs} has no counterpart: it is {kind}, ours are on-policy")
+    if theirs not in ALGORITHMS:
+        raise ConfigError(f"unknown algorithm {theirs} of OmniSafe{nearest(str(theirs), ALGORITHMS)}")
+    return ALGORITHMS[theirs]
+
+
+def find_environment(theirs: Any, envs: Any) -> list[str]:
+    """Options for the environment that OmniSafe calls `theirs`, or that is called so here."""
+    if not theirs:
+        raise ConfigError("no env_id in the file: add --env, as in --env SafetyPointGoal1-v0")
+    if ours := envs.suite.safety_gymnasium(theirs):
+        return [f"env={ours}", "env.rules=safety_gymnasium"]
+    if theirs.startswith("Safety"):
+        raise ConfigError(
+            f"{theirs} has no counterpart: of Safety-Gymnasium's tasks we have Point's and Car's Goal, "
+            "Button and Push; --env chooses another, by Safety-Gymnasium's name or ours"
+        )
+    return [f"env={envs.canonical(theirs)}"]
+
+
+def safety_gym(config: dict[str, Any], envs: Any) -> Migrated:
+    """The command line for the dict that Safety Gym's Engine takes; its options are ours by name.
+
+    The environment is the registered one of that task and robot, if any, that differs least from it.
+
+    Raises:
+        ConfigError: an option that Engine does not have, or a value of the wrong type.
+    """
+    config = {**config}
+    known = [field for field in envs.defaults() if field not in OURS_ALONE]
+    for key in config:
+        if key not in known:
+            raise ConfigError(f"unknown option {key} of Engine{nearest(key, known)}")
+    lines = []
+    for key in [k for k in VISION if k in config]:
+        asked = key == "observe_vision" and bool(config[key])
+        lines.append(Line(key, config.pop(key), "vision is not available yet", asked))
+    options = dataclasses.asdict(envs.read(envs.defaults(**config)))
+    options = {k: v for k, v in options.items() if k not in VISION}
+
+    def differences(name: str) -> dict[str, Any]:
+        other = envs.env_defaults(name)
+        return {k: v for k, v in options.items() if v != other[k]}
+
+    def distance(name: str) -> tuple[bool, bool, int]:
+        found = differences(name)
+        return "task" in found, "robot_base" in found, len(found)
+
+    name = min(envs.suite.suite(), key=distance)
+    argv = [f"env={name}", *(written(f"env.{k}", v) for k, v in differences(name).items())]
+    lines += [Line(k, config[k], written(f"env.{k}", options[k])) for k in config]
+    return Migrated(argv, lines)
+
+
+def flatten(tree: Any, head: str = "") -> dict[str, Any]:
+    """{'train_cfgs.device': 'cpu', ...}"""
+    if not isinstance(tree, dict):
+        raise ConfigError(f"{head or 'the file'}: expected names with values, not {tree!r}")
+    found: dict[str, Any] = {}
+    for name, value in tree.items():
+        deeper = isinstance(value, dict)
+        found |= flatten(value, f"{head}{name}.") if deeper else {f"{head}{name}": value}
+    return found
+
+
+def written(key: str, value: Any) -> str:
+    """An option as train.py reads it: lists in brackets, true, false and null."""
+    return f"{key}={text_of(value)}"
+
+
+def text_of(value: Any) -> str:
+    if isinstance(value, list | tuple):
+        return f"[{','.join(map(text_of, value))}]"
+    return json.dumps(value) if value is None or isinstance(value, bool) else str(value)
+
+
+def read(path: Path) -> dict[str, Any]:
+    """A .json or .yaml file. Executes nothing from it."""
+    try:
+        text = path.read_text()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"cannot read {path}: {command.one_line(error)}") from error
+    if path.suffix not in (".json", ".yaml", ".yml"):
+        raise ConfigError(f"{path}: expected a name that ends in .json or .yaml")
+    try:
+        tree = json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)
+    except (json.JSONDecodeError, yaml.YAMLError) as error:
+        raise ConfigError(
+            f"{path} is no {path.suffix[1:].upper()}: {command.one_line(error)}"
+        ) from error
+    flatten(tree)
+    return tree
+
+
+def report(lines: list[Line]) -> str:
+    """A line a key; what the command does not do comes last."""
+    return "\n".join(
+        f"{'no counterpart: ' * line.lost}{line.key}={text_of(line.value)}: {line.text}"
+        for line in sorted(lines, key=lambda line: line.lost)
+    )
+
+
+def main(envs: Any, algos: Any) -> int:
+    """scripts/migrate.py. Exit status 2 for a file that has no counterpart."""
+
+    def migrate() -> int:
+        parser = argparse.ArgumentParser(
+            description=(__doc__ or "").partition("\n")[0],
+            epilog=(__doc__ or "").partition("\n\n")[2],
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        parser.error = command.fail  # type: ignore[method-assign]
+        parser.add_argument("source", choices=("omnisafe", "safety_gym"))
+        parser.add_argument("config", type=Path, metavar="CONFIG")
+        parser.add_argument("--algo", default="", help="OmniSafe's name (default: the file's)")
+        parser.add_argument("--env", default="", help="OmniSafe's name, or ours (default: the file's)")
+        args = parser.parse_args()
+        tree = read(args.config)
+        if args.source == "omnisafe":
+            algo = args.algo or (args.config.stem if args.config.stem in ALGORITHMS else "")
+            found = omnisafe(tree, envs, algos, algo, args.env)
+        else:
+            found = safety_gym(tree, envs)
+        print(report(found.lines), file=sys.stderr, flush=True)
+        print(shlex.join(["python", "scripts/train.py", *found.argv]))
+        return 0
+
+    return command.guarded(migrate)

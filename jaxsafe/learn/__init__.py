@@ -1,0 +1,1 @@
+"""The training loops and the parts they are made of."""

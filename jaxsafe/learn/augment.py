@@ -1,0 +1,235 @@
+"""Augmentations: what an algorithm adds to the task for its learner alone.
+
+Rewards and costs of the environment stay what they are, and with them every metric; only what the
+networks see, what the learner is paid and where its episodes end may differ.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxsafe.config import config
+from jaxsafe.learn.rollout import Episode, Trajectory, never
+from jaxsafe.learn.treatments import Treatment
+from jaxsafe.types import Env, PyTree, State
+
+MIN_BUDGET = 1e-6  # cost per episode, so that a limit of 0 divides nothing by zero; OmniSafe
+
+
+class Augmentation(NamedTuple):
+    """wrap(env, cfg, dual) -> the Env that the policy acts in, in training and afterwards; what it
+    appends to the observation passes the normaliser by. Its floats may be traced.
+    renew(resets, cfg, dual) -> State [N], resets drawn in an earlier iteration as they are now.
+    stop(episode, cfg) -> bool [N], where an episode of training ends for good.
+    reward(traj, cfg) -> float [T, N], what the learner is paid.
+    last_obs(traj, cfg) -> float [T, N, O], the observations whose value each step leads to.
+    """
+
+    wrap: Callable[[Env, Any, PyTree], Env]
+    renew: Callable[[State, Any, PyTree], State]
+    stop: Callable[[Episode, Any], jax.Array]
+    reward: Callable[[Trajectory, Any], jax.Array]
+    last_obs: Callable[[Trajectory, Any], jax.Array]
+
+
+nothing = Augmentation(
+    wrap=lambda env, cfg, dual: env,
+    renew=lambda resets, cfg, dual: resets,
+    stop=lambda episode, cfg: never(episode),
+    reward=lambda traj, cfg: traj.reward,
+    last_obs=lambda traj, cfg: traj.next_obs,
+)
+
+
+@dataclass(frozen=True)
+class Budget:
+    """`env` that also shows z, what is left of a budget on cost, as the last entry of its observation.
+
+        z_0 = start,   z_{t+1} = (z_t - c_t / budget) / discount
+
+    so discount^t z_t = start - sum_{s<t} discount^s c_s / budget: a discounted budget, as seen from
+    step t. info counts the steps of an episode that end without any: 'unsafe'.
+
+    start: share of the budget, in [0, 1]. budget: in units of cost. discount: in (0, 1].
+    """
+
+    env: Env
+    start: jax.Array | float
+    budget: jax.Array | float
+    discount: jax.Array | float
+
+    @property
+    def obs_size(self) -> int:
+        return self.env.obs_size + 1
+
+    @property
+    def action_size(self) -> int:
+        return self.env.action_size
+
+    @property
+    def episode_length(self) -> int:
+        return self.env.episode_length
+
+    @property
+    def cost_names(self) -> tuple[str, ...]:
+        return self.env.cost_names
+
+    def reset(self, key: jax.Array) -> State:
+        return self._show(self.env.reset(key), self.start)
+
+    def step(self, state: State, action: jax.Array) -> State:
+        info = {name: x for name, x in state.info.items() if name != "unsafe"}
+        z = state.obs[-1]
+        state = self.env.step(dataclasses.replace(state, obs=state.obs[:-1], info=info), action)
+        return self._show(state, (z - state.cost / self.budget) / self.discount)
+
+    def _show(self, state: State, z: jax.Array | float) -> State:
+        unsafe = jnp.float32(jnp.asarray(z) <= 0)
+        return dataclasses.replace(
+            state, obs=jnp.append(state.obs, z), info=state.info | {"unsafe": unsafe}
+        )
+
+
+@config
+class SauteConfig:
+    saute_discount: float = 0.9999  # gamma_n; OmniSafe on Goal and Circle, on Button 0.999
+    unsafe_reward: float = -0.2  # n, of a step without budget left; OmniSafe likewise, on Button -1
+    full_at_end: bool = False  # the value at a time limit is of z = 1; OmniSafe
+
+
+def full_budget(env: Env, cfg: Any) -> jax.Array:
+    """B: the discounted cost of an episode that spends `cost_limit` evenly."""
+    weights = cfg.saute_discount ** jnp.arange(env.episode_length)
+    return jnp.maximum(cfg.cost_limit, MIN_BUDGET) * jnp.mean(weights)
+
+
+def safe_reward(traj: Trajectory, cfg: Any) -> jax.Array:
+    return jnp.where(traj.next_obs[..., -1] > 0, traj.reward, cfg.unsafe_reward)
+
+
+def last_budget(traj: Trajectory, cfg: Any) -> jax.Array:
+    full = traj.next_obs.at[..., -1].set(1.0)
+    return jnp.where((traj.truncated & cfg.full_at_end)[..., None], full, traj.next_obs)
+
+
+# Sootla et al. (2022), "Saute RL: Almost Surely Safe Reinforcement Learning Using State
+# Augmentation", arXiv:2202.06558, section 3; the scale of the budget is from their code
+saute = nothing._replace(
+    wrap=lambda env, cfg, dual: Budget(env, 1.0, full_budget(env, cfg), cfg.saute_discount),
+    reward=safe_reward,
+    last_obs=last_budget,
+)
+
+
+@config
+class SimmerConfig(SauteConfig):
+    budget_init: float = 0.5  # d_1, share of cost_limit; 0.57 in the authors' pendulum
+    budget_ramp: float = 200.0  # iterations until d = cost_limit; the authors' last sixth of training
+    budget_reach: float = 0.15  # largest |u|, share of cost_limit; 0.14 in the authors' pendulum
+    simmer_kp: float = 0.1  # of the smoothed error
+    simmer_ki: float = 0.01  # of the sum of smoothed errors; the authors' 0.005 to 0.04
+    simmer_kaw: float = 0.01  # of what clipping took from the last u; the authors' 0 to 0.04
+    simmer_smoothing: float = 0.9  # share of the past in the error; the authors' 0 to 0.999
+    simmer_window: int = 100  # errors in the sum; the authors' code
+    simmer_adds: bool = False  # u is added to the last B, not to d; OmniSafe
+    simmer_full: bool = False  # z is the share of B that is left, and starts at 1; OmniSafe
+
+
+# OmniSafe @15603dd, PPOSimmerPID.yaml and TRPOSimmerPID.yaml: a budget that starts at its bound, and
+# steps of at most 1 of 25. With `simmer_adds` far larger gains drive the budget to 0 for good.
+OMNISAFE_SIMMER: dict[str, Any] = {
+    "budget_init": 1.0,
+    "budget_reach": 0.04,
+    "simmer_kp": 5e-4,
+    "simmer_ki": 1e-5,
+    "simmer_kaw": 0.0,
+    "simmer_smoothing": 0.995,
+    "simmer_window": 10,
+}
+
+
+class Schedule(NamedTuple):
+    """What the controller of the budget remembers; costs are per episode."""
+
+    budget: jax.Array  # float [], B, what a new episode may cost
+    errors: jax.Array  # float [simmer_window], smoothed d - J_c, oldest first
+    clipped: jax.Array  # float [], what clipping added to the last u
+    iteration: jax.Array  # int32 [], updates so far
+
+
+def reference(iteration: jax.Array | int, cfg: Any) -> jax.Array:
+    """d, the budget that is aimed at: a line from budget_init cost_limit to cost_limit."""
+    done = jnp.clip(iteration / jnp.maximum(cfg.budget_ramp, 1.0), 0.0, 1.0)
+    return cfg.cost_limit * (cfg.budget_init + (1 - cfg.budget_init) * done)
+
+
+def init_schedule(cfg: Any) -> Schedule:
+    budget = jnp.maximum(reference(0, cfg), MIN_BUDGET)
+    return Schedule(budget, jnp.zeros(cfg.simmer_window), jnp.zeros(()), jnp.int32(0))
+
+
+def control_budget(dual: Schedule, episode_cost: jax.Array, cfg: Any) -> Schedule:
+    """B = d + u, u = K_p e + K_i sum e + K_aw (u' - u'_raw), from the error e = d - J_c, smoothed."""
+    d = dual.budget if cfg.simmer_adds else reference(dual.iteration + 1, cfg)
+    past = cfg.simmer_smoothing
+    error = past * dual.errors[-1] + (1 - past) * (d - episode_cost)
+    errors = jnp.append(dual.errors[1:], error)
+    raw = cfg.simmer_kp * error + cfg.simmer_ki * errors.sum() + cfg.simmer_kaw * dual.clipped
+    reach = cfg.budget_reach * cfg.cost_limit
+    budget = jnp.clip(
+        d + jnp.clip(raw, -reach, reach), MIN_BUDGET, jnp.maximum(cfg.cost_limit, MIN_BUDGET)
+    )
+    return Schedule(budget, errors, budget - d - raw, dual.iteration + 1)
+
+
+# Sootla et al. (2022), "Effects of Safety State Augmentation on Safe Exploration",
+# arXiv:2206.02675, "PI Simmer"; window, filter and clips are from their code
+schedule = Treatment(
+    init=init_schedule,
+    update=control_budget,
+    advantage=lambda dual, adv_r, adv_c: adv_r,
+    metrics=lambda dual: {"train/budget": dual.budget},
+)
+
+
+def start(cfg: Any, dual: Schedule) -> jax.Array:
+    """z_0, the scheduled share of the whole budget."""
+    share = dual.budget / jnp.maximum(cfg.cost_limit, MIN_BUDGET)
+    return jnp.ones_like(share) if cfg.simmer_full else share
+
+
+def scheduled(env: Env, cfg: Any, dual: Schedule) -> Budget:
+    whole = full_budget(env, cfg)
+    if cfg.simmer_full:
+        whole = whole * dual.budget / jnp.maximum(cfg.cost_limit, MIN_BUDGET)
+    return Budget(env, start(cfg, dual), whole, cfg.saute_discount)
+
+
+simmer = saute._replace(
+    wrap=scheduled,
+    renew=lambda resets, cfg, dual: dataclasses.replace(
+        resets, obs=resets.obs.at[:, -1].set(start(cfg, dual))
+    ),
+)
+
+
+@config
+class EarlyConfig:
+    termination_reward: float = 0.0  # r_e, of the step that breaks the limit; OmniSafe
+    keep_cost: bool = False  # cost counts on through episodes that time ends; OmniSafe
+
+
+def broken(episode: Episode, cfg: Any) -> jax.Array:
+    """Whether the step breaks the limit, bool [..., N]."""
+    return (episode.kept_cost if cfg.keep_cost else episode.cost) > cfg.cost_limit
+
+
+# Sun et al. (2021), "Safe Exploration by Solving Early Terminated MDP", arXiv:2107.04200
+early = nothing._replace(
+    stop=broken,
+    reward=lambda traj, cfg: jnp.where(broken(traj.episode, cfg), cfg.termination_reward, traj.reward),
+)

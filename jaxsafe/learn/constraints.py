@@ -1,0 +1,88 @@
+"""What is constrained: `cost` under cost_limit or, with cost_limits, named costs, each under its own.
+
+What belongs to the constraint (a limit, a multiplier, J_c) is then float [K] instead of float [], and
+what belongs to it at each step (A_c, the critic's targets) has a last axis K, in the order of `named`.
+"""
+
+import dataclasses
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxsafe.config import ConfigError, config, nearest
+from jaxsafe.learn.rollout import Trajectory
+from jaxsafe.types import Env, Metrics
+
+Names = tuple[str, ...]
+
+
+@config
+class LimitsConfig:
+    """For algorithms that take several constraints."""
+
+    cost_limits: dict[str, float] | None = None  # per episode, by names of costs; null: cost_limit
+
+
+def unnamed(cfg: Any) -> Names:
+    return ()
+
+
+def named(cfg: Any) -> Names:
+    """The costs under limits of their own, in the order of the alphabet; () for `cost` under one."""
+    if cfg.cost_limits is None:
+        return ()
+    if not cfg.cost_limits:
+        raise ConfigError("cost_limits={}: expected a limit for one cost at least")
+    return tuple(sorted(cfg.cost_limits))
+
+
+def limit(cfg: Any, names: Names) -> jax.Array:
+    return jnp.stack([cfg.cost_limits[name] for name in names]) if names else cfg.cost_limit
+
+
+def own_limits(cfg: Any) -> dict[str, float]:
+    """The limits by name, of the config of any algorithm; none where there is but cost_limit."""
+    return dict(sorted((dataclasses.asdict(cfg).get("cost_limits") or {}).items()))
+
+
+def limits_of(cfg: Any) -> dict[str, float]:
+    """Every limit in force, by name; '' is the name of `cost`."""
+    return own_limits(cfg) or {"": float(cfg.cost_limit)}
+
+
+def written(name: str) -> str:
+    """What tables call a cost; '' is the name of `cost`."""
+    return f"cost {name}" if name else "cost"
+
+
+def in_words(limits: dict[str, float]) -> str:
+    """'25', or 'hazards 10, vases_contact 5'; '-' of none."""
+    return ", ".join(f"{name} {most:.9g}".lstrip() for name, most in limits.items()) or "-"
+
+
+def check_names(names: Iterable[str], env: Env) -> None:
+    for name in names:
+        if name not in env.cost_names:
+            hint = nearest(name, env.cost_names) if env.cost_names else "; the environment has none"
+            raise ConfigError(f"cost_limits: unknown cost {name!r}{hint}")
+
+
+def signal(env: Env, traj: Trajectory, names: Names) -> jax.Array:
+    """What is held under the limit: float [T, N] or, of several, [T, N, K]."""
+    return traj.costs[..., [env.cost_names.index(n) for n in names]] if names else traj.cost
+
+
+def each(fn: Callable, names: Names) -> Callable:
+    """`fn` of one constraint for all of them, along the last axis of what it takes and gives."""
+    return jax.vmap(fn, in_axes=-1, out_axes=-1) if names else fn
+
+
+def spread(metrics: Metrics, names: Sequence[str]) -> Metrics:
+    """`metrics` with an entry for each constraint in place of those of [K]: train/lam_hazards, ..."""
+    out = {}
+    for metric, x in metrics.items():
+        several = {f"{metric}_{name}": x[k] for k, name in enumerate(names)} if jnp.ndim(x) else {}
+        out |= several or {metric: x}
+    return out

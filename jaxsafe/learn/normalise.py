@@ -1,0 +1,48 @@
+"""Running mean and variance of observations, rewards and costs, merged over batches and devices.
+
+    w = n / (count + n);  d = mean_batch - mean
+    mean <- mean + w d;   var <- var + w (var_batch - var) + w (1 - w) d^2
+
+Source: Chan, Golub and LeVeque (1983), "Algorithms for Computing the Sample Variance". Keeping the
+variance rather than the sum of squares, and the merge as a weighted mean, needs only the relative
+precision of `count`, so float32 serves beyond 1e9 samples. Floor and clip are OmniSafe's; it uses
+the unbiased variance, which differs by 1 / count.
+"""
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from jaxsafe.learn.batch import batch_mean, psum
+
+MIN_STD = 0.01  # in units of what is normalised
+CLIP = 5.0  # standard deviations
+
+
+@flax.struct.dataclass
+class Normaliser:
+    count: jax.Array  # float []
+    mean: jax.Array  # float [O]
+    var: jax.Array  # float [O]
+
+
+def init_normaliser(size: int) -> Normaliser:
+    """Before the first batch observations pass through, clipped only."""
+    return Normaliser(jnp.zeros(()), jnp.zeros(size), jnp.ones(size))
+
+
+def merge(stats: Normaliser, x: jax.Array, axis_name: str | None = None) -> Normaliser:
+    """`stats` with the samples `x` [..., O] of all devices added."""
+    x = x.reshape(-1, x.shape[-1])
+    mean = batch_mean(x, axis_name, axis=0)
+    var = batch_mean((x - mean) ** 2, axis_name, axis=0)
+    n = psum(jnp.float32(x.shape[0]), axis_name)
+    w = n / (stats.count + n)
+    d = mean - stats.mean
+    var = stats.var + w * (var - stats.var) + w * (1 - w) * d**2
+    return Normaliser(stats.count + n, stats.mean + w * d, var)
+
+
+def normalise(stats: Normaliser, x: jax.Array) -> jax.Array:
+    std = jnp.maximum(jnp.sqrt(stats.var), MIN_STD)
+    return jnp.clip((x - stats.mean) / std, -CLIP, CLIP)

@@ -1,0 +1,482 @@
+"""The on-policy loop: rollout, estimates, treatment, step, as one pure update.
+
+`jit(update)` compiles an iteration, `vmap(update)` runs seeds or floats of the config side by side,
+and `shard_map(update)` with `axis_name` set splits environments over devices: each device then holds
+`cfg.num_envs` of its own and the same parameters, and gets the same key, which is folded with the
+device's index where devices must differ.
+"""
+
+import dataclasses
+import operator
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Literal, NamedTuple
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from jaxsafe.config import ConfigError, config
+from jaxsafe.learn.augment import Augmentation, nothing
+from jaxsafe.learn.batch import all_finite, batch_mean, centre, masked_mean, psum, select, standardise
+from jaxsafe.learn.constraints import Names, check_names, each, limit, signal, spread, unnamed
+from jaxsafe.learn.normalise import init_normaliser, merge, normalise
+from jaxsafe.learn.returns import Estimator, Window, advantages, empty_window, mean_length, window_mean
+from jaxsafe.learn.rollout import RolloutState, Trajectory, collect, init_rollout
+from jaxsafe.learn.steps import Step, adam, fit_critic, stops_critics
+from jaxsafe.learn.surrogates import Surrogate, with_entropy
+from jaxsafe.learn.treatments import Treatment
+from jaxsafe.nn.gaussian import Gaussian, entropy, log_prob, sample
+from jaxsafe.nn.networks import init_params, policy, share_trunk, stack, stack_critics, values
+from jaxsafe.types import Env, Metrics, PyTree
+
+
+@config
+class OnPolicyConfig:
+    """What the on-policy algorithms share. [O] OmniSafe's default, [S] safety-starter-agents'."""
+
+    num_envs: int = 512  # per device; with horizon 20,480 steps a batch, near the 20,000 of [O]
+    horizon: int = 40  # steps of each environment per iteration; shorter ones learn less from a step
+    stagger: bool = True  # spread the first episodes' ends over time
+    total_iterations: float = float("inf")  # where what decays reaches 0; inf: total_steps' end
+    hidden: tuple[int, ...] = (64, 64)  # units of each network [O]
+    trunk: Literal["separate", "shared"] = "separate"  # networks of their own [O, S], or one for all
+    value_coef: float = (
+        0.5  # of each critic's squared error in the loss of a shared trunk; else unused; SB3
+    )
+    activation: Literal["tanh", "relu"] = "tanh"  # [O, S]
+    init: Literal["orthogonal", "torch"] = "orthogonal"  # weights; [O] torch, its kaiming_uniform
+    init_log_std: float = -0.5  # of the actions' standard deviation [S]
+    std: Literal["free", "state"] = "free"  # a parameter of its own [O, S], or a function of the state
+    obs_normalize: bool = True  # by running mean and variance [O]
+    reward_normalize: bool = False  # likewise, for the learner alone [O]
+    cost_normalize: bool = False  # likewise [O]; limits and metrics are of costs as they are
+    entropy_coef: float = 0.0  # times the policy's entropy, added to what it maximises [O]
+    entropy_decay: bool = False  # of entropy_coef, linearly to 0 at total_iterations
+    estimator: Estimator = "gae"  # of advantages and of the critics' targets [O]
+    discount: float = 0.99  # [O, S]
+    gae_lambda: float = 0.95  # [O]
+    cost_discount: float = 0.99  # [O, S], who name it but use `discount`
+    cost_gae_lambda: float = 0.95  # [O]
+    cost_limit: float = 25.0  # undiscounted cost per episode [O, S]; without constraint only a mark
+    cost_window: int = 1  # iterations that J_c is a mean over; [O] the last 100 episodes, 5 of its own
+    minibatches: int = 8  # a pass over the batch, for policy and critics
+    critic_lr: float = 1e-3  # [S]; Adam; unused with a shared trunk, as are the next two
+    critic_epochs: int = 10  # passes of each critic; with 8 minibatches the 80 steps of [S]
+    critic_norm_coef: float = 1e-3  # times the sum of squared parameters [O]
+    max_grad_norm: float = 40.0  # of each network's gradient [O]
+
+
+# The settings that all of [O]'s on-policy algorithms share (@15603dd, configs/on-policy) and that
+# differ from the defaults above. Its 20 episodes run one after the other, these side by side.
+OMNISAFE: dict[str, Any] = {
+    "num_envs": 20,
+    "horizon": 1000,
+    "stagger": False,
+    "init": "torch",
+    "init_log_std": 0.0,
+}
+
+
+@flax.struct.dataclass
+class TrainState:
+    """All that an update needs. Environment steps so far: iteration * num_envs * horizon.
+
+    config: the algorithm's, with its floats as arrays.
+    params: {'actor', 'critic_r', 'critic_c'}; of several constraints critic_c is stacked, [K, ...].
+        With a shared trunk {'actor'}, see networks.share_trunk.
+    opt_state: {'actor': the step's own, 'critics': Adam's for all critics, stacked, or ()}.
+    dual: the treatment's state.
+    normaliser: Normaliser, or () without `obs_normalize`.
+    signals: Normaliser of [reward, costs ...], or () without `reward_normalize` and `cost_normalize`.
+    rollout: this device's environments.
+    episode_length: float [], running mean length of an episode, in steps.
+    past_costs: J_c of the last `cost_window` iterations, float [W] or [W, K].
+    """
+
+    config: Any
+    params: dict[str, PyTree]
+    opt_state: dict[str, PyTree]
+    dual: PyTree
+    normaliser: PyTree
+    signals: PyTree
+    rollout: RolloutState
+    episode_length: jax.Array
+    past_costs: Window
+    key: jax.Array
+    iteration: jax.Array
+
+
+@flax.struct.dataclass
+class Batch:
+    """B = T * N transitions, as the policy sees them: observations are normalised.
+
+    obs [B, O]; action [B, A]; log_prob [B] and old (Gaussian [B, A]) of the policy that acted;
+    adv_r standardised, adv_c only centred, in cost units or, with `cost_normalize`, in standard
+    deviations of a step's; ret_r, ret_c: the critics' targets [B]. Of several constraints adv_c and
+    ret_c are [B, K].
+    """
+
+    obs: jax.Array
+    action: jax.Array
+    log_prob: jax.Array
+    old: Gaussian
+    adv_r: jax.Array
+    adv_c: jax.Array
+    ret_r: jax.Array
+    ret_c: jax.Array
+
+
+class Algorithm(NamedTuple):
+    """init(key, cfg) -> ts; update(ts) -> (ts, metrics); act(ts, obs [..., O], key) -> action,
+    sampled, or the mean where key is None; task(ts) -> the Env whose observations `act` takes."""
+
+    init: Callable[[jax.Array, Any], TrainState]
+    update: Callable[[TrainState], tuple[TrainState, Metrics]]
+    act: Callable[[TrainState, jax.Array, jax.Array | None], jax.Array]
+    task: Callable[[TrainState], Env]
+
+
+def on_policy(
+    env: Env,
+    treatment: Treatment,
+    surrogate: Surrogate,
+    step: Step,
+    axis_name: str | None = None,
+    augmentation: Augmentation = nothing,
+) -> Algorithm:
+    """Algorithms with one objective: the surrogate of the advantage that the treatment mixes."""
+
+    def improve(ts: TrainState, batch: Batch, cost: jax.Array, length: jax.Array, key: jax.Array):
+        cfg = ts.config
+        dual = treatment.update(ts.dual, cost, cfg)
+
+        def objective(actor: PyTree, batch: Batch) -> tuple[jax.Array, Metrics]:
+            advantage = treatment.advantage(dual, batch.adv_r, batch.adv_c)
+            earned = with_entropy(surrogate, ts.iteration)
+            return earned(policy(actor, batch.obs, cfg), batch, advantage, cfg)
+
+        actor, opt_state, metrics = step.update(
+            ts.params["actor"], ts.opt_state["actor"], objective, batch, key, cfg, axis_name
+        )
+        return actor, opt_state, dual, metrics | treatment.metrics(dual)
+
+    return loop(env, step.init, treatment.init, improve, axis_name, augmentation, treatment.named)
+
+
+def on_policy_pair(
+    env: Env,
+    surrogate: Surrogate,
+    step: Step,
+    axis_name: str | None = None,
+    surrogate_c: Surrogate | None = None,
+    named: Callable[[Any], Names] = unnamed,
+) -> Algorithm:
+    """Algorithms whose step weighs reward against cost itself, so that it takes two objectives:
+    `surrogate` of the reward's advantage, and `surrogate_c` (or the same) of the cost's.
+
+    update(actor, opt_state, objective_r, objective_c, excess, length, batch, key, cfg, axis_name),
+    where excess = J_c - cost_limit, in cost per episode, and length is the mean episode's in steps:
+    objective_c is in cost per step, the unit of excess / length. For K costs `named(cfg)` both are [K].
+    """
+
+    def improve(ts: TrainState, batch: Batch, cost: jax.Array, length: jax.Array, key: jax.Array):
+        cfg = ts.config
+
+        def objective_r(actor: PyTree, batch: Batch) -> tuple[jax.Array, Metrics]:
+            earned = with_entropy(surrogate, ts.iteration)
+            return earned(policy(actor, batch.obs, cfg), batch, batch.adv_r, cfg)
+
+        def objective_c(actor: PyTree, batch: Batch) -> tuple[jax.Array, Metrics]:
+            dist = policy(actor, batch.obs, cfg)
+
+            def of_one(adv_c: jax.Array) -> tuple[jax.Array, Metrics]:
+                return (surrogate_c or surrogate)(dist, batch, adv_c, cfg)
+
+            return each(of_one, named(cfg))(batch.adv_c)
+
+        actor, opt_state, metrics = step.update(
+            ts.params["actor"],
+            ts.opt_state["actor"],
+            objective_r,
+            objective_c,
+            cost - limit(cfg, named(cfg)),
+            length,
+            batch,
+            key,
+            cfg,
+            axis_name,
+        )
+        return actor, opt_state, (), metrics
+
+    def init_dual(cfg: Any) -> tuple[()]:
+        if cfg.cost_normalize:
+            raise ConfigError(
+                "cost_normalize=True: expected False for an algorithm that adds what it estimates of "
+                "the cost to the violation, which is in units of cost"
+            )
+        return ()
+
+    return loop(env, step.init, init_dual, improve, axis_name, named=named)
+
+
+def loop(
+    env: Env,
+    init_step: Callable[[PyTree, Any], PyTree],
+    init_dual: Callable[[Any], PyTree],
+    improve: Callable[..., tuple[PyTree, PyTree, PyTree, Metrics]],
+    axis_name: str | None,
+    augmentation: Augmentation = nothing,
+    named: Callable[[Any], Names] = unnamed,
+) -> Algorithm:
+    """The loop around `improve(ts, batch, episode_cost, episode_length, key)`, which returns
+    (actor, opt_state, dual, metrics). episode_cost is of `cost` or, [K], of the costs `named(cfg)`."""
+
+    def init(key: jax.Array, cfg: Any) -> TrainState:
+        check(cfg)
+        cfg = jax.tree.map(jnp.float32, cfg)
+        params_key, rollout_key, key = jax.random.split(key, 3)
+        dual = init_dual(cfg)
+        wrapped = augmentation.wrap(env, cfg, dual)
+        sizes = wrapped.obs_size, wrapped.action_size
+        params = init_params(params_key, *sizes, cfg)
+        if names := named(cfg):
+            check_names(names, env)
+            keys = jax.random.split(params_key, len(names))
+            critics = jax.vmap(lambda key: init_params(key, *sizes, cfg)["critic_c"])(keys)
+            params |= {"critic_c": critics}
+        opt_critics = jax.vmap(adam(cfg.critic_lr, cfg).init)(stack_critics(params))
+        if cfg.trunk == "shared":
+            params, opt_critics = share_trunk(params, cfg), ()
+        return TrainState(
+            config=cfg,
+            params=params,
+            opt_state={"actor": init_step(params["actor"], cfg), "critics": opt_critics},
+            dual=dual,
+            normaliser=init_normaliser(env.obs_size) if cfg.obs_normalize else (),
+            signals=init_signals(cfg, len(named(cfg)) or 1),
+            rollout=init_rollout(wrapped, own(rollout_key, axis_name), cfg.num_envs, cfg.stagger),
+            episode_length=jnp.float32(env.episode_length),
+            past_costs=empty_window(cfg.cost_window, jnp.shape(limit(cfg, named(cfg)))),
+            key=key,
+            iteration=jnp.int32(0),
+        )
+
+    def task(ts: TrainState) -> Env:
+        return augmentation.wrap(env, ts.config, ts.dual)
+
+    def update(ts: TrainState) -> tuple[TrainState, Metrics]:
+        cfg = ts.config
+        key, rollout_key, step_key, critic_key = jax.random.split(ts.key, 4)
+
+        def behave(obs: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+            dist = policy(ts.params["actor"], see(ts, obs), cfg)
+            action = sample(dist, key)
+            return action, log_prob(dist, action)
+
+        pool = augmentation.renew(ts.rollout.pool, cfg, ts.dual)
+        rollout, traj = collect(
+            task(ts),
+            behave,
+            dataclasses.replace(ts.rollout, pool=pool),
+            own(rollout_key, axis_name),
+            cfg.horizon,
+            lambda episode: augmentation.stop(episode, cfg),
+        )
+        names = named(cfg)
+        charged = signal(env, traj, names)
+        reward, cost, signals = learned(ts, augmentation.reward(traj, cfg), charged, axis_name)
+        last_obs = augmentation.last_obs(traj, cfg)
+        batch, explained = estimate(ts, traj, last_obs, reward, cost, names, axis_name)
+        length = mean_length(ts.episode_length, traj.ended, traj.length, axis_name)
+        cost_rate = batch_mean(traj.cost, axis_name)
+        episode_cost = batch_mean(charged, axis_name, (0, 1)) * length
+        recent, past_costs = window_mean(ts.past_costs, episode_cost)
+
+        actor, opt_actor, dual, metrics = improve(ts, batch, recent, length, step_key)
+        critics, opt_critics, skipped = {}, (), 0
+        if cfg.trunk == "separate":
+            passes = metrics["train/passes"] if stops_critics(cfg) else cfg.critic_epochs
+            critics, opt_critics, skipped, fitted = fit_critics(
+                ts, batch, passes, critic_key, axis_name
+            )
+            metrics |= fitted
+        seen = traj.obs[..., : env.obs_size]
+        normaliser = merge(ts.normaliser, seen, axis_name) if cfg.obs_normalize else ()
+        # parameters are guarded step by step; what is not a step of a gradient is guarded here
+        finite = psum(~all_finite((batch, normaliser, signals)), axis_name) == 0
+        dual, normaliser, signals, length, past_costs = select(
+            finite,
+            (dual, normaliser, signals, length, past_costs),
+            (ts.dual, ts.normaliser, ts.signals, ts.episode_length, ts.past_costs),
+        )
+        metrics |= explained | {"train/cost_estimate": episode_cost}
+        metrics = spread(metrics, names) | episode_metrics(env, traj, axis_name)
+        metrics |= {
+            "train/cost_rate": cost_rate,  # per environment step
+            "train/cost_estimate": cost_rate * length,  # J_c of this iteration
+            "train/return_estimate": batch_mean(traj.reward, axis_name) * length,  # likewise
+            "train/entropy": batch_mean(entropy(policy(actor, batch.obs, cfg)), axis_name),
+            "train/nonfinite": metrics["train/nonfinite"] + skipped + ~finite,
+        }
+        ts = dataclasses.replace(
+            ts,
+            params={"actor": actor, **critics},
+            opt_state={"actor": opt_actor, "critics": opt_critics},
+            dual=dual,
+            normaliser=normaliser,
+            signals=signals,
+            rollout=rollout,
+            episode_length=length,
+            past_costs=past_costs,
+            key=key,
+            iteration=ts.iteration + 1,
+        )
+        return ts, jax.tree.map(jnp.float32, metrics)
+
+    def act(ts: TrainState, obs: jax.Array, key: jax.Array | None) -> jax.Array:
+        dist = policy(ts.params["actor"], see(ts, obs), ts.config)
+        return dist.mean if key is None else sample(dist, key)
+
+    return Algorithm(init, update, act, task)
+
+
+def fit_critics(
+    ts: TrainState, batch: Batch, passes: jax.Array | int, key: jax.Array, axis_name: str | None
+) -> tuple[dict[str, PyTree], PyTree, jax.Array, Metrics]:
+    """All critics fitted to their targets at once: {'critic_r', 'critic_c'}, opt_state, the number of
+    steps skipped, and metrics."""
+    fit = partial(fit_critic, obs=batch.obs, passes=passes, key=key, cfg=ts.config, axis_name=axis_name)
+    critics, opt_state, errors, skipped = jax.vmap(lambda c, o, y: fit(c, o, target=y))(
+        stack_critics(ts.params), ts.opt_state["critics"], stack(batch.ret_r, batch.ret_c.T)
+    )
+    params = {
+        "critic_r": jax.tree.map(operator.itemgetter(0), critics),
+        "critic_c": jax.tree.map(lambda x, c: x[1:].reshape(c.shape), critics, ts.params["critic_c"]),
+    }
+    metrics = {
+        "train/value_loss_r": errors[0],
+        "train/value_loss_c": errors[1:].reshape(batch.ret_c.shape[1:]),
+    }
+    return params, opt_state, skipped.sum(), metrics
+
+
+def own(key: jax.Array, axis_name: str | None) -> jax.Array:
+    """A key of this device's own."""
+    return key if axis_name is None else jax.random.fold_in(key, jax.lax.axis_index(axis_name))
+
+
+def see(ts: TrainState, obs: jax.Array) -> jax.Array:
+    """`obs` [..., O] as the networks see it: what an augmentation appended is left as it is."""
+    if not ts.config.obs_normalize:
+        return obs
+    size = ts.normaliser.mean.shape[-1]
+    return jnp.concatenate([normalise(ts.normaliser, obs[..., :size]), obs[..., size:]], -1)
+
+
+def init_signals(cfg: Any, costs: int) -> PyTree:
+    return init_normaliser(1 + costs) if cfg.reward_normalize or cfg.cost_normalize else ()
+
+
+def learned(
+    ts: TrainState, reward: jax.Array, cost: jax.Array, axis_name: str | None
+) -> tuple[jax.Array, jax.Array, PyTree]:
+    """Reward [T, N] and cost, [T, N] or [T, N, K], as the learner sees them, and `ts.signals` with
+    them added.
+
+    Unlike observations, on which the policy has acted already, a batch is normalised by statistics
+    that include it, as in OmniSafe, so that the critics' first targets have the scale of all others.
+    """
+    cfg = ts.config
+    if not (cfg.reward_normalize or cfg.cost_normalize):
+        return reward, cost, ()
+    all_of_them = jnp.concatenate([reward[..., None], cost.reshape(*reward.shape, -1)], -1)
+    signals = merge(ts.signals, all_of_them, axis_name)
+    scaled = normalise(signals, all_of_them)
+    return (
+        scaled[..., 0] if cfg.reward_normalize else reward,
+        scaled[..., 1:].reshape(cost.shape) if cfg.cost_normalize else cost,
+        signals,
+    )
+
+
+def check(cfg: Any) -> None:
+    """Refuse sizes that do not fit each other."""
+    for name in ("num_envs", "horizon", "minibatches", "cost_window"):
+        if getattr(cfg, name) < 1:
+            raise ConfigError(f"{name}={getattr(cfg, name)}: expected at least 1")
+    size = cfg.num_envs * cfg.horizon
+    if size % cfg.minibatches:
+        divisors = [m for m in range(1, size + 1) if size % m == 0]
+        raise ConfigError(
+            f"minibatches={cfg.minibatches}: expected a divisor of num_envs * horizon = {size}; "
+            f"the nearest is {min(divisors, key=lambda m: abs(m - cfg.minibatches))}"
+        )
+
+
+def estimate(
+    ts: TrainState,
+    traj: Trajectory,
+    next_obs: jax.Array,
+    reward: jax.Array,
+    cost: jax.Array,
+    names: Names,
+    axis_name: str | None,
+) -> tuple[Batch, Metrics]:
+    """Advantages and targets of `reward` [T, N] and of `cost` [T, N] or, for several `names`,
+    [T, N, K], under the parameters that acted. next_obs [T, N, O]: whose value a step leads to."""
+    cfg = ts.config
+    obs, next_obs = see(ts, traj.obs), see(ts, next_obs)
+    old = policy(ts.params["actor"], obs, cfg)
+    ratio = jnp.exp(log_prob(old, traj.action) - traj.log_prob)  # 1: the policy is still the same
+
+    v, next_v = values(ts.params, obs, cfg), values(ts.params, next_obs, cfg)
+    v_c, next_v_c = (x[..., 1:].reshape(cost.shape) for x in (v, next_v))
+
+    def both(v: jax.Array, next_v: jax.Array, signal: jax.Array, discount: Any, decay: Any):
+        ends = traj.terminated, traj.done
+        adv, error = advantages(
+            cfg.estimator, signal, v, next_v, *ends, ratio, discount=discount, decay=decay
+        )
+        return adv, error, error + v
+
+    adv_r, error_r, ret_r = both(v[..., 0], next_v[..., 0], reward, cfg.discount, cfg.gae_lambda)
+    of_cost = jax.vmap(both, (-1, -1, -1, None, None), -1) if names else both
+    adv_c, error_c, ret_c = of_cost(v_c, next_v_c, cost, cfg.cost_discount, cfg.cost_gae_lambda)
+    batch = Batch(
+        obs=obs,
+        action=traj.action,
+        log_prob=traj.log_prob,
+        old=old,
+        adv_r=standardise(adv_r, axis_name),
+        adv_c=each(lambda x: centre(x, axis_name), names)(adv_c),
+        ret_r=ret_r,
+        ret_c=ret_c,
+    )
+    metrics = {
+        "train/explained_variance_r": explained_variance(error_r, ret_r, axis_name),
+        "train/explained_variance_c": each(
+            lambda error, target: explained_variance(error, target, axis_name), names
+        )(error_c, ret_c),
+    }
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch), metrics
+
+
+def explained_variance(error: jax.Array, target: jax.Array, axis_name: str | None) -> jax.Array:
+    """1 - var(target - value) / var(target): 1 is a perfect critic, 0 one that knows the mean only."""
+    total = batch_mean(centre(target, axis_name) ** 2, axis_name)
+    return 1 - batch_mean(centre(error, axis_name) ** 2, axis_name) / jnp.maximum(total, 1e-8)
+
+
+def episode_metrics(env: Env, traj: Trajectory, axis_name: str | None) -> Metrics:
+    """Means over the complete episodes that ended in the batch; NaN where there are none."""
+    over = partial(masked_mean, mask=traj.ended, axis_name=axis_name)
+    episode = traj.episode
+    return {
+        "train/episodes": psum(traj.ended.sum(), axis_name),
+        "train/return": over(episode.ret),
+        "train/cost": over(episode.cost),
+        "train/episode_length": over(traj.length),
+        **{f"train/cost_{name}": over(episode.costs[..., k]) for k, name in enumerate(env.cost_names)},
+        **{f"train/{name}": over(x) for name, x in episode.info.items()},
+    }

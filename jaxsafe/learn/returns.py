@@ -1,0 +1,185 @@
+"""Advantages, and what an episode costs."""
+
+from functools import partial
+from typing import Literal, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+
+from jaxsafe.learn.batch import psum
+
+Estimator = Literal["gae", "gae_rtg", "plain", "vtrace"]
+
+
+def gae(
+    reward: jax.Array,
+    value: jax.Array,
+    next_value: jax.Array,
+    terminated: jax.Array,
+    done: jax.Array,
+    *,
+    discount: jax.Array | float,
+    decay: jax.Array | float,
+) -> jax.Array:
+    """Generalised advantage estimates, for rewards or for costs.
+
+        delta_t = r_t + discount (0 if terminated_t else V(s_{t+1})) - V(s_t)
+        A_t     = delta_t + discount decay (0 if done_t else A_{t+1})
+
+    `terminated` cuts the bootstrap, `done` (terminated or out of time) cuts the sum, so a
+    time limit still bootstraps from `next_value`, the value of the state before the reset.
+    Nothing is multiplied by zero: a value that is not finite stays behind the cut.
+
+    Args:
+        reward, value, next_value: float [T, N], over steps and environments.
+        terminated, done: bool [T, N].
+        discount, decay: scalars in [0, 1]; gamma and lambda in the paper.
+    Returns:
+        Advantages, float [T, N], in the units of `reward`. With `value` added they are the
+        TD(lambda) returns.
+    Raises:
+        AssertionError: while tracing, if the five arrays differ in shape.
+    Source: Schulman et al. (2016), "High-Dimensional Continuous Control Using
+        Generalized Advantage Estimation", section 3.
+    """
+    chex.assert_equal_shape([reward, value, next_value, terminated, done])
+    delta = td_error(reward, value, next_value, terminated, discount)
+    return backward_sums(delta, done, discount * decay, jnp.ones_like(delta))
+
+
+def td_error(
+    reward: jax.Array,
+    value: jax.Array,
+    next_value: jax.Array,
+    terminated: jax.Array,
+    discount: jax.Array | float,
+) -> jax.Array:
+    return reward + discount * jnp.where(terminated, 0.0, next_value) - value
+
+
+def backward_sums(
+    delta: jax.Array, done: jax.Array, factor: jax.Array | float, rho: jax.Array
+) -> jax.Array:
+    """A_t = rho_t (delta_t + factor (1 - done_t) A_{t+1}), float [T, N]."""
+
+    def backward(later: jax.Array, x: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
+        delta, done, rho = x
+        now = rho * (delta + factor * jnp.where(done, 0.0, later))
+        return now, now
+
+    return jax.lax.scan(backward, jnp.zeros_like(delta[0]), (delta, done, rho), reverse=True)[1]
+
+
+def vtrace(
+    reward: jax.Array,
+    value: jax.Array,
+    next_value: jax.Array,
+    terminated: jax.Array,
+    done: jax.Array,
+    ratio: jax.Array,
+    *,
+    discount: jax.Array | float,
+) -> jax.Array:
+    """V-trace: advantages for a policy pi from the data of another, mu.
+
+        A_t = rho_t (r_t + discount v_{t+1} - V(s_t)),   v_t = V(s_t) + A_t,   rho_t = min(1, pi / mu)
+
+    where v_{t+1} is 0 if terminated_t, else V(s_{t+1}) if done_t. Both of the paper's clips, rho and
+    c, are at 1, which makes one recursion of its two: v_t - V(s_t) is A_t. With pi = mu it is
+    `gae` with a decay of 1.
+
+    Args:
+        ratio: float [T, N], pi(a_t | s_t) / mu(a_t | s_t); the others as for `gae`.
+    Returns:
+        Advantages, float [T, N]. With `value` added they are the targets v.
+    Source: Espeholt et al. (2018), "IMPALA: Scalable Distributed Deep-RL with Importance Weighted
+        Actor-Learner Architectures", arXiv:1802.01561, equation 1 and section 4.2.
+    """
+    chex.assert_equal_shape([reward, value, next_value, terminated, done, ratio])
+    delta = td_error(reward, value, next_value, terminated, discount)
+    return backward_sums(delta, done, discount, jnp.minimum(1.0, ratio))
+
+
+def advantages(
+    estimator: Estimator,
+    reward: jax.Array,
+    value: jax.Array,
+    next_value: jax.Array,
+    terminated: jax.Array,
+    done: jax.Array,
+    ratio: jax.Array,
+    *,
+    discount: jax.Array | float,
+    decay: jax.Array | float,
+) -> tuple[jax.Array, jax.Array]:
+    """Advantages, and the errors of the critic: its targets less `value`. OmniSafe's four:
+
+        gae:      generalised advantages; their own TD(lambda) returns as targets
+        gae_rtg:  generalised advantages; discounted rewards to go as targets
+        plain:    temporal differences of one step; rewards to go as targets
+        vtrace:   V-trace, for both
+
+    Rewards to go run to the end of the episode or of the batch and add the value there, unless it
+    terminated: V(s) plus `gae` with a decay of 1.
+
+    Args: as for `vtrace` and `gae`; only those two names with gae in them read `decay`.
+    """
+    sums = partial(gae, reward, value, next_value, terminated, done, discount=discount)
+    match estimator:
+        case "gae":
+            advantage = error = sums(decay=decay)
+        case "gae_rtg":
+            advantage, error = sums(decay=decay), sums(decay=1.0)
+        case "plain":
+            advantage = td_error(reward, value, next_value, terminated, discount)
+            error = sums(decay=1.0)
+        case "vtrace":
+            advantage = error = vtrace(
+                reward, value, next_value, terminated, done, ratio, discount=discount
+            )
+    return advantage, error
+
+
+class Window(NamedTuple):
+    """The last W of some values, float [W, ...], the newest last, and how many there are, int32 []."""
+
+    values: jax.Array
+    count: jax.Array
+
+
+def empty_window(size: int, shape: tuple[int, ...]) -> Window:
+    return Window(jnp.zeros((size, *shape)), jnp.int32(0))
+
+
+def window_mean(window: Window, value: jax.Array) -> tuple[jax.Array, Window]:
+    """The mean of the last W values, of which `value` is one, and the window with it."""
+    values = jnp.concatenate([window.values[1:], value[None]])
+    count = jnp.minimum(window.count + 1, len(values))
+    return values.sum(0) / count, Window(values, count)
+
+
+def mean_length(
+    length: jax.Array, ended: jax.Array, lengths: jax.Array, axis_name: str | None = None
+) -> jax.Array:
+    """A running mean of episode lengths, in steps: what a cost per step is multiplied by.
+
+    By the renewal-reward theorem an episode's mean cost is the mean cost per step times the mean
+    length of an episode. The batch gives the first factor without lag, whether or not an episode
+    ended in it. This is the second: it starts at the time limit, where it stays, exactly, while
+    nothing terminates early; else it is a mean over about the last N complete episodes. So
+
+    - over synchronous whole episodes the product is their plain mean cost, Safety Gym's J_c;
+    - over parts of staggered episodes that only time ends, it is unbiased: rate times limit;
+    - early terminations reach the length with a lag of an episode, since one that is shortened is
+      known at once and one that is not only when it ends. The cost rate never lags.
+
+    Args:
+        length: float [], the mean so far, at first `env.episode_length`.
+        ended: bool [T, N], complete episodes that ended.
+        lengths: int [T, N], their lengths there.
+    """
+    excess, count, memory = psum(
+        (jnp.where(ended, lengths - length, 0.0).sum(), ended.sum(), ended.shape[1]), axis_name
+    )
+    return length + excess / (count + memory)

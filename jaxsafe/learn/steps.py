@@ -1,0 +1,218 @@
+"""First-order steps: epochs of Adam on minibatches, for policies and for critics.
+
+Policy and critics have loops of their own, so that stopping the policy early leaves the critics'
+passes alone. OmniSafe alternates them on each minibatch and stops all three together
+(`critics_stop`). On a shared trunk they are one network, and their loss is one.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from jaxsafe.config import ConfigError
+from jaxsafe.learn.batch import batch_mean, pmean, select
+from jaxsafe.nn.gaussian import Gaussian, kl
+from jaxsafe.nn.networks import outputs, policy, stack, value
+from jaxsafe.types import Metrics, PyTree
+
+# (actor, batch) -> (this device's mean of what to maximise, metrics)
+Objective = Callable[[PyTree, Any], tuple[jax.Array, Metrics]]
+
+
+class Step(NamedTuple):
+    """A rule that moves the policy; one objective or two, as its `update` says.
+
+    init(actor, cfg) -> opt_state
+    update(actor, opt_state, objective, batch, key, cfg, axis_name) -> (actor, opt_state, metrics)
+
+    On a shared trunk `update` trains the critics too (`with_values`), or else `init` refuses it
+    (`own_trunk`).
+    """
+
+    init: Callable[[PyTree, Any], PyTree]
+    update: Callable[..., tuple[PyTree, PyTree, Metrics]]
+
+
+class AdamState(NamedTuple):
+    adam: PyTree
+    iteration: jax.Array  # int32 [], updates so far
+
+
+def adam(lr: jax.Array | float, cfg: Any) -> optax.GradientTransformation:
+    return optax.chain(optax.clip_by_global_norm(cfg.max_grad_norm), optax.adam(lr))
+
+
+def remaining(iteration: jax.Array, cfg: Any) -> jax.Array:
+    """The share of training that is left: 1 at first, 0 from `cfg.total_iterations` on."""
+    total = jnp.where(cfg.total_iterations > 0, cfg.total_iterations, jnp.inf)
+    return jnp.maximum(0.0, 1.0 - iteration / total)
+
+
+def descend(
+    optimiser: optax.GradientTransformation, params: PyTree, opt_state: PyTree, grads: PyTree
+) -> tuple[PyTree, PyTree, jax.Array]:
+    """One step of `optimiser`, or none if a gradient is not finite: (params, opt_state, skipped)."""
+    change, new_state = optimiser.update(grads, opt_state, params)
+    finite = jnp.isfinite(optax.tree.norm(grads))
+    new = (optax.apply_updates(params, change), new_state)
+    return *select(finite, new, (params, opt_state)), ~finite
+
+
+def one_pass(
+    step: Callable[[PyTree, PyTree], tuple[PyTree, PyTree]],
+    carry: PyTree,
+    data: PyTree,
+    key: jax.Array,
+    minibatches: int,
+) -> tuple[PyTree, PyTree]:
+    """Scan `step(carry, minibatch)` over a shuffle of `data`, whose leaves are [B, ...]."""
+    size = jax.tree.leaves(data)[0].shape[0]
+    rows = jax.random.permutation(key, size).reshape(minibatches, size // minibatches)
+
+    def on_rows(carry: PyTree, rows: jax.Array) -> tuple[PyTree, PyTree]:
+        return step(carry, jax.tree.map(lambda x: x[rows], data))
+
+    return jax.lax.scan(on_rows, carry, rows)
+
+
+def mean_kl(old: Gaussian, new: Gaussian, axis_name: str | None) -> jax.Array:
+    return batch_mean(kl(old, new), axis_name)
+
+
+def init_adam(actor: PyTree, cfg: Any) -> AdamState:
+    return AdamState(adam(cfg.lr, cfg).init(actor), jnp.int32(0))
+
+
+def update_adam(
+    actor: PyTree,
+    opt_state: AdamState,
+    objective: Objective,
+    batch: Any,
+    key: jax.Array,
+    cfg: Any,
+    axis_name: str | None,
+) -> tuple[PyTree, AdamState, Metrics]:
+    """Up to `cfg.epochs` passes over the batch, until KL(old || new) > `cfg.target_kl`.
+
+    The KL is the mean over the whole batch, taken after each pass; there is no way back. The
+    learning rate falls linearly to 0 at `cfg.total_iterations`, if `cfg.lr_decay`.
+    """
+    objective = with_values(objective, cfg) if cfg.trunk == "shared" else objective
+    left = remaining(opt_state.iteration, cfg) if cfg.lr_decay else 1.0
+    optimiser = adam(cfg.lr * left, cfg)
+
+    def minibatch_step(carry: PyTree, batch: Any) -> tuple[PyTree, jax.Array]:
+        grads = jax.grad(lambda actor: -objective(actor, batch)[0])(carry[0])
+        actor, state, skipped = descend(optimiser, carry[0], carry[1], pmean(grads, axis_name))
+        return (actor, state), skipped
+
+    def next_pass(carry: PyTree) -> PyTree:
+        params, key, passes, _, skipped = carry
+        key, shuffle_key = jax.random.split(key)
+        params, skips = one_pass(minibatch_step, params, batch, shuffle_key, cfg.minibatches)
+        divergence = mean_kl(batch.old, policy(params[0], batch.obs, cfg), axis_name)
+        return params, key, passes + 1, divergence, skipped + skips.sum()
+
+    (actor, state), _, passes, divergence, skipped = jax.lax.while_loop(
+        lambda carry: (carry[2] < cfg.epochs) & ~(carry[3] > cfg.target_kl),
+        next_pass,
+        ((actor, opt_state.adam), key, jnp.int32(0), jnp.zeros(()), jnp.int32(0)),
+    )
+    final, metrics = pmean(objective(actor, batch), axis_name)
+    return (
+        actor,
+        AdamState(state, opt_state.iteration + 1),
+        {
+            "train/kl": divergence,
+            "train/passes": passes,
+            "train/objective": final,
+            "train/nonfinite": skipped,
+            **metrics,
+        },
+    )
+
+
+adam_epochs = Step(init=init_adam, update=update_adam)
+
+
+def with_values(objective: Objective, cfg: Any) -> Objective:
+    """`objective` - value_coef sum_i E[(V_i - target_i)^2], over reward and costs, on a shared trunk.
+
+    Source: Schulman et al. (2017), "Proximal Policy Optimization Algorithms", equation 9.
+    """
+
+    def joint(actor: PyTree, batch: Any) -> tuple[jax.Array, Metrics]:
+        gain, metrics = objective(actor, batch)
+        targets = stack(batch.ret_r, batch.ret_c.T)
+        errors = jnp.mean((outputs(actor, batch.obs, cfg)[1] - targets.T) ** 2, axis=0)
+        of_cost = errors[1:].reshape(batch.ret_c.shape[1:])
+        metrics = metrics | {"train/value_loss_r": errors[0], "train/value_loss_c": of_cost}
+        metrics |= {"train/objective": gain}
+        return gain - cfg.value_coef * errors.sum(), metrics
+
+    return joint
+
+
+def own_trunk(actor: PyTree, cfg: Any) -> tuple[()]:
+    """The empty state of a step that moves the policy alone.
+
+    Raises:
+        ConfigError: a shared trunk, which such a step would leave without critics.
+    """
+    if cfg.trunk == "shared":
+        raise ConfigError(
+            "trunk=shared: expected separate, for a step by natural gradients moves the policy alone; "
+            "policy and critics share a trunk where Adam takes the steps, as in ppo_lag or focops"
+        )
+    return ()
+
+
+def fit_critic(
+    critic: PyTree,
+    opt_state: PyTree,
+    obs: jax.Array,
+    target: jax.Array,
+    passes: jax.Array | int,
+    key: jax.Array,
+    cfg: Any,
+    axis_name: str | None,
+) -> tuple[PyTree, PyTree, jax.Array, jax.Array]:
+    """`cfg.critic_epochs` passes of Adam on mean (V - target)^2 + critic_norm_coef sum theta^2.
+
+    Args:
+        obs, target: float [B, O] and [B].
+        passes: whose change counts, the first of them.
+    Returns:
+        critic, opt_state, the mean squared error during the last pass that counts, and the number
+        of its and earlier minibatch steps skipped because their gradient was not finite.
+    """
+    optimiser = adam(cfg.critic_lr, cfg)
+
+    def loss(critic: PyTree, obs: jax.Array, target: jax.Array) -> tuple[jax.Array, jax.Array]:
+        error = jnp.mean((value(critic, obs, cfg) - target) ** 2)
+        return error + cfg.critic_norm_coef * sum(jnp.sum(x**2) for x in jax.tree.leaves(critic)), error
+
+    def minibatch_step(carry: PyTree, data: PyTree) -> tuple[PyTree, PyTree]:
+        grads, error = jax.grad(loss, has_aux=True)(carry[0], *data)
+        critic, state, skipped = descend(optimiser, carry[0], carry[1], pmean(grads, axis_name))
+        return (critic, state), (error, skipped)
+
+    def next_pass(carry: PyTree, key: jax.Array) -> tuple[PyTree, PyTree]:
+        before, done = carry
+        after, metrics = one_pass(minibatch_step, before, (obs, target), key, cfg.minibatches)
+        return (select(done < passes, after, before), done + 1), metrics
+
+    ((critic, opt_state), _), (errors, skipped) = jax.lax.scan(
+        next_pass, ((critic, opt_state), 0), jax.random.split(key, cfg.critic_epochs)
+    )
+    counted = jnp.arange(cfg.critic_epochs) < passes
+    error = errors[jnp.maximum(counted.sum(), 1) - 1]
+    return critic, opt_state, batch_mean(error, axis_name), (skipped * counted[:, None]).sum()
+
+
+def stops_critics(cfg: Any) -> bool:
+    """Whether the critics stop with a policy that Adam moves; other policies have no passes."""
+    return getattr(cfg, "critics_stop", False)

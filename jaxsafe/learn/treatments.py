@@ -1,0 +1,163 @@
+"""Treatments of the constraint: how the cost advantage joins the reward's in one objective."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from jaxsafe.config import config
+from jaxsafe.learn.constraints import LimitsConfig, Names, limit, named, unnamed
+from jaxsafe.types import Metrics, PyTree
+
+
+class Treatment(NamedTuple):
+    """init(cfg) -> dual; update(dual, episode_cost, cfg) -> dual, once an iteration, before the
+    policy's step; advantage(dual, adv_r, adv_c) -> float [B], what the policy maximises;
+    metrics(dual); named(cfg) -> the costs it holds under limits of their own, () for `cost` alone.
+    """
+
+    init: Callable[[Any], PyTree]
+    update: Callable[[PyTree, jax.Array, Any], PyTree]
+    advantage: Callable[[PyTree, jax.Array, jax.Array], jax.Array]
+    metrics: Callable[[PyTree], Metrics]
+    named: Callable[[Any], Names] = unnamed
+
+
+none = Treatment(
+    init=lambda cfg: (),
+    update=lambda dual, episode_cost, cfg: (),
+    advantage=lambda dual, adv_r, adv_c: adv_r,
+    metrics=lambda dual: {},
+)
+
+
+@config
+class LagrangianConfig(LimitsConfig):
+    lam_init: float = 0.001  # OmniSafe
+    lam_max: float = float("inf")  # OmniSafe
+    dual_lr: float = 0.1  # Adam's step, whatever the size of the violation; OmniSafe 0.035
+
+
+class Multiplier(NamedTuple):
+    lam: jax.Array  # float [] or [K], standard deviations of A_r per unit of cost, >= 0
+    opt_state: PyTree
+
+
+def first_price(cfg: Any) -> jax.Array:
+    return jnp.full(jnp.shape(limit(cfg, named(cfg))), cfg.lam_init, jnp.float32)
+
+
+def init_multiplier(cfg: Any) -> Multiplier:
+    lam = first_price(cfg)
+    return Multiplier(lam, optax.adam(cfg.dual_lr).init(lam))
+
+
+def adam_ascent(dual: Multiplier, episode_cost: jax.Array, cfg: Any) -> Multiplier:
+    """One Adam step on the loss -lam (J_c - cost_limit), then lam in [0, lam_max]."""
+    grad = -(episode_cost - limit(cfg, named(cfg)))
+    change, opt_state = optax.adam(cfg.dual_lr).update(grad, dual.opt_state)
+    lam: Any = optax.apply_updates(dual.lam, change)
+    return Multiplier(jnp.clip(lam, 0.0, cfg.lam_max), opt_state)
+
+
+def mixed(dual: Any, adv_r: jax.Array, adv_c: jax.Array) -> jax.Array:
+    """A = (A_r - sum_i lam_i A_ci) / (1 + sum_i lam_i), over the constraints; A_c is [B] or [B, K]."""
+    price = jnp.dot(adv_c, dual.lam, precision=jax.lax.Precision.HIGHEST)  # of one, their product
+    return (adv_r - price) / (1.0 + dual.lam.sum())
+
+
+# Ray, Achiam and Amodei (2019), and the scale from their code
+lagrangian = Treatment(
+    init=init_multiplier,
+    update=adam_ascent,
+    advantage=mixed,
+    metrics=lambda dual: {"train/lam": dual.lam},
+    named=named,
+)
+
+
+@config
+class PIDConfig(LimitsConfig):
+    lam_init: float = 0.001  # OmniSafe
+    pid_kp: float = 0.1  # of the smoothed error; OmniSafe
+    pid_ki: float = 0.01  # of the error, each iteration; OmniSafe
+    pid_kd: float = 0.01  # of the smoothed cost's rise; OmniSafe
+    pid_smoothing: float = 0.95  # share of the past in what is smoothed; OmniSafe
+    pid_delay: int = 10  # iterations over which a rise is taken; OmniSafe
+
+
+class PID(NamedTuple):
+    """What the controller remembers: lam and integral are prices, the others costs per episode.
+
+    Of several constraints all have a last axis K.
+    """
+
+    lam: jax.Array  # float [], standard deviations of A_r per unit of cost, >= 0
+    integral: jax.Array  # float [], K_i times the sum of errors, >= 0
+    error: jax.Array  # float [], smoothed J_c - cost_limit
+    cost: jax.Array  # float [], smoothed J_c
+    past: jax.Array  # float [pid_delay], earlier smoothed costs, oldest first
+
+
+def init_pid(cfg: Any) -> PID:
+    lam = first_price(cfg)
+    zero = jnp.zeros_like(lam)
+    return PID(lam, lam, zero, zero, jnp.zeros((cfg.pid_delay, *lam.shape)))
+
+
+def control(dual: PID, episode_cost: jax.Array, cfg: Any) -> PID:
+    """lam = (K_p P + I + K_d D)+, from the error's smoothed value, its sum, and the cost's rise."""
+    error = episode_cost - limit(cfg, named(cfg))
+    integral = jnp.maximum(0.0, dual.integral + cfg.pid_ki * error)
+    smooth = cfg.pid_smoothing * dual.error + (1 - cfg.pid_smoothing) * error
+    cost = cfg.pid_smoothing * dual.cost + (1 - cfg.pid_smoothing) * episode_cost
+    rise = jnp.maximum(0.0, cost - dual.past[0])
+    lam = jnp.maximum(0.0, cfg.pid_kp * smooth + integral + cfg.pid_kd * rise)
+    past = jnp.concatenate([dual.past[1:], cost[None]])
+    return PID(lam, integral, smooth, cost, past)
+
+
+# Stooke, Achiam and Abbeel (2020), "Responsive Safety in Reinforcement Learning by PID Lagrangian
+# Methods", arXiv:2007.03964, algorithm 2; the smoothing and the scale are from their code
+pid = Treatment(
+    init=init_pid,
+    update=control,
+    advantage=lagrangian.advantage,
+    metrics=lambda dual: {"train/lam": dual.lam, "train/integral": dual.integral},
+    named=named,
+)
+
+
+def barrier_price(dual: jax.Array, episode_cost: jax.Array, cfg: Any) -> jax.Array:
+    """The slope of the barrier -barrier log(cost_limit - J_c), or price_max where there is none."""
+    slack = cfg.cost_limit - episode_cost
+    price = cfg.barrier / jnp.where(slack > 0, slack, 1.0)
+    return jnp.where((slack > 0) & (price < cfg.price_max), price, cfg.price_max)
+
+
+# Liu, Ding and Liu (2020), "IPO: Interior-point Policy Optimization under Constraints",
+# arXiv:1910.09615, equation 6, whose barrier enters here by its gradient
+barrier = Treatment(
+    init=lambda cfg: jnp.zeros(()),
+    update=barrier_price,
+    advantage=lambda price, adv_r, adv_c: (adv_r - price * adv_c) / (1.0 + price),
+    metrics=lambda price: {"train/lam": price},
+)
+
+penalty = Treatment(
+    init=lambda cfg: jnp.asarray(cfg.price, jnp.float32),
+    update=lambda price, episode_cost, cfg: price,
+    advantage=lambda price, adv_r, adv_c: adv_r - price * adv_c,
+    metrics=lambda price: {"train/lam": price},
+)
+
+# Xu, Liang and Lan (2021), "CRPO: A New Approach for Safe Reinforcement Learning with Convergence
+# Guarantee", arXiv:2011.05869, algorithm 1
+switch = Treatment(
+    init=lambda cfg: jnp.bool_(False),
+    update=lambda over_limit, episode_cost, cfg: episode_cost > cfg.cost_limit + cfg.tolerance,
+    advantage=lambda over_limit, adv_r, adv_c: jnp.where(over_limit, -adv_c, adv_r),
+    metrics=lambda over_limit: {"train/over_limit": over_limit},
+)

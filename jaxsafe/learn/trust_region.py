@@ -1,0 +1,161 @@
+"""Trust-region steps, and what they share: Fisher products, conjugate gradients, a line search.
+
+Vectors are flat, float [P]: the policy's parameters through `ravel_pytree`.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+
+from jaxsafe.learn.batch import all_finite, pmean
+from jaxsafe.learn.steps import Objective, Step, mean_kl, own_trunk
+from jaxsafe.nn.gaussian import Gaussian, kl
+from jaxsafe.nn.networks import policy
+from jaxsafe.types import Metrics, PyTree
+
+Matvec = Callable[[jax.Array], jax.Array]
+
+
+def fisher_product(
+    dist: Callable[[jax.Array], Gaussian],
+    params: jax.Array,
+    old: Gaussian,
+    cfg: Any,
+    axis_name: str | None,
+) -> Matvec:
+    """v -> H v + damping v, with H the Hessian of E_s[KL(old || dist(params))] at `params`.
+
+    The KL is summed over action dimensions, unless `cfg.kl_per_action`, and averaged over states and
+    devices. Where `params` are the old policy's, H is the Fisher information. The gradient is
+    linearised once for all v.
+    """
+
+    def divergence(params: jax.Array) -> jax.Array:
+        return jnp.mean(kl(old, dist(params))) / dimensions(old, cfg)
+
+    product = jax.linearize(jax.grad(divergence), params)[1]
+    return lambda v: pmean(product(v), axis_name) + cfg.damping * v
+
+
+def dimensions(dist: Gaussian, cfg: Any) -> int:
+    """What a sum over the dimensions of an action is divided by: with `kl_per_action` it is a mean."""
+    return dist.mean.shape[-1] if cfg.kl_per_action else 1
+
+
+def distance(old: Gaussian, new: Gaussian, cfg: Any, axis_name: str | None) -> jax.Array:
+    """KL(old || new), what `target_kl` bounds."""
+    return mean_kl(old, new, axis_name) / dimensions(old, cfg)
+
+
+def conjugate_gradient(matvec: Matvec, b: jax.Array, iterations: int) -> tuple[jax.Array, jax.Array]:
+    """Solve A x = b for a symmetric positive definite A: (x, ||b - A x|| / ||b||).
+
+    A fixed number of iterations from x = 0, frozen once the residual is at float32's floor. The
+    residual is the recursion's own; it is 0 for b = 0.
+
+    Source: Hestenes and Stiefel (1952); Nocedal and Wright (2006), algorithm 5.2.
+    """
+    scale = jnp.linalg.norm(b)
+    b = b / jnp.where(scale > 0, scale, 1.0)  # squares of small gradients would underflow
+
+    def iterate(_: int, carry: Any) -> Any:
+        x, r, p, rr = carry
+        a_p = matvec(p)
+        curvature = p @ a_p
+        going = (rr > 1e-14) & (curvature > 0)
+        alpha = jnp.where(going, rr / jnp.where(going, curvature, 1.0), 0.0)
+        r_new = r - alpha * a_p
+        rr_new = r_new @ r_new
+        beta = jnp.where(going, rr_new / jnp.where(going, rr, 1.0), 0.0)
+        return x + alpha * p, r_new, jnp.where(going, r_new + beta * p, p), rr_new
+
+    x, _, _, rr = jax.lax.fori_loop(0, iterations, iterate, (jnp.zeros_like(b), b, b, b @ b))
+    return scale * x, jnp.sqrt(rr)
+
+
+def line_search(
+    accept: Callable[[jax.Array], jax.Array],
+    start: jax.Array,
+    step: jax.Array,
+    tries: int,
+    shrink: float,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The first of start + shrink^i step, i < tries, that `accept` takes; else `start`.
+
+    Args:
+        accept: params [P] -> bool []. Comparisons with NaN are False, so it should ask for what
+            must hold rather than for what must not.
+    Returns:
+        params [P], accepted (bool []), and i (int32 [], `tries` if there is none).
+    """
+
+    def candidate(i: jax.Array) -> jax.Array:
+        return start + shrink ** i.astype(start.dtype) * step
+
+    accepted, i = jax.lax.while_loop(
+        lambda carry: ~carry[0] & (carry[1] < tries),
+        lambda carry: (ok := accept(candidate(carry[1])), carry[1] + jnp.where(ok, 0, 1)),
+        (jnp.bool_(False), jnp.int32(0)),
+    )
+    return jnp.where(accepted, candidate(i), start), accepted, i
+
+
+def update_natural(
+    actor: PyTree,
+    opt_state: PyTree,
+    objective: Objective,
+    batch: Any,
+    key: jax.Array,
+    cfg: Any,
+    axis_name: str | None,
+    search: bool,
+) -> tuple[PyTree, PyTree, Metrics]:
+    """theta + sqrt(2 delta / g'H^-1 g) H^-1 g, to where the quadratic model's KL is target_kl.
+
+    With `search` the step is shortened until the objective does not fall and the KL itself is at
+    most target_kl; else it is taken as it is.
+    """
+    start, unravel = ravel_pytree(actor)
+
+    def evaluate(params: jax.Array) -> tuple[jax.Array, jax.Array]:
+        actor = unravel(params)
+        gain = pmean(objective(actor, batch)[0], axis_name)
+        return gain, distance(batch.old, policy(actor, batch.obs, cfg), cfg, axis_name)
+
+    g = pmean(jax.grad(lambda params: objective(unravel(params), batch)[0])(start), axis_name)
+    product = fisher_product(
+        lambda params: policy(unravel(params), batch.obs, cfg), start, batch.old, cfg, axis_name
+    )
+    h_g, residual = conjugate_gradient(product, g, cfg.cg_iterations)
+    step = jnp.sqrt(2 * cfg.target_kl / jnp.maximum(g @ h_g, 1e-20)) * h_g
+    before, _ = evaluate(start)
+
+    def accept(params: jax.Array) -> jax.Array:
+        gain, divergence = evaluate(params)
+        return (gain >= before) & (divergence <= cfg.target_kl) if search else jnp.isfinite(gain)
+
+    tries, shrink = (cfg.line_search_tries, cfg.line_search_shrink) if search else (1, 1.0)
+    params, accepted, tried = line_search(accept, start, step, tries, shrink)
+    after, divergence = evaluate(params)
+    return (
+        unravel(params),
+        opt_state,
+        {
+            "train/kl": divergence,
+            "train/objective": after - before,
+            "train/accepted": accepted,
+            "train/line_search": tried,
+            "train/cg_residual_r": residual,
+            "train/nonfinite": ~all_finite((g, step)),
+        },
+    )
+
+
+# Kakade (2001), "A Natural Policy Gradient", with the step's length from the trust region
+natural_gradient = Step(own_trunk, partial(update_natural, search=False))
+# Schulman et al. (2015), "Trust Region Policy Optimization", arXiv:1502.05477, appendix C
+trust_region = Step(own_trunk, partial(update_natural, search=True))

@@ -1,0 +1,1 @@
+"""Networks and distributions, and nothing else."""

@@ -1,0 +1,130 @@
+"""The on-policy networks: a Gaussian policy, and a critic each for reward and for cost.
+
+They are networks of their own or, with `trunk` 'shared', one: hidden layers and the outputs of all.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from jaxsafe.nn.gaussian import Gaussian
+from jaxsafe.types import PyTree
+
+# range of a std that depends on the state; Haarnoja et al. (2018), the code of "Soft Actor-Critic"
+LOG_STD = (-20.0, 2.0)
+
+
+class MLP(nn.Module):
+    """Layers of `activation` and a linear one, float [..., I] -> [..., out].
+
+    weights 'orthogonal': gain sqrt(2), `gain` for the last layer, zero biases (Andrychowicz et al.,
+    2021, "What Matters in On-Policy Reinforcement Learning?"). 'torch': weights and biases uniform
+    in +-1 / sqrt(fan in), PyTorch's default, OmniSafe's kaiming_uniform with a = sqrt(5).
+    """
+
+    hidden: tuple[int, ...]
+    out: int
+    weights: str
+    activation: str
+    gain: float = 1.0
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        for size in self.hidden:
+            x = ACTIVATIONS[self.activation](self._dense(size, math.sqrt(2.0), x.shape[-1])(x))
+        return self._dense(self.out, self.gain, x.shape[-1])(x)
+
+    def _dense(self, size: int, gain: float, fan_in: int) -> nn.Dense:
+        kernel, bias = INITS[self.weights](gain, fan_in)
+        # full float32: on a GPU the default rounds products to 10 bits, too few for KLs of 1e-2
+        return nn.Dense(size, precision=jax.lax.Precision.HIGHEST, kernel_init=kernel, bias_init=bias)
+
+
+def torch_uniform(fan_in: int) -> Callable[..., jax.Array]:
+    def init(key: jax.Array, shape: Any, dtype: Any = jnp.float32) -> jax.Array:
+        return jax.random.uniform(key, shape, dtype, -1 / math.sqrt(fan_in), 1 / math.sqrt(fan_in))
+
+    return init
+
+
+ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {"tanh": nn.tanh, "relu": nn.relu}
+INITS = {  # name -> (gain, fan in) -> initialisers of weights and of biases
+    "orthogonal": lambda gain, fan_in: (nn.initializers.orthogonal(gain), nn.initializers.zeros),
+    "torch": lambda gain, fan_in: (torch_uniform(fan_in), torch_uniform(fan_in)),
+}
+
+
+def mlp(cfg: Any, out: int, gain: float = 1.0) -> MLP:
+    return MLP(cfg.hidden, out, cfg.init, cfg.activation, gain)
+
+
+def policy_outputs(action_size: int, cfg: Any) -> int:
+    return 2 * action_size if cfg.std == "state" else action_size
+
+
+def init_params(key: jax.Array, obs_size: int, action_size: int, cfg: Any) -> dict[str, PyTree]:
+    """{'actor': {'mean', 'log_std' [A]}, 'critic_r', 'critic_c'}, where with `std` 'state' the second
+    half of what 'mean' gives is added to log_std."""
+    keys, obs = jax.random.split(key, 3), jnp.zeros(obs_size)
+    actor = {
+        "mean": mlp(cfg, policy_outputs(action_size, cfg), gain=0.01).init(keys[0], obs),
+        "log_std": jnp.full(action_size, cfg.init_log_std, jnp.float32),
+    }
+    critic_r, critic_c = (mlp(cfg, 1).init(key, obs) for key in keys[1:])
+    return {"actor": actor, "critic_r": critic_r, "critic_c": critic_c}
+
+
+def stack(of_reward: jax.Array, of_cost: jax.Array) -> jax.Array:
+    """[1 + K, ...] of [...] and [K, ...]; or [2, ...] of two alike."""
+    return jnp.concatenate([of_reward[None], of_cost.reshape(-1, *of_reward.shape)])
+
+
+def stack_critics(params: dict[str, PyTree]) -> PyTree:
+    """All critics in one tree, [2, ...] or [1 + K, ...], so that they train in one program."""
+    return jax.tree.map(stack, params["critic_r"], params["critic_c"])
+
+
+def share_trunk(params: dict[str, PyTree], cfg: Any) -> dict[str, PyTree]:
+    """{'actor'} alone: the policy's hidden layers, with the critics' outputs after its own."""
+    layers, last = params["actor"]["mean"]["params"], f"Dense_{len(cfg.hidden)}"
+    joined = jax.tree.map(
+        lambda own, critics: jnp.concatenate([own, jnp.moveaxis(critics[..., 0], 0, -1)], -1),
+        layers[last],
+        stack_critics(params)["params"][last],
+    )
+    return {"actor": params["actor"] | {"mean": {"params": layers | {last: joined}}}}
+
+
+def outputs(actor: PyTree, obs: jax.Array, cfg: Any) -> tuple[jax.Array, jax.Array]:
+    """What the actor's network gives: the policy's outputs and, of a shared trunk, the critics' values
+    of reward and of each cost, float [..., 1 + K]."""
+    size = policy_outputs(actor["log_std"].shape[-1], cfg)
+    last = actor["mean"]["params"][f"Dense_{len(cfg.hidden)}"]
+    out: Any = mlp(cfg, last["bias"].shape[-1]).apply(actor["mean"], obs)
+    return out[..., :size], out[..., size:]
+
+
+def policy(actor: PyTree, obs: jax.Array, cfg: Any) -> Gaussian:
+    """The policy's action distribution for `obs` [..., O]; its mean and log std are [..., A]."""
+    out, _ = outputs(actor, obs, cfg)
+    if cfg.std == "state":
+        mean, change = jnp.split(out, 2, axis=-1)
+        return Gaussian(mean, jnp.clip(actor["log_std"] + change, *LOG_STD))
+    return Gaussian(out, jnp.broadcast_to(actor["log_std"], out.shape))
+
+
+def value(critic: PyTree, obs: jax.Array, cfg: Any) -> jax.Array:
+    """A critic's estimate for `obs` [..., O], float [...], in units of reward or of cost."""
+    out: Any = mlp(cfg, 1).apply(critic, obs)
+    return out[..., 0]
+
+
+def values(params: dict[str, PyTree], obs: jax.Array, cfg: Any) -> jax.Array:
+    """The values of reward and of each cost, float [..., 1 + K], whatever the trunk."""
+    if cfg.trunk == "shared":
+        return outputs(params["actor"], obs, cfg)[1]
+    return jax.vmap(lambda critic: value(critic, obs, cfg), out_axes=-1)(stack_critics(params))

@@ -1,0 +1,310 @@
+"""Pictures: the learning curves of a run; the curves, trade-off, scores and profiles of several."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
+
+from jaxsafe.learn.constraints import written
+from jaxsafe.report import stats
+from jaxsafe.run import run_folder
+
+FORMATS = ("png", "svg")
+MARKERS = {"-": "o", "--": "s", ":": "^", "-.": "v"}  # by the kind of line that goes with it
+PANELS = (("train/return", "return of an episode"), ("train/cost", "cost of an episode"))
+
+
+def by_seed(metrics: dict[str, np.ndarray], name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Steps [T] and values [S, T] of one metric; NaN where a seed has no value yet."""
+    steps, seeds = np.unique(metrics["steps"]), np.unique(metrics["seed"])
+    values = np.full((len(seeds), len(steps)), np.nan)
+    values[np.searchsorted(seeds, metrics["seed"]), np.searchsorted(steps, metrics["steps"])] = metrics[
+        name
+    ]
+    for row in values:
+        carry(row)  # over iterations in which no episode ended
+    return steps, values
+
+
+def curves(
+    metrics: dict[str, np.ndarray],
+    path: Path,
+    title: str,
+    cost_limit: float,
+    own_limits: Mapping[str, float] = MappingProxyType({}),
+) -> None:
+    """Write the PNG: a thin line a seed, and for several seeds their mean and 95 % interval.
+
+    Settings trained side by side have a colour each, and their own limits where those differ. Named
+    costs with limits of their own have panels instead of a limit on the sum.
+    """
+    # with each limit its column of metrics.csv, which is there where the settings differ in it
+    limits = {
+        f"train/cost_{name}": (limit, f"algo.cost_limits.{name}") for name, limit in own_limits.items()
+    }
+    panels = (
+        *PANELS,
+        *((name, f"{name.removeprefix('train/cost_')} of an episode") for name in limits),
+    )
+    limits = limits or {"train/cost": (cost_limit, "algo.cost_limit")}
+    figure = Figure(figsize=(5 * len(panels), 4), layout="constrained")
+    FigureCanvasAgg(figure)
+    settings = run_folder.by_setting(metrics)
+    for axes, (name, label) in zip(figure.subplots(1, len(panels)), panels, strict=True):
+        for i, (setting, table) in enumerate(settings.items()):
+            if name in table and len(table["steps"]):
+                draw(axes, *by_seed(table, name), f"C{i % 10}", setting)
+        if name in limits:
+            common, column = limits[name]
+            own = {t[column][0]: i for i, t in enumerate(settings.values()) if column in t}
+            for limit, i in (own or {common: 3}).items():
+                axes.axhline(limit, color=f"C{i % 10}", ls="--", lw=1, label=f"limit {limit:g}")
+        axes.set(xlabel="environment steps", ylabel=label)
+        if axes.get_legend_handles_labels()[0]:
+            axes.legend(frameon=False, fontsize="small")
+    figure.suptitle(title)
+    figure.savefig(path, dpi=120)
+
+
+def draw(axes: Axes, steps: np.ndarray, values: np.ndarray, color: str, setting: str) -> None:
+    """The curves of one setting, `values` [S, T]."""
+    alone = len(values) == 1
+    lines = axes.plot(steps, values.T, color=color, lw=1.2 if alone else 0.6, alpha=1 if alone else 0.4)
+    if not alone:
+        band(axes, steps, values, setting or f"mean of {len(values)} seeds", color=color)
+        axes.collections[-1].set_label(None if setting else "95 % interval")
+    elif setting:
+        lines[0].set_label(setting)
+
+
+def band(axes: Axes, steps: np.ndarray, values: np.ndarray, label: str, **style: Any) -> None:
+    """Mean over seeds and its 95 % interval, of `values` [S, T]."""
+    e = stats.estimate(values, draws=1000)
+    (line,) = axes.plot(steps, e.mean, lw=2, label=label, **style)
+    axes.fill_between(steps, e.low, e.high, color=line.get_color(), alpha=0.2, lw=0)
+
+
+def trade_off(
+    rows: Sequence[Any], title: str, published: Mapping[tuple[str, str], Any] = MappingProxyType({})
+) -> Figure:
+    """Return against cost of each row of a comparison: a panel an environment or, where named costs
+    have limits of their own, each of these.
+
+    A point is the mean over seeds with its 95 % interval, each limit a dashed line: grey, or in the
+    colour of the one setting it belongs to. The grey steps are the Pareto front of the means. A hollow
+    diamond is the mean that was published, by environment and name.
+    """
+    places = sorted({(row.env, name) for row in rows for name in row.limits or [""]})
+    figure, panels = grid(len(places), size=(4.6, 4))
+    looks = styles(rows)
+    for axes, (env, name) in zip(panels, places, strict=True):
+        shown = [row for row in rows if row.env == env]
+        limits = [row.limits.get(name, np.nan) for row in shown]
+        means = []
+        for i, row in enumerate(shown):
+            color, marker = looks[row.name]["color"], MARKERS[looks[row.name]["ls"]]
+            axes.plot(row.values(written(name)), row.returns, ".", color=color, ms=4, alpha=0.5)
+            ret, cost = row.ret, row.estimate(written(name))
+            means.append((cost.mean, ret.mean))
+            axes.errorbar(
+                cost.mean,
+                ret.mean,
+                xerr=[[cost.mean - cost.low], [cost.high - cost.mean]],
+                yerr=[[ret.mean - ret.low], [ret.high - ret.mean]],
+                fmt=marker,
+                color=color,
+                label=row.name,
+            )
+            if not name and (known := published.get((env, row.name))) is not None:
+                axes.plot(known.cost[0], known.ret[0], "D", mfc="none", ms=7, color=color)
+            if (limit := limits[i]) not in limits[:i]:
+                alone = limits.count(limit) == 1 and len({x for x in limits if not np.isnan(x)}) > 1
+                line = color if alone else "0.5"
+                axes.axvline(limit, color=line, ls="--", lw=1)
+        axes.plot(*front(means), color="0.6", lw=1, zorder=0)
+        axes.set(title=env, xlabel=f"{name or 'cost'} of an episode", ylabel=PANELS[0][1])
+    legend(figure, panels, looks)
+    figure.suptitle(title + ("; hollow: published" if any(published.values()) else ""))
+    return figure
+
+
+def front(points: Sequence[tuple[float, float]]) -> tuple[list[float], list[float]]:
+    """The corners of the steps under which no point costs less and returns more."""
+    xs: list[float] = []
+    ys: list[float] = []
+    for cost, ret in sorted(p for p in points if np.isfinite(p).all()):
+        if not ys or ret > ys[-1]:
+            xs += [cost, cost] if ys else [cost]
+            ys += [ys[-1], ret] if ys else [ret]
+    return xs, ys
+
+
+def learning(groups: Sequence[Any]) -> Figure:
+    """Return, cost and cost rate so far over environment steps: a row a task, a line a setting.
+
+    A point is the mean over one of at most 50 equal stretches of training; the band is the 95 %
+    interval over seeds. A line ends where the first of its seeds does.
+    """
+    envs = sorted({g.env for g in groups})
+    figure = Figure(figsize=(13, 3.4 * len(envs)), layout="constrained")
+    FigureCanvasAgg(figure)
+    looks = styles(groups)
+    rows = figure.subplots(len(envs), 3, squeeze=False)
+    for env, (ret, cost, rate) in zip(envs, rows, strict=True):
+        shown = [g for g in groups if g.env == env]
+        runs = [run for g in shown for run in g.runs]
+        count = min(50, *(len(np.unique(run.table["steps"])) for run in runs))
+        edges = np.linspace(0, max(run.steps for run in runs), count + 1)
+        for g in shown:
+            for axes, name in ((ret, "train/return"), (cost, "train/cost"), (rate, "train/cost_rate")):
+                if all(name in run.table for run in g.runs):
+                    values = np.concatenate([stretches(run.table, name, edges) for run in g.runs])
+                    band(axes, edges[1:], values, g.name, **looks[g.name])
+        limits = [g.cost_limit for g in shown]
+        for g in shown:
+            own = limits.count(g.cost_limit) == 1 and len(set(limits)) > 1
+            if own or g is shown[limits.index(g.cost_limit)]:
+                color = looks[g.name]["color"] if own else "0.4"
+                cost.axhline(g.cost_limit, color=color, ls="--", lw=1)
+        for axes, label in zip((ret, cost, rate), ("return", "cost", "cost rate so far"), strict=True):
+            axes.set(title=f"{env}, {label}")
+            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    for axes in rows[-1]:
+        axes.set_xlabel("environment steps")
+    legend(figure, rows.ravel(), looks)
+    return figure
+
+
+def stretches(table: Mapping[str, np.ndarray], name: str, edges: np.ndarray) -> np.ndarray:
+    """The mean of a metric of each seed over each stretch of steps (edges[i], edges[i + 1]], [S, T].
+
+    A stretch without value has the one before it, NaN before the first and after the last row of the
+    seed. Cost rates are averaged from the start, so that the last one is that of all training.
+    """
+    seeds = np.unique(table["seed"])
+    found = np.full((len(seeds), len(edges) - 1), np.nan)
+    for row, seed in zip(found, seeds, strict=True):
+        own = table["seed"] == seed
+        values, steps = table[name][own], table["steps"][own]
+        if name == "train/cost_rate":
+            values = np.cumsum(values) / np.arange(1, len(values) + 1)
+        known = np.isfinite(values)
+        which = np.searchsorted(edges, steps, side="left") - 1
+        count = np.bincount(which[known], minlength=len(row))
+        total = np.bincount(which[known], values[known], minlength=len(row))
+        end = which.max() + 1
+        row[count > 0] = total[count > 0] / count[count > 0]
+        carry(row[:end])
+    return found
+
+
+def carry(row: np.ndarray) -> None:
+    """Fill NaN with the last finite value before it, in place."""
+    finite = np.flatnonzero(np.isfinite(row))
+    if len(finite):
+        last = finite[np.maximum(np.searchsorted(finite, np.arange(len(row)), side="right") - 1, 0)]
+        row[finite[0] :] = row[last[finite[0] :]]
+
+
+def normalised(
+    names: Sequence[str], metrics: Sequence[str], found: Mapping[tuple[str, str, str], Any]
+) -> Figure:
+    """Mean and IQM of each score with their intervals, a row a setting."""
+    figure = Figure(figsize=(4 * len(metrics) + 1, 1.2 + 0.4 * len(names)), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(1, len(metrics), sharey=True, squeeze=False)[0]
+    for axes, metric in zip(panels, metrics, strict=True):
+        for kind, color, shift in (("IQM", "C0", -0.12), ("mean", "0.5", 0.12)):
+            es = [found[name, metric, kind] for name in names]
+            error = [[e.mean - e.low for e in es], [e.high - e.mean for e in es]]
+            ys = np.arange(len(names)) + shift
+            axes.errorbar([e.mean for e in es], ys, xerr=error, fmt="o", ms=5, color=color, label=kind)
+        axes.set(title=metric, yticks=range(len(names)), yticklabels=names)
+        axes.grid(axis="x", alpha=0.3)
+    panels[0].set_ylim(len(names) - 0.5, -0.5)
+    legend(figure, panels)
+    return figure
+
+
+def profiles(suite: Any) -> Figure:
+    """The share of seeds above each normalised return, and above each cost in limits."""
+    figure, panels = grid(2, size=(5, 3.8))
+    looks = styles([gs[0] for gs in suite.groups.values()])
+    labels = ("normalised return", "cost / limit")
+    for axes, label in zip(panels, labels, strict=True):
+        samples = {
+            name: [
+                g.values(label) if label == labels[0] else g.costs / (g.cost_limit or np.nan)
+                for g in gs
+            ]
+            for name, gs in suite.groups.items()
+        }
+        values = np.concatenate([x for xs in samples.values() for x in xs])
+        values = values[np.isfinite(values)]
+        if len(values):
+            thresholds = np.linspace(min(0, values.min()), max(1.2, values.max()) * 1.02, 201)
+            for name, xs in samples.items():
+                if all(np.isfinite(x).all() for x in xs):
+                    e = stats.profile(xs, thresholds)
+                    axes.plot(thresholds, e.mean, label=name, **looks[name])
+                    axes.fill_between(
+                        thresholds, e.low, e.high, color=looks[name]["color"], alpha=0.15, lw=0
+                    )
+        axes.axvline(1, color="0.5", ls="--", lw=1)
+        axes.set(xlabel=label, ylabel="share of seeds above", ylim=(-0.02, 1.02))
+    legend(figure, panels, looks)
+    figure.suptitle(", ".join(suite.tasks) if len(suite.tasks) < 4 else f"{len(suite.tasks)} tasks")
+    return figure
+
+
+# ---- what the figures share ------------------------------------------------------------------
+
+
+def styles(rows: Sequence[Any]) -> dict[str, dict[str, Any]]:
+    """Colour and line of each name: ten colours, then the next kind of line."""
+    names = dict.fromkeys(row.name for row in rows)
+    lines = list(MARKERS)
+    return {
+        name: {"color": f"C{i % 10}", "ls": lines[i // 10 % len(lines)]} for i, name in enumerate(names)
+    }
+
+
+def grid(count: int, size: tuple[float, float]) -> tuple[Figure, list[Axes]]:
+    """A figure of `count` panels, at most four beside each other, with room for a legend."""
+    columns = min(4, max(1, count))
+    rows = -(-max(1, count) // columns)
+    figure = Figure(figsize=(size[0] * columns + 2, size[1] * rows), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axes in panels[count:]:
+        axes.set_axis_off()
+    return figure, list(panels[:count])
+
+
+def legend(figure: Figure, panels: Iterable[Axes], names: Iterable[str] = ()) -> None:
+    """One for all panels, on the right: `names` first."""
+    entries: dict[str, Any] = dict.fromkeys(names)
+    for axes in panels:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            entries[label] = entries.get(label) or handle
+    entries = {label: handle for label, handle in entries.items() if handle}
+    if entries:
+        columns = -(-len(entries) // int(4 * figure.get_figheight()))
+        place = {"loc": "outside right upper", "ncols": columns, "frameon": False}
+        figure.legend(entries.values(), entries.keys(), **place)
+
+
+def save(figure: Figure, path: Path, formats: Sequence[str] = FORMATS) -> None:
+    """Write `path` with each suffix; the same figure is the same file."""
+    for suffix in formats:
+        with matplotlib.rc_context({"svg.hashsalt": "jaxsafe"}):
+            about = {"Date": None} if suffix == "svg" else None
+            figure.savefig(path.with_suffix(f".{suffix}"), dpi=120, metadata=about)
+        figure.set_layout_engine("none")  # is laid out, and the next file is like it

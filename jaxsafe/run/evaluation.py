@@ -1,0 +1,150 @@
+"""Fresh episodes of a trained policy, and what Safety Gym reports about them."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsafe.learn.on_policy import Algorithm
+from jaxsafe.report import scores, stats
+from jaxsafe.report.stats import Estimate
+from jaxsafe.types import Env, PyTree
+
+
+class Episodes(NamedTuple):
+    """Sums over episodes: `costs` is [S, N, K], the others are [S, N]."""
+
+    ret: np.ndarray
+    cost: np.ndarray
+    costs: np.ndarray
+    length: np.ndarray
+    discounted_ret: np.ndarray
+    discounted_cost: np.ndarray
+
+
+def episode(
+    env: Env,
+    act: Callable[[jax.Array, jax.Array], jax.Array],
+    key: jax.Array,
+    discount: jax.Array | float = 1.0,
+    cost_discount: jax.Array | float = 1.0,
+) -> Episodes:
+    """One whole episode, pure: rewards and costs count until termination or the time limit.
+
+    The discounted sums, sum_t discount^t r_t and likewise of costs, begin with the first step.
+    """
+    reset_key, act_key = jax.random.split(key)
+
+    def step(carry, t):
+        state, alive = carry
+        state = env.step(state, act(state.obs, jax.random.fold_in(act_key, t)))
+        reward, cost = alive * state.reward, alive * state.cost
+        later = discount**t * reward, cost_discount**t * cost
+        sums = Episodes(reward, cost, alive * state.costs, alive, *later)
+        return (state, alive * (1.0 - state.terminated)), sums
+
+    _, sums = jax.lax.scan(step, (env.reset(reset_key), jnp.float32(1)), jnp.arange(env.episode_length))
+    return jax.tree.map(lambda x: x.sum(0), sums)
+
+
+def run_episodes(algo: Algorithm, ts: PyTree, num_episodes: int, seed: int) -> Episodes:
+    """`num_episodes` fresh episodes for each of the S train states in `ts` (leading axis), compiled.
+
+    The policy is the deterministic one. Every train state meets the same episodes, so that seeds
+    differ by their policy alone.
+    """
+    keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), 0x6576616C), num_episodes)
+
+    def one_seed(ts: PyTree) -> Episodes:
+        task, discounts = algo.task(ts), (ts.config.discount, ts.config.cost_discount)
+        return jax.vmap(
+            lambda key: episode(task, lambda obs, _: algo.act(ts, obs, None), key, *discounts)
+        )(keys)
+
+    return jax.tree.map(np.asarray, jax.jit(jax.vmap(one_seed))(ts))
+
+
+def estimate(values: np.ndarray) -> Estimate:
+    """Mean of `values` [S, N] and its interval over seeds, whose means hold the spread of episodes too.
+
+    With one seed the interval covers the episodes alone, not what another seed would give.
+    """
+    return stats.estimate(values.mean(1) if len(values) > 1 else values[0])
+
+
+def cost_rate(metrics: dict[str, np.ndarray]) -> np.ndarray | None:
+    """Safety Gym's cost rate, [S]: total training cost over total training steps; None if unknown.
+
+    `metrics` are the columns of metrics.csv.
+    """
+    if "train/cost_rate" not in metrics or not len(metrics["seed"]):
+        return None
+    rates = metrics["train/cost_rate"]  # of one iteration; all have the same number of steps
+    return np.array([np.nanmean(rates[metrics["seed"] == seed]) for seed in np.unique(metrics["seed"])])
+
+
+def measures(
+    episodes: Episodes, cost_names: Sequence[str], limits: Mapping[str, float]
+) -> dict[str, np.ndarray]:
+    """What is reported of each episode, float or bool [S, N] by name.
+
+    Args:
+        episodes: their sums.
+        cost_names: of the environment, the last axis of `episodes.costs`.
+        limits: what is held under them; '' is the cost, other names are those of `cost_names`.
+    """
+    costs = {name: episodes.costs[..., k] for k, name in enumerate(cost_names)}
+    over = {name: (costs[name] if name else episodes.cost) > most for name, most in limits.items()}
+    named = costs if len(costs) > 1 else {}
+    return {
+        "return": episodes.ret,
+        "cost": episodes.cost,
+        "violation rate": np.any([*over.values()], axis=0),
+        **{f"cost {name}": x for name, x in named.items()},
+        **{f"{name} over {limits[name]:g}": x for name, x in over.items() if name},
+        "discounted return": episodes.discounted_ret,
+        "discounted cost": episodes.discounted_cost,
+        "episode length": episodes.length,
+    }
+
+
+def summary(
+    env_name: str,
+    found: Mapping[str, np.ndarray],
+    cost_limit: float,
+    metrics: dict[str, np.ndarray],
+) -> dict[str, Estimate]:
+    """The rows of the table: `measures`, then the cost rate of training and normalised scores."""
+    rows = {name: estimate(values) for name, values in found.items()}
+    rate = cost_rate(metrics)
+    if rate is not None:
+        rows["cost rate (training)"] = stats.estimate(rate)
+    if env_name in scores.CHARACTERISTIC:
+
+        def scaled(score: Callable, of: Estimate, *args: float) -> Estimate:
+            return Estimate(*(float(score(env_name, x, *args)) for x in of))
+
+        rows["normalised return"] = scaled(scores.normalized_return, rows["return"])
+        rows["normalised violation"] = scaled(scores.normalized_violation, rows["cost"], cost_limit)
+        if rate is not None:
+            rows["normalised cost rate"] = scaled(
+                scores.normalized_cost_rate, rows["cost rate (training)"]
+            )
+    return rows
+
+
+def table(rows: dict[str, Estimate]) -> str:
+    """Aligned plain text: a row each, mean and interval. A single number has no interval."""
+
+    def line(name: str, e: Estimate) -> str:
+        interval = "" if e.low == e.high == e.mean else f"[{e.low:10.4g}, {e.high:10.4g} ]"
+        return f"{name:<22}{e.mean:>10.4g}   {interval}".rstrip()
+
+    return "\n".join([f"{'':<22}{'mean':>10}   95 % interval", *(line(n, e) for n, e in rows.items())])
+
+
+def as_json(rows: dict[str, Estimate]) -> dict[str, list[float | None]]:
+    return {name: [x if math.isfinite(x) else None for x in e] for name, e in rows.items()}

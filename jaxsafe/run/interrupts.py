@@ -1,0 +1,71 @@
+"""Ctrl-C and SIGTERM as a request to stop, seen even while JAX compiles."""
+
+import signal
+import socket
+import threading
+from collections.abc import Callable
+from types import TracebackType
+
+from jaxsafe.run import distributed
+
+EXIT_STATUS = 130
+
+
+class Interrupts:
+    """The first signal sets `requested`; the second, or any while `nothing_to_save`, leaves at once.
+
+    Python runs signal handlers between its own instructions only, and one XLA compilation can
+    take minutes. So a thread reads the signals from the wakeup socket, which is written at once.
+
+    Args:
+        say: where to say what a signal does.
+        hosted: the process goes on afterwards, as a notebook does. To leave at once is then a
+            KeyboardInterrupt, which has to wait for a compilation, and SIGTERM is not for us.
+    """
+
+    def __init__(self, say: Callable[[str], None], hosted: bool = False):
+        self.say, self.hosted = say, hosted
+        self.requested = False
+        self.nothing_to_save = ""  # what to say when leaving at once is all right
+
+    def __enter__(self) -> "Interrupts":
+        self.handlers = {}
+        if threading.current_thread() is not threading.main_thread():
+            return self  # there Python allows no handlers
+        if self.hosted:
+            self.handlers[signal.SIGINT] = signal.signal(signal.SIGINT, self._interrupted)
+        else:
+            self.reader, self.writer = socket.socketpair()
+            self.writer.setblocking(False)
+            self.wakeup = signal.set_wakeup_fd(self.writer.fileno(), warn_on_full_buffer=False)
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self.handlers[number] = signal.signal(number, lambda *_: None)
+            threading.Thread(target=self._listen, daemon=True).start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for number, handler in self.handlers.items():
+            signal.signal(number, handler)
+        if self.handlers and not self.hosted:
+            signal.set_wakeup_fd(self.wakeup)
+            self.writer.close()  # ends the thread
+
+    def _interrupted(self, *_: object) -> None:  # says nothing: it may interrupt what is being said
+        if self.requested or self.nothing_to_save:
+            raise KeyboardInterrupt(self.nothing_to_save or "stopped without a last checkpoint")
+        self.requested = True
+
+    def _listen(self) -> None:
+        with self.reader:
+            while received := self.reader.recv(1):
+                if received[0] not in (signal.SIGINT, signal.SIGTERM):
+                    continue
+                if self.requested or self.nothing_to_save:
+                    self.say(self.nothing_to_save or "stopped without a last checkpoint")
+                    distributed.end(EXIT_STATUS)
+                self.requested = True
+                self.say(
+                    "stopping after this iteration, with a checkpoint; Ctrl-C again leaves at once"
+                )

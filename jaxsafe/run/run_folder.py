@@ -1,0 +1,301 @@
+"""A run folder: what was asked, what ran, what came out. Plain JSON, YAML, CSV and Orbax.
+
+config.yaml     every setting, resolved
+versions.json   package versions, commit, device and command of each start
+metrics.csv     one row an iteration and seed; an empty cell where there was no value (read packed
+                as metrics.csv.xz too). Where settings
+                train side by side, a row for each with each seed, and a column a float they differ in
+tensorboard/    the same for TensorBoard, one folder a seed (and setting)
+checkpoints/    see jaxsafe.checkpoint
+curves.png, video.mp4, evaluation.json   written at the end
+"""
+
+import csv
+import datetime
+import importlib.metadata
+import json
+import lzma
+import math
+import os
+import platform
+import shlex
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from tensorboardX.event_file_writer import EventsWriter
+from tensorboardX.proto import event_pb2, summary_pb2
+
+import jaxsafe
+from jaxsafe.config import ConfigError
+from jaxsafe.run import checkpoint
+
+PACKAGES = (
+    "jax", "jaxlib", "mujoco", "mujoco-mjx", "warp-lang", "flax", "optax", "orbax-checkpoint", "numpy",
+    "brax",
+)  # fmt: skip
+INDEX = ("iteration", "steps", "seed", "seconds")
+
+
+def write_config(folder: Path, config: dict[str, Any]) -> None:
+    replace_text(folder / "config.yaml", yaml.safe_dump(config, sort_keys=False))
+
+
+def read_config(folder: Path) -> dict[str, Any]:
+    """The settings of a run, as plain values: nothing in the file is executed.
+
+    Raises:
+        ConfigError: no run folder, or its config.yaml is not a mapping of settings.
+    """
+    path = folder / "config.yaml"
+    if not path.is_file():
+        raise ConfigError(f"{folder} is not a run folder: it has no config.yaml")
+    try:
+        config = yaml.safe_load(path.read_text())
+    except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
+        raise ConfigError(f"{path} cannot be read: {' '.join(str(error).split())}") from error
+    groups = [config.get(g) if isinstance(config, dict) else None for g in ("env", "algo")]
+    if not all(isinstance(g, dict) and isinstance(g.get("name"), str) for g in groups):
+        raise ConfigError(f"{path} is not the config of a run: it names no env or no algo")
+    return config
+
+
+def append_versions(folder: Path, device: str, engine: str | None) -> None:
+    """Add this start of the run to versions.json."""
+    path = folder / "versions.json"
+    try:
+        starts = list(json.loads(path.read_text())) if path.exists() else []
+    except ValueError:
+        starts = []
+    now = {
+        "time": datetime.datetime.now().astimezone().isoformat(timespec="seconds"),
+        # as it was typed: `command` adds the ++ that Hydra needs
+        "command": shlex.join([Path(sys.executable).name, *(x.removeprefix("++") for x in sys.argv)]),
+        "commit": commit(),
+        "device": device,
+        "engine": engine,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "jaxsafe": jaxsafe.__version__,
+        **{name: installed(name) for name in PACKAGES},
+    }
+    replace_text(path, json.dumps([*starts, now], indent=1))
+
+
+def trained_by(folder: Path) -> str:
+    """The version of jaxsafe that a run was last started with, and its commit."""
+    try:
+        last = json.loads((folder / "versions.json").read_text())[-1]
+        return f"{last['jaxsafe']} ({last['commit']})"
+    except (OSError, ValueError, LookupError, TypeError):
+        return "of an unknown version"
+
+
+def installed(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def commit() -> str | None:
+    """The commit of the source tree, '-dirty' if it has changes; None outside a repository."""
+
+    def git(*args: str) -> str:
+        where = Path(jaxsafe.__file__).parent
+        return subprocess.run(
+            ["git", "-C", str(where), *args], check=True, capture_output=True, text=True, timeout=10
+        ).stdout.strip()
+
+    try:
+        tracked = git("ls-files", "--error-unmatch", "__init__.py")  # not some other project's tree
+        return (
+            git("rev-parse", "HEAD") + ("-dirty" if git("status", "--porcelain") else "")
+            if tracked
+            else None
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+
+
+class Metrics:
+    """metrics.csv: appends rows, and on resumption drops those after the checkpoint."""
+
+    def __init__(self, folder: Path, names: list[str], iteration: int):
+        """Open for appending after `iteration`; later rows and a torn last line are dropped.
+
+        Raises:
+            ConfigError: the file exists with other columns.
+        """
+        self.path, self.names, self.seconds = folder / "metrics.csv", names, 0.0
+        header = [*INDEX, *names]
+        kept = []
+        if self.path.exists() and iteration:
+            with self.path.open(newline="") as file:
+                rows = csv.reader(file)
+                if (found := next(rows, header)) != header:
+                    odd = sorted(set(found) ^ set(header))
+                    raise ConfigError(
+                        f"{self.path} has other columns ({', '.join(odd) or 'in another order'})"
+                    )
+                kept = [
+                    r
+                    for r in rows
+                    if len(r) == len(header) and r[0].isdigit() and int(r[0]) <= iteration
+                ]
+            self.seconds = float(kept[-1][3]) if kept else 0.0
+        part = self.path.with_suffix(".part")
+        with part.open("w", newline="") as file:
+            csv.writer(file, lineterminator="\n").writerows([header, *kept])
+        part.replace(self.path)
+        self.file = self.path.open("a", newline="")
+        self.writer = csv.writer(self.file, lineterminator="\n")
+
+    def append(
+        self, iteration: int, steps: int, seeds: list[int], seconds: float, values: Mapping
+    ) -> None:
+        """Add one row a seed; `values` holds float [S] by metric name."""
+        columns = [np.asarray(values[name], np.float32) for name in self.names]
+        for s, seed in enumerate(seeds):
+            cells = ("" if math.isnan(c[s]) else str(c[s]) for c in columns)
+            self.writer.writerow([iteration, steps, seed, f"{seconds:.3f}", *cells])
+        self.file.flush()
+
+    def sync(self) -> None:
+        """Put every row on the disk, before a checkpoint counts on them."""
+        self.file.flush()
+        os.fsync(self.file.fileno())
+
+    def close(self) -> None:
+        self.file.close()
+
+
+class Board:
+    """TensorBoard's file of one seed, written at once: no thread of its own that could fail unseen."""
+
+    def __init__(self, folder: Path, steps: int):
+        """Open for appending after `steps`; TensorBoard drops what older files have beyond."""
+        folder.mkdir(parents=True, exist_ok=True)
+        self.writer = EventsWriter(str(folder / "events"), f".{os.getpid()}.{steps}")
+        if steps:
+            session = event_pb2.SessionLog(status=event_pb2.SessionLog.START)  # type: ignore[attr-defined]
+            self._write(steps + 1, session_log=session)
+
+    def append(self, steps: int, values: Mapping[str, float]) -> None:
+        entries = [{"tag": name, "simple_value": v} for name, v in values.items() if math.isfinite(v)]
+        self._write(steps, summary=summary_pb2.Summary(value=entries))  # type: ignore[attr-defined]
+
+    def _write(self, steps: int, **what: Any) -> None:
+        event = event_pb2.Event(wall_time=time.time(), step=steps, **what)  # type: ignore[attr-defined]
+        self.writer.write_event(event)
+
+    def flush(self) -> None:
+        self.writer.flush()
+
+    def close(self) -> None:
+        self.writer.close()
+
+
+def metrics_file(folder: Path) -> Path:
+    """metrics.csv, or metrics.csv.xz as long as there is only that."""
+    path = folder / "metrics.csv"
+    packed = path.with_name("metrics.csv.xz")
+    return packed if packed.is_file() and not path.is_file() else path
+
+
+def read_metrics(folder: Path) -> dict[str, np.ndarray]:
+    """metrics.csv as float columns by name (NaN where a cell is empty); empty if there is none."""
+    path = metrics_file(folder)
+    return read_table(path) if path.is_file() else {}
+
+
+def read_table(path: Path) -> dict[str, np.ndarray]:
+    """A .csv or .csv.xz as `read_metrics` gives it. A torn line is left out.
+
+    Raises:
+        ConfigError: a cell is no number, or the file cannot be read.
+    """
+    try:
+        x = path.read_bytes()
+        text = (lzma.decompress(x) if path.suffix == ".xz" else x).decode()
+        header, *lines = text.splitlines() or [""]
+        names = header.split(",")
+        body = "".join(f"{line}\n" for line in lines if line.count(",") == len(names) - 1)
+        body = body.replace(",,", ",nan,").replace(",,", ",nan,").replace(",\n", ",nan\n")
+        rows = body.split()
+        table = (
+            np.loadtxt(rows, delimiter=",", comments=None, ndmin=2)
+            if rows
+            else np.empty((0, len(names)))
+        )
+    except (ValueError, OSError, EOFError, lzma.LZMAError) as error:
+        raise ConfigError(f"{path} cannot be read: {' '.join(str(error).split())}") from error
+    return dict(zip(names, table.T, strict=True))
+
+
+def read_evaluation(folder: Path, setting: str) -> dict[str, np.ndarray]:
+    """What evaluation found of each seed in a setting ('' where there is one), [S] by name.
+
+    Empty without evaluation.json, or with one that does not hold the seeds apart.
+
+    Raises:
+        ConfigError: the file cannot be read.
+    """
+    path = folder / "evaluation.json"
+    if not path.is_file():
+        return {}
+    try:
+        found = json.loads(path.read_text())
+        found = found[setting] if setting else found
+        return {name: np.array(values, float) for name, values in found.get("seeds", {}).items()}
+    except (ValueError, KeyError, TypeError, AttributeError, OSError) as error:
+        raise ConfigError(f"{path} cannot be read: {' '.join(str(error).split())}") from error
+
+
+def by_setting(metrics: dict[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
+    """The tables of settings trained side by side, by name; {'': metrics} if there is but one."""
+    names = [name for name in metrics if name.startswith("algo.")]
+    if not names:
+        return {"": metrics}
+    values = np.stack([metrics[name] for name in names], axis=1)
+    _, first, which = np.unique(values, axis=0, return_index=True, return_inverse=True)
+    return {
+        setting_name(dict(zip(names, values[first[i]], strict=True))): {
+            name: column[which.ravel() == i] for name, column in metrics.items()
+        }
+        for i in np.argsort(first)
+    }
+
+
+def setting_name(swept: Mapping[str, Any]) -> str:
+    return ", ".join(f"{k}={v:.9g}" if isinstance(v, float) else f"{k}={v}" for k, v in swept.items())
+
+
+def last_tenth(metrics: dict[str, np.ndarray], name: str) -> np.ndarray:
+    """The mean of a metric over the last 10 % of training so far, [S]; NaN for a seed without value."""
+    late = metrics["iteration"] > 0.9 * metrics["iteration"].max()
+    late &= np.isfinite(metrics[name])
+    values = (metrics[name][late & (metrics["seed"] == s)] for s in np.unique(metrics["seed"]))
+    return np.array([v.mean() if len(v) else np.nan for v in values])
+
+
+def progress(folder: Path) -> tuple[int, int] | None:
+    """Iteration and steps of the newest checkpoint; None without one."""
+    for path in checkpoint.checkpoints(folder / "checkpoints"):
+        try:
+            manifest = checkpoint.read_manifest(path)
+        except (ValueError, KeyError, TypeError, AttributeError, OSError):
+            continue
+        return manifest.iteration, manifest.steps
+    return None
+
+
+def replace_text(path: Path, text: str) -> None:
+    part = path.with_name(path.name + ".part")
+    part.write_text(text)
+    part.replace(path)

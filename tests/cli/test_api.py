@@ -1,0 +1,348 @@
+"""`import jaxsafe` as a program or a notebook uses it, on toys."""
+
+import inspect
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import rich.console
+from tasks import FAST
+from toys import Corridor
+
+import jaxsafe
+from jaxsafe import algos, api, envs
+from jaxsafe.algos.ppo import PPOConfig
+from jaxsafe.config import config
+from jaxsafe.learn.on_policy import on_policy
+from jaxsafe.learn.steps import adam_epochs
+from jaxsafe.learn.surrogates import clipped
+from jaxsafe.learn.treatments import penalty
+from jaxsafe.run import checkpoint, command, progress, run_folder, runner
+
+TINY: dict[str, Any] = {
+    "num_envs": 4, "horizon": 8, "minibatches": 2, "epochs": 1, "critic_epochs": 1, "hidden": (4, 4),
+    "total_steps": 96, "eval_episodes": 0,
+}  # fmt: skip
+
+
+@config
+class PricedConfig(PPOConfig):
+    price: float = 0.5
+
+
+PRICED = algos.Entry(
+    PricedConfig, lambda env, axis_name=None: on_policy(env, penalty, clipped, adam_epochs, axis_name)
+)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compiled_quickly():
+    def quick(program: runner.Program, ts: Any) -> Any:
+        return jax.jit(program.update, donate_argnums=0, compiler_options=FAST).lower(ts).compile()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(runner, "compiled", quick)
+        yield
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> jaxsafe.Run:
+    """Two seeds of an algorithm that adds to the observation; nobody changes it."""
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    return jaxsafe.train(Corridor(), "ppo_saute", num_seeds=2, run_dir=folder, **TINY)
+
+
+# ---- what is public --------------------------------------------------------------------------
+
+
+def test_importing_the_package_imports_neither_jax_nor_the_registries():
+    code = (
+        "import jaxsafe, sys; print({'jax', 'hydra', 'jaxsafe.api'} & {*sys.modules});"
+        "from jaxsafe import on_policy; print({'jaxsafe.envs', 'jaxsafe.algos'} & {*sys.modules});"
+        "print(callable(jaxsafe.sweep), 'train' in dir(jaxsafe))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split("\n")[:3] == ["set()", "set()", "True True"]
+
+
+def test_a_name_that_is_not_there_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="has no attribute 'trian'"):
+        jaxsafe.trian  # noqa: B018  # type: ignore[attr-defined]
+
+
+def public() -> dict[str, Any]:
+    """Every public function and class, and their public methods and properties."""
+    found = {name: getattr(jaxsafe, name) for name in jaxsafe.__all__}
+    members = {f"Run.{k}": v for k, v in vars(jaxsafe.Run).items() if not k.startswith("_")}
+    return found | members
+
+
+@pytest.mark.parametrize("name", public())
+def test_a_public_name_says_what_it_takes_gives_and_raises(name):
+    thing = public()[name]
+    text = inspect.getdoc(thing) or ""
+    assert text, f"{name} has no docstring"
+    if inspect.isfunction(thing):
+        for section in ("Args:", "Returns:", "Raises:"):
+            assert f"\n{section}\n" in text, f"{name} has no {section}"
+        for argument in inspect.signature(thing).parameters:
+            assert argument == "self" or f"\n    {argument}: " in text, f"{name}: {argument}"
+        assert inspect.signature(thing).return_annotation is not inspect.Parameter.empty
+    if name in ("make", "evaluate"):
+        assert "Source:" in text
+    if name in ("make", "Run.policy"):
+        assert "float [" in text
+
+
+def test_the_lazy_names_are_those_of_the_module():
+    assert jaxsafe.__all__ == api.__all__
+
+
+# ---- the same as the scripts -----------------------------------------------------------------
+
+SAME: dict[str, tuple[tuple[Any, Any, dict[str, Any]], list[str]]] = {
+    "a name and settings": (
+        ("point_goal1", "cpo", {"cost_limit": 10, "num_seeds": 4, "total_steps": 1e6}),
+        ["algo=cpo", "algo.cost_limit=10", "num_seeds=4", "total_steps=1e6"],
+    ),
+    "the defaults": ((None, None, {}), []),
+    "Safety Gym's id": (("Safexp-CarPush1-v0", None, {}), ["env=car_push1"]),
+    "an option of the environment": (
+        ("point_goal1", None, {"env.hazards_num": 12, "env.num_steps": np.int64(50)}),
+        ["env.hazards_num=12", "env.num_steps=50"],
+    ),
+    "several values of a float": (
+        (None, "ppo_lag", {"cost_limit": np.array([5.0, 10.0]), "hidden": (8, 8)}),
+        ["algo.cost_limit=[5,10]", "algo.hidden=[8,8]"],
+    ),
+    "named limits": (
+        ("point_goal2", "cpo", {"cost_limits": {"hazards": 10}, "video": False}),
+        ["env=point_goal2", "algo=cpo", "algo.cost_limits={hazards: 10}", "video=false"],
+    ),
+    "a preset, by its prefix": (
+        (None, None, {"preset": "published", "algo.clip": 0.1}),
+        ["preset=published", "algo.clip=0.1"],
+    ),
+}
+
+
+@pytest.mark.parametrize("case", SAME)
+def test_arguments_mean_what_they_mean_on_the_command_line(case):
+    (env, algo, options), expected = SAME[case]
+    known = api.registries(env, algo)
+    found = command.compose(api.texts(known, options), known.envs, known.algos)
+    assert found.plain() == command.compose(expected, envs, algos).plain()
+
+
+def test_an_environment_that_was_made_is_recorded_by_its_name_and_options():
+    env = jaxsafe.make("Safexp-PointGoal1-v0", hazards_num=12, hazards_size=0.1)
+    known = api.registries(env, None)
+    assert known.envs is envs and known.own == {}
+    found = command.compose(api.texts(known, {}), envs, algos)
+    expected = ["env=point_goal1", "env.hazards_num=12", "env.hazards_size=0.1"]
+    assert found.plain() == command.compose(expected, envs, algos).plain()
+
+
+@pytest.mark.parametrize(
+    "value",
+    ["run", "a b", "true", "1e3", "it's", "back\\slash", "end\\", "a\\'b", "[1", "x,y", "ü/(1)", ""],
+)
+def test_every_string_arrives_as_it_is(value):
+    assert command.parse(f"run_dir={api.text(value)}").value() == value
+    assert command.parse(f"run_dir=[{api.text(value)}]").value() == [value]
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (("point_gol1",), "did you mean 'point_goal1'?"),
+        ((None, "cop"), "did you mean 'cpo'?"),
+        ((None, None, {"cost_limt": 3}), "unknown option cost_limt; did you mean 'cost_limit'?"),
+        ((None, None, {"total_step": 5}), "did you mean 'total_steps'?"),
+        ((None, "cpo", {"epochs": 5}), "unknown option algo.epochs of cpo"),
+        ((None, None, {"env.hazard_num": 5}), "did you mean 'hazards_num'?"),
+        ((None, None, {"total_steps": -1}), "expected at least 1"),
+        ((None, None, {"cost_limit": "wide"}), "expected a number"),
+        ((None, None, {"cost_limit": float("nan")}), "expected at least 0"),
+        ((None, None, {"clip": object()}), "expected a number, a string"),
+        ((None, None, {"num_envs": 1e9}), "GiB"),
+        ((None, None, {"resume": "nowhere"}), "not a run folder"),
+        ((None, None, {"num_processes": 2}), "several processes are for scripts/train.py"),
+        ((Corridor(), None, {"env.dt": 0.1}), "env.dt=0.1: this Corridor has another value"),
+        ((object(),), "object (object) is no Env"),
+        (("nowhere:Corridor",), "no module 'nowhere'"),
+        ((None, object()), "expected a name or an object with a config class and make"),
+    ],
+)
+def test_bad_input_is_a_config_error_of_one_line(arguments, message):
+    env, algo = (*arguments[:2], None, None)[:2]
+    options: dict[str, Any] = dict(*arguments[2:])
+    with pytest.raises(jaxsafe.ConfigError) as caught:
+        jaxsafe.train(env, algo, **options)
+    assert message in str(caught.value) and "\n" not in str(caught.value)
+    assert not Path("runs").exists()
+
+
+# ---- a run -----------------------------------------------------------------------------------
+
+
+def test_a_run_has_its_settings_and_its_metrics_by_iteration_and_policy(run):
+    assert run.steps == 96 and run.settings.algo.horizon == 8
+    assert run.config["env"]["name"] == "Corridor" and run.config["env"]["half_width"] == 0.5
+    metrics, table = run.metrics, run_folder.read_metrics(run.folder)
+    assert metrics["steps"].tolist() == [32, 64, 96]
+    assert metrics["train/kl"].shape == (3, 2)
+    for seed in (0, 1):
+        own = table["seed"] == seed
+        np.testing.assert_array_equal(metrics["train/kl"][:, seed], table["train/kl"][own])
+    assert repr(run).endswith(": Corridor, ppo_saute, 2 seeds, 96 steps)")
+
+
+def test_a_policy_acts_on_what_its_environment_shows(run):
+    env = run.env(1)
+    assert env.obs_size == Corridor().obs_size + 1  # the budget
+    obs = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 3)).obs
+    actions = run.policy(obs, index=1)
+    assert actions.shape == (3, 2)
+    one_by_one = jax.jit(jax.vmap(lambda x: run.policy(x, index=1)))(obs)
+    np.testing.assert_allclose(actions, one_by_one, atol=1e-6)
+    assert not np.allclose(actions, run.policy(obs, index=0))
+    assert not np.allclose(actions, run.policy(obs, jax.random.key(1), 1))
+    with pytest.raises(jaxsafe.ConfigError, match="index 2: the run has 2 policies"):
+        run.policy(obs, index=2)
+
+
+def test_evaluation_is_that_of_the_script(run):
+    scores = jaxsafe.evaluate(run, episodes=3)
+    settings, _, algo, states = run._opened
+    (expected,) = command.evaluate(settings, algo, states, 3, 1, run.folder)
+    assert scores == expected
+    assert len(scores.seeds["return"]) == 2
+    assert str(scores).splitlines()[1].startswith("return ")
+    for bad in ({"episodes": 0}, {"seed": -1}, {"setting": 1}):
+        with pytest.raises(jaxsafe.ConfigError, match=r"expected|has 1"):
+            jaxsafe.evaluate(run, **bad)
+
+
+def test_what_cannot_be_filmed_is_refused(run):
+    with pytest.raises(jaxsafe.ConfigError, match=r"policy\.avi: expected a name that ends in"):
+        jaxsafe.render(run, "policy.avi")
+    with pytest.raises(jaxsafe.ConfigError, match="index 7"):
+        jaxsafe.render(run, "policy.mp4", index=7)
+    with pytest.raises(jaxsafe.ConfigError, match="only Safety Gym's environments can be drawn"):
+        jaxsafe.render(run, "policy.mp4")
+    with pytest.raises(jaxsafe.ConfigError, match="not a run folder"):
+        jaxsafe.evaluate("nowhere")
+
+
+def test_a_run_of_ones_own_opens_with_the_same_object_alone(run):
+    again = jaxsafe.Run(run.folder, Corridor())
+    obs = run.env().reset(jax.random.key(0)).obs
+    np.testing.assert_array_equal(again.policy(obs), run.policy(obs))
+    with pytest.raises(jaxsafe.ConfigError, match="unknown environment 'Corridor'"):
+        jaxsafe.Run(run.folder)
+
+
+@pytest.fixture
+def signals(monkeypatch):
+    """Ctrl-C at the first report of progress."""
+
+    sent = []
+
+    def update(self: progress.Report, *_: Any, **__: Any) -> None:
+        if not sent:
+            sent.append(signal.raise_signal(signal.SIGINT))
+
+    monkeypatch.setattr(progress.Report, "update", update)
+
+
+def test_an_interrupted_run_is_saved_and_continues(signals, run, capsys):
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt, match=r"env=<your Corridor>, algo=<your Priced>, r"):
+        jaxsafe.train(Corridor(), PRICED, run_dir="stopped", **TINY)
+    assert signal.getsignal(signal.SIGINT) is before
+    stopped = jaxsafe.Run("stopped", Corridor(), PRICED)
+    assert 0 < stopped.steps < 96
+    out = capsys.readouterr().out
+    assert "only this program knows Corridor and Priced" in out and "stopped at" in out
+    with pytest.raises(jaxsafe.ConfigError, match=r"env\.half_width=0.5: this Corridor has another"):
+        jaxsafe.train(Corridor(half_width=0.1), PRICED, resume="stopped")
+    assert jaxsafe.train(Corridor(), PRICED, resume="stopped").steps == 96
+    jaxsafe.train(Corridor(), PRICED, run_dir="whole", **TINY)
+    left, right = (checkpoint.load(Path(f, "checkpoints"))[0] for f in ("stopped", "whole"))
+    for name in left:
+        np.testing.assert_array_equal(left[name], right[name], err_msg=name)
+
+
+def test_an_interrupt_with_nothing_to_save_leaves_the_program_running(monkeypatch):
+    def compiling(program: runner.Program, ts: Any) -> Any:
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(runner, "compiled", compiling)
+    with pytest.raises(KeyboardInterrupt, match="stopped before the first update; nothing to save"):
+        jaxsafe.train(Corridor(), run_dir="run", **TINY)
+
+
+# ---- sweeps ----------------------------------------------------------------------------------
+
+
+def test_a_sweep_takes_lists_for_values_and_tuples_for_lists():
+    known = api.registries("point_goal1", ["ppo_lag", PRICED])
+    options = {"cost_limit": [5, 10], "hidden": [(8, 8), (4, 4)], "seed": range(2), "max_parallel": 4}
+    assert api.texts(known, options | {"num_envs": 4}, swept=True) == [
+        "env=point_goal1", "algo=ppo_lag,Priced", "algo.cost_limit=5,10", "algo.hidden=[8,8],[4,4]",
+        "seed=0,1", "max_parallel=4", "num_envs=4",
+    ]  # fmt: skip
+    limits = {"cost_limits": {"hazards": [5, 10], "vases_contact": 25}}
+    assert api.texts(known, limits, swept=True)[2:] == [
+        "algo.cost_limits.hazards=5,10", "algo.cost_limits.vases_contact=25",
+    ]  # fmt: skip
+    for options, message in (
+        ({"cost_limit": []}, "expected values to sweep"),
+        ({"cost_limits": {"hazards": []}}, "cost_limits.hazards=[]: expected values to sweep"),
+        ({"cost_limit": 5}, "nothing to sweep"),
+        ({"max_paralel": 5}, "did you mean 'max_parallel'?"),
+    ):
+        with pytest.raises(jaxsafe.ConfigError, match=re.escape(message)):
+            jaxsafe.sweep("point_goal1", **options)
+    with pytest.raises(jaxsafe.ConfigError, match="expected names in a list"):
+        jaxsafe.sweep(["point_goal1", Corridor()])
+
+
+def test_a_sweep_has_a_row_a_setting_and_opens_its_runs():
+    found = jaxsafe.sweep(Corridor(), PRICED, price=[0.0, 1.0], num_seeds=2, run_dir="sweep", **TINY)
+    assert [row.name for row in found.rows] == ["algo.price=0", "algo.price=1"]
+    assert found.rows[0].returns.shape == (2,)
+    assert str(found) == Path("sweep", "summary.md").read_text()
+    (run,) = found.runs
+    assert run.metrics["train/lam"][0].tolist() == [0, 0, 1, 1]
+    assert run.policy(jnp.zeros(4), index=3).shape == (2,)
+
+
+# ---- notebooks -------------------------------------------------------------------------------
+
+
+def test_a_notebook_has_one_line_that_changes(monkeypatch, capsys):
+    monkeypatch.setattr(rich.console, "_is_jupyter", lambda: True)
+    monkeypatch.setattr(progress, "NOTEBOOK_EVERY", 0.0)
+    with progress.Report() as report:
+        report.line("first")
+        report.start(100, 0, [25.0])
+        for steps in (50, 100):
+            report.update(steps, 1, ret=1.0, cost=2.0, lam=0.0)
+        report.line("last")
+    first, changing, last = capsys.readouterr().out.removesuffix("\n").split("\n")
+    assert (first, last) == ("first", "last")
+    assert [part[:4] for part in changing.split("\r")] == ["", " 50%", "100%"]

@@ -1,0 +1,315 @@
+"""Comparisons of runs written by hand, on the real registries."""
+
+import csv
+import io
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from jaxsafe import algos, envs
+from jaxsafe.config import ConfigError
+from jaxsafe.report import compare, plots, scores, stats, tables
+from jaxsafe.run import run_folder
+
+RESULTS = Path(__file__).parent.parent.parent / "docs" / "results"
+HEADER = "task,algo,source,return,return_std,cost,cost_std,cost_limit\n"
+
+
+def write(
+    folder: Path,
+    env: str = "point_goal1",
+    algo: str = "ppo_lag",
+    returns: Any = (1.0, 3.0),
+    costs: Any = (20.0, 40.0),
+    seeds: Any = (0, 1),
+    total_steps: int = 200,
+    columns: Any = (),
+    **options: Any,
+) -> Path:
+    """A run of 20 iterations of 10 steps: these returns and costs, a seed each, in the last two."""
+    folder.mkdir(parents=True)
+    config = {"env": {"name": env}, "algo": {"name": algo, **options}}
+    train = {"total_steps": total_steps, "seed": seeds[0], "num_seeds": len(set(seeds))}
+    run_folder.write_config(folder, config | train)
+    more = dict(columns)
+    log = run_folder.Metrics(folder, ["train/return", "train/cost", "train/cost_rate", *more], 0)
+    for i in range(1, 21):
+        late = i > 18
+        values = {
+            "train/return": late * np.array(returns),
+            "train/cost": np.where(late, costs, 99.0),
+            "train/cost_rate": np.full(len(returns), i / 100),
+        }
+        log.append(i, 10 * i, list(seeds), 0.0, values | more)
+    log.close()
+    return folder
+
+
+def read(*paths: Path) -> list[compare.Run]:
+    return compare.read(paths, envs, algos)
+
+
+def compared(*paths: Path, by: tuple[str, ...] = ()) -> list[compare.Group]:
+    runs = read(*paths)
+    return compare.ordered(compare.group(runs, by or compare.telling(runs)))
+
+
+# ---- what is known of a run ------------------------------------------------------------------
+
+
+def test_what_is_known_of_each_seed_by_hand(tmp_path):
+    (run,) = read(write(tmp_path / "a", columns={"train/cost_hazards": [4.0, 6.0]}))
+    ppo = scores.CHARACTERISTIC["point_goal1"]
+    expected = {
+        "return": [1, 3],
+        "cost": [20, 40],
+        "violation rate": [0, 1],
+        "cost rate": [0.105, 0.105],  # of all iterations: mean of 0.01 .. 0.20
+        "cost hazards": [4, 6],
+        "normalised return": [1 / ppo.ret, 3 / ppo.ret],
+        "normalised violation": [0, 15 / (ppo.cost - 25)],
+        "normalised cost rate": [0.105 / ppo.cost_rate] * 2,
+    }
+    assert run.values.keys() == expected.keys()
+    for name, values in expected.items():
+        np.testing.assert_allclose(run.values[name], values, rtol=1e-6, err_msg=name)
+
+
+def test_costs_under_limits_of_their_own_violate_when_one_of_them_does():
+    table = {
+        "iteration": np.array([1.0, 1.0]), "steps": np.array([1.0, 1.0]), "seed": np.array([0.0, 1.0]),
+        "train/return": np.zeros(2), "train/cost": np.array([9.0, 9.0]),
+        "train/cost_a": np.array([5.0, 5.0]), "train/cost_b": np.array([0.0, 1.0]),
+        "train/cost_estimate_a": np.zeros(2),
+    }  # fmt: skip
+    values = compare.measured("point_goal1", table, {"a": 5.0, "b": 0.5})
+    np.testing.assert_array_equal(values["violation rate"], [0, 1])
+    assert "cost estimate_a" not in values and "normalised violation" not in values
+
+
+def test_evaluations_of_each_seed_join_in_where_the_run_has_them(tmp_path):
+    a, b = write(tmp_path / "a"), write(tmp_path / "b", seeds=(2, 3))
+    (a / "evaluation.json").write_text(json.dumps({"seeds": {"return": [5.0, 7.0]}}))
+    (b / "evaluation.json").write_text(json.dumps({"return": [5.0, 4.0, 6.0]}))
+    (both,) = compared(a, b)
+    np.testing.assert_array_equal(both.values("final return"), [5, 7, np.nan, np.nan])
+    (b / "evaluation.json").write_text(json.dumps({"seeds": {"return": [5.0]}}))
+    with pytest.raises(ConfigError, match=r"is of 1 seeds, metrics.csv of 2"):
+        read(b)
+
+
+def test_stretches_of_training_are_means_carried_on_to_the_end_of_each_seed():
+    table = {
+        "steps": np.array([10, 20, 30, 40, 10, 20.0]), "seed": np.array([0, 0, 0, 0, 1, 1.0]),
+        "x": np.array([1, 3, np.nan, np.nan, np.nan, 7]),
+        "train/cost_rate": np.array([1, 3, 5, 7, 2, 4.0]),
+    }  # fmt: skip
+    edges = np.array([0.0, 20.0, 40.0, 60.0])
+    np.testing.assert_array_equal(
+        plots.stretches(table, "x", edges), [[2, 2, np.nan], [7, np.nan, np.nan]]
+    )
+    np.testing.assert_array_equal(  # so far: 1, 2, 3, 4 and 2, 3
+        plots.stretches(table, "train/cost_rate", edges), [[1.5, 3.5, np.nan], [2.5, np.nan, np.nan]]
+    )
+
+
+# ---- which runs are averaged -----------------------------------------------------------------
+
+
+def test_seeds_of_one_setting_are_pooled_and_other_settings_stand_apart(tmp_path):
+    write(tmp_path / "x" / "1")
+    write(tmp_path / "x" / "2", seeds=(2,), returns=(5.0,), costs=(30.0,))
+    write(tmp_path / "y", algo="cpo")
+    ppo_lag, cpo = sorted(compared(tmp_path), key=lambda g: g.name, reverse=True)
+    assert (cpo.name, ppo_lag.name) == ("cpo", "ppo_lag")
+    np.testing.assert_array_equal(np.sort(ppo_lag.returns), [1, 3, 5])
+    assert (ppo_lag.cost, ppo_lag.held) == (stats.estimate(np.array([20.0, 40, 30])), "unclear")
+
+
+def test_settings_of_an_algorithm_are_told_apart_by_what_differs(tmp_path):
+    for limit in (100, 5, 20):
+        write(tmp_path / f"{limit}", cost_limit=float(limit))
+    groups = compared(tmp_path)
+    assert [g.name for g in groups] == [f"ppo_lag, algo.cost_limit={x}" for x in (5, 20, 100)]
+    assert [g.held for g in groups] == ["no", "unclear", "yes"]
+    assert "**" not in str(compare.results(groups, "return", {}).rows)  # of other limits, none is best
+
+
+def test_settings_side_by_side_in_one_run_are_groups_of_their_own(tmp_path):
+    limits = {"algo.cost_limit": [5.0, 5.0, 10.0, 10.0]}
+    write(tmp_path / "a", returns=(1, 2, 3, 4), costs=[0] * 4, seeds=[0, 1, 0, 1], columns=limits,
+          cost_limit=[5, 10])  # fmt: skip
+    groups = compared(tmp_path, by=("algo.cost_limit",))
+    assert [(g.cost_limit, *g.returns) for g in groups] == [(5, 1, 2), (10, 3, 4)]
+
+
+def test_averaging_over_a_field_is_asked_for_and_said(tmp_path):
+    write(tmp_path / "a", dual_lr=0.1)
+    write(tmp_path / "b", dual_lr=0.2)
+    (both,) = compared(tmp_path, by=("algo.name",))
+    assert len(both.returns) == 4
+    assert compare.notes([both]) == ["averaged over algo.dual_lr (0.1, 0.2)"]
+
+
+def test_tasks_stand_apart_and_only_those_of_every_setting_are_compared(tmp_path):
+    write(tmp_path / "1", "point_goal1", "cpo", returns=(10.0, 20.0), costs=(10.0, 11.0))
+    write(tmp_path / "2", "car_goal1", "cpo", returns=(4.0, 8.0))
+    write(tmp_path / "3", "point_goal1", "ppo_lag", returns=(0.0, 15.0), costs=(12.0, 20.0))
+    write(tmp_path / "4", "point_run", "cpo", total_steps=400)
+    groups = compared(tmp_path)
+    assert len(groups) == 4
+    s = compare.suite(groups)
+    assert s.tasks == ["point_goal1"]
+    pairs = compare.improvements(s)
+    assert pairs["cpo", "ppo_lag", "return"].mean == 3 / 4  # 10 beats 0, 20 beats both
+    assert pairs["cpo", "ppo_lag", "cost"].mean == 1
+    assert compare.notes(groups) == [
+        f"unfinished: {tmp_path / '4'}, at 200 of 400 steps",
+        "not in comparisons across tasks, as a setting lacks them: car_goal1, point_run",
+        "without normalised scores, as there are no published ones: point_run",
+    ]
+    cpo = compare.suite([g for g in groups if g.algo == "cpo" and g.env != "point_run"])
+    found = compare.aggregates(cpo)["cpo", "normalised return", "mean"]
+    assert found.mean == pytest.approx((6 / 25.49 + 15 / 25.179) / 2)
+
+
+# ---- tables and figures ----------------------------------------------------------------------
+
+
+def test_published_figures_stand_below_and_what_lies_beyond_their_spread_is_marked(tmp_path):
+    write(tmp_path / "1", "point_goal1", "cpo", (10.0, 20.0), (10.0, 20.0))
+    write(tmp_path / "2", "point_goal1", "ppo_lag", (30.0, 30.0), (30.0, 31.0))
+    write(tmp_path / "3", "car_push1", "cpo", (1.0, 2.0), (0.0, 0.0))
+    path = tmp_path / "published.csv"
+    path.write_text(
+        f"{HEADER}point_goal1,cpo,Peer,12,2.9,30,20,25\npoint_goal1,ppo_lag,Peer,1,2,3,4,10\n"
+    )
+    table = compare.results(compared(tmp_path), "return", compare.read_published(path))
+    assert table.header == ["", "car_push1", "point_goal1"]
+    assert table.rows == [
+        ["`cpo`", "**1.50 [1.00, 2.00]**", "**15.00 [10.00, 20.00]** ↑"],
+        ["Peer", "-", "12.00 ± 2.90"],
+        ["`ppo_lag`", "-", "30.00"],  # published with another limit; the cost is over ours
+    ]
+    cost = compare.results(compared(tmp_path), "cost", compare.read_published(path))
+    assert cost.rows[0][2] == "15.00 [10.00, 20.00]" and cost.rows[1][2] == "30.00 ± 20.00"
+
+
+def test_published_figures_stand_beside_runs_of_the_same_rules_alone(tmp_path):
+    path = tmp_path / "published.csv"
+    path.write_text(f"{HEADER.strip()},rules\npoint_button1,cpo,Peer,1,2,3,4,25,safety_gymnasium\n")
+    for rules in ("safety_gym", "safety_gymnasium"):
+        folder = write(tmp_path / rules / "1", "point_button1", "cpo")
+        config = run_folder.read_config(folder)
+        config["env"]["rules"] = rules
+        run_folder.write_config(folder, config)
+        (g,) = compared(tmp_path / rules)
+        known = compare.beside(g, compare.read_published(path))
+        assert (known is not None) == (rules == "safety_gymnasium")
+
+
+def test_the_committed_published_figures_are_whole():
+    found = compare.read_published(RESULTS / "published.csv")
+    assert len(found) == 160
+    for env, algo in found:
+        assert env in envs.ENVS and algo in algos.ALGOS
+    assert found["point_goal1", "cpo"] == ((20.46, 1.38), (28.84, 7.76), 25.0, "OmniSafe", "")
+    assert {f.rules for (env, _), f in found.items() if "button" in env} == {"safety_gymnasium"}
+
+
+def test_a_table_is_markdown_and_latex():
+    table = tables.Table("50% & _more_", ["", "a|b"], [["`x_y`", "**1** ↑ ±"], ["[2]", "-"]])
+    assert (
+        tables.markdown(table) == "|  | a\\|b |\n| --- | ---: |\n| `x_y` | **1** ↑ ± |\n| [2] | - |\n"
+    )
+    text = tables.latex(table)
+    assert r"\caption{50\% \& \_more\_}" in text and r"\begin{tabular}{lr}" in text
+    assert r"\texttt{x\_y} & \textbf{1} $\uparrow$ $\pm$ \\" in text
+
+
+def test_the_pareto_front_leaves_out_what_costs_more_and_returns_less():
+    points = [(3.0, 1.0), (1.0, 2.0), (2.0, 5.0), (4.0, 5.0), (5.0, 6.0), (0.0, np.nan)]
+    assert plots.front(points) == ([1, 2, 2, 5, 5], [2, 2, 5, 5, 6])
+
+
+def command(monkeypatch, *arguments: Any) -> int:
+    monkeypatch.setattr(sys, "argv", ["plot.py", *map(str, arguments)])
+    return compare.main(envs, algos)
+
+
+def test_one_command_writes_every_table_and_figure_the_same_each_time(tmp_path, monkeypatch, capsys):
+    for env in ("point_goal1", "car_goal1"):
+        for algo in ("cpo", "ppo_lag"):
+            write(tmp_path / "runs" / f"{env}-{algo}", env, algo)
+    out = tmp_path / "out"
+    arguments = (tmp_path / "runs", "--published", RESULTS / "published.csv", "--out", out)
+    assert command(monkeypatch, *arguments) == 0
+    figures = [
+        f"{name}.{s}" for name in ("curves", "trade_off", "scores", "profiles") for s in plots.FORMATS
+    ]
+    assert {p.name for p in out.iterdir()} == {*figures, "results.md", "results.tex", "results.csv"}
+    first = {p.name: p.read_bytes() for p in out.iterdir()}
+    printed = capsys.readouterr().out
+    assert "| OmniSafe | 43.32 ± 14.35 | 28.84 ± 7.76 |" in printed and printed.endswith(
+        f"written: {out}\n"
+    )
+    rows = list(csv.DictReader(io.StringIO((out / "results.csv").read_text())))
+    (one,) = [r for r in rows if r["task"] == "car_goal1" and r["algo.name"] == "cpo"
+              and (r["metric"], r["statistic"]) == ("return", "mean")]  # fmt: skip
+    assert [float(one[k]) for k in ("seeds", "value", "low", "high")] == [2, 2, 1, 3]
+    assert "P(better than ppo_lag)" in {r["statistic"] for r in rows}
+    assert command(monkeypatch, *arguments, "--by", "algo.name") == 0
+    assert {p.name: p.read_bytes() for p in out.iterdir()} == first
+
+
+def test_the_published_runs_are_read_packed():
+    groups = compared(RESULTS)
+    known = {(g.env, g.name): g for g in groups}
+    cpo = known["point_goal1", "cpo, preset=fast, compat=none"]
+    assert tables.cell(cpo.ret, ".2f") == "19.00 [17.38, 20.50]" and len(cpo.costs) == 5
+
+
+BAD = {
+    "nowhere": "nowhere is not a folder",
+    "empty": "empty holds no run",
+    "begun": "no run has begun in begun",
+    "runs --by algo.cost_limt": "unknown field algo.cost_limt; did you mean 'algo.cost_limit'?",
+    "runs --by cost_limit": "unknown field cost_limit; did you mean 'algo.cost_limit'?",
+    "runs --published none.csv": "none.csv cannot be read",
+    "runs --published bad.csv": "bad.csv has no column algo; expected task, algo, source",
+    "runs --published words.csv": "words.csv cannot be read: could not convert string to float: 'many'",
+    "runs --out runs/a/config.yaml": "--out runs/a/config.yaml: File exists",
+    "runs --out /proc/here": "--out /proc/here: No such file or directory",
+    "runs copy": "runs/a and copy are the same run of seed 0",
+    "other": "trained by jaxsafe 9.0 (abc), does not fit jaxsafe 0.1.0: unknown option algo.magic",
+    "columns": "columns/metrics.csv has no column train/return",
+    "torn": "torn/metrics.csv cannot be read",
+    "runs --fast": "unrecognized arguments: --fast",
+    "": "the following arguments are required: RUNS",
+}
+
+
+@pytest.mark.parametrize("arguments", BAD)
+def test_bad_input_is_one_line_and_status_2(arguments, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    write(Path("runs/a"))
+    write(Path("copy"))
+    write(Path("other"), magic=3)
+    Path("other/versions.json").write_text('[{"jaxsafe": "9.0", "commit": "abc"}]')
+    write(Path("begun"))
+    Path("begun/metrics.csv").unlink()
+    Path("empty").mkdir()
+    write(Path("columns"))
+    Path("columns/metrics.csv").write_text("iteration,steps,seed\n1,1,1\n")
+    write(Path("torn"))
+    Path("torn/metrics.csv").write_text("iteration,steps\n1,many\n")
+    Path("bad.csv").write_text("task,return\npoint_goal1,3\n")
+    Path("words.csv").write_text(f"{HEADER}point_goal1,cpo,Peer,many,1,1,1,25\n")
+    assert command(monkeypatch, *arguments.split()) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1 and lines[0].startswith("error: ") and BAD[arguments] in lines[0]
+    assert not Path("comparison").exists()

@@ -1,0 +1,224 @@
+"""Environments from outside the package, in Python and on the command line."""
+
+import dataclasses
+import sys
+from types import SimpleNamespace
+from typing import Any
+
+import jax.numpy as jnp
+import pytest
+from toys import Clock, Corridor
+
+from jaxsafe import algos, envs
+from jaxsafe.config import ConfigError
+from jaxsafe.envs.check import check_env
+from jaxsafe.envs.safety_gym.suite import ROBOTS, TASKS
+from jaxsafe.run import command, viewing
+
+MAINS = {
+    "train": command.train_main,
+    "evaluate": command.evaluate_main,
+    "render": viewing.render_main,
+}
+
+
+@pytest.fixture(autouse=True)
+def registry(monkeypatch):
+    """The registry as it was, and no module of an earlier test."""
+    monkeypatch.setattr(envs, "ENVS", {**envs.ENVS})
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.delitem(sys.modules, "mine", raising=False)
+
+
+def test_a_task_is_registered_by_its_options():
+    envs.register("maze1", TASKS["goal1"] | ROBOTS["point"] | {"hazards_num": 12, "engine": "c"})
+    assert envs.env_defaults("maze1")["hazards_num"] == 12
+    env = envs.make("maze1", lidar_num_bins=8)
+    assert (env.name, env.config.hazards_num, env.config.lidar_num_bins) == ("maze1", 12, 8)
+    envs.register("maze2", env)
+    assert envs.env_defaults("maze2")["lidar_num_bins"] == 8
+    with pytest.raises(ConfigError, match="did you mean 'hazards_num'"):
+        envs.register("maze3", {"hazard_num": 3})
+
+
+def test_a_layout_without_room_is_refused_though_nothing_is_overridden():
+    envs.register(
+        "full", TASKS["goal1"] | ROBOTS["point"] | {"hazards_num": 90, "hazards_keepout": 0.5}
+    )
+    with pytest.raises(ConfigError, match="no valid layout"):
+        envs.make("full")
+
+
+def made(name: str, **options: Any) -> Any:
+    return envs.make(name, **options)
+
+
+def test_an_object_or_what_makes_one_is_registered_too():
+    envs.register("hall", Corridor(half_width=0.2))
+    assert made("hall").half_width == 0.2 and envs.env_defaults("hall") == {}
+    envs.register("halls", Corridor)
+    assert envs.env_defaults("halls")["half_width"] == 0.5
+    assert made("halls", half_width=1).half_width == 1.0
+
+    def clock(life: int = 3, label=object()):  # noqa: B008
+        return Clock(lives=(life, life))
+
+    envs.register("clock", clock)
+    assert envs.env_defaults("clock") == {"life": 3}
+    assert made("clock", life=2.0).lives == (2, 2)
+    with pytest.raises(ConfigError, match=r"unknown option env.lif; did you mean 'life'"):
+        envs.make("clock", lif=2)
+    with pytest.raises(ConfigError, match=r"env.life='long': expected a whole number"):
+        envs.make("clock", life="long")
+    envs.register("bare", lambda life: clock(life))
+    with pytest.raises(ConfigError, match="bare: argument 'life' has no default"):
+        envs.env_defaults("bare")
+
+
+@dataclasses.dataclass(frozen=True)
+class Odd(Corridor):
+    """A corridor with one thing wrong: fields of its states replaced."""
+
+    fault: str = ""
+
+    def reset(self, key):
+        state = super().reset(key)
+        return {"obs": state.obs} if self.fault == "dict" else self.spoilt(state)
+
+    def step(self, state, action):
+        new = super().step(dataclasses.replace(state, info={}), action)
+        return (
+            dataclasses.replace(new, physics=jnp.int32(0)) if self.fault == "step" else self.spoilt(new)
+        )
+
+    def spoilt(self, state):
+        changes = {
+            "obs": {"obs": state.obs[:3]},
+            "cost": {"cost": state.cost[None]},
+            "costs": {"costs": jnp.zeros(2)},
+            "terminated": {"terminated": jnp.float32(0)},
+            "info": {"info": {"laps": 3}},
+        }
+        return dataclasses.replace(state, **changes.get(self.fault, {}))
+
+
+FAULTS = {
+    "obs": r"odd.reset: obs is float32\[3\], expected float32\[4\]",
+    "cost": r"odd.reset: cost is float32\[1\], expected float32\[\]",
+    "costs": r"odd.reset: costs is float32\[2\], expected float32\[1\]",
+    "terminated": r"odd.reset: terminated is float32\[\], expected bool\[\]",
+    "info": r"odd.reset: info\['laps'\] is int32\[\], expected float32\[\]",
+    "dict": "odd.reset gives a dict, expected jaxsafe.types.State",
+    "step": r"odd: state.physics is float32\[4\] after reset but int32\[\] after step",
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_state_that_does_not_fit_is_one_line(fault):
+    with pytest.raises(ConfigError, match=FAULTS[fault]):
+        check_env(Odd(fault=fault), "odd")
+
+
+def test_a_member_that_is_missing_or_odd_is_one_line():
+    with pytest.raises(
+        ConfigError, match=r"odd \(SimpleNamespace\) is no Env .*: it lacks obs_size, action_size"
+    ):
+        check_env(SimpleNamespace(reset=1, step=1), "odd")
+    with pytest.raises(ConfigError, match=r"odd: episode_length is inf, expected a whole number"):
+        check_env(Corridor(episode_length=float("inf")), "odd")  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="cost_names is 'wall', expected a tuple"):
+        check_env(Corridor(cost_names="wall"), "odd")  # type: ignore[arg-type]
+    assert check_env(Clock(), "clock") == Clock()
+
+
+# On the command line -------------------------------------------------------------------------
+
+MINE = """
+from pathlib import Path
+from toys import Corridor
+from jaxsafe.envs.suite import ROBOTS, TASKS
+
+Path("imported").touch()
+maze1 = TASKS["goal1"] | ROBOTS["point"]
+number = 3
+"""
+SMALL = (
+    "algo=ppo_lag", "num_envs=4", "algo.horizon=16", "algo.minibatches=2", "algo.epochs=2",
+    "algo.critic_epochs=2", "algo.hidden=[8,8]", "eval_episodes=2",
+)  # fmt: skip
+
+
+@pytest.fixture
+def call(tmp_path, monkeypatch, capsys):
+    """call('train', *arguments) -> exit status, stdout, stderr; in a folder with mine.py."""
+    (tmp_path / "mine.py").write_text(MINE)
+    monkeypatch.chdir(tmp_path)
+
+    def call(script: str, *args: str) -> tuple[int | str | None, str, str]:
+        monkeypatch.setattr(sys, "argv", [f"{script}.py", *args])
+        try:
+            status = MAINS[script](envs, algos)
+        except SystemExit as stop:
+            status = stop.code
+        return status, *capsys.readouterr()
+
+    return call
+
+
+def forget():
+    """As in a new process."""
+    del envs.ENVS["mine:Corridor"], sys.modules["mine"]
+
+
+def test_a_run_on_it_trains_resumes_and_evaluates_once_it_is_named(call, tmp_path):
+    own = "env=mine:Corridor"
+    status, out, err = call(
+        "train", own, "env.half_width=0.3", *SMALL, "total_steps=128", "run_dir=run"
+    )
+    assert status == 0, err
+    assert "mine:Corridor | ppo_lag" in out and "engine" not in out
+    assert "no video: only Safety Gym's environments can be drawn, not a Corridor" in out
+    config = (tmp_path / "run" / "config.yaml").read_text()
+    assert "name: mine:Corridor\n  half_width: 0.3\n" in config
+    forget()
+    (tmp_path / "imported").unlink()
+    for line in (("evaluate", "run"), ("render", "run"), ("train", "resume=run", "total_steps=256")):
+        status, out, err = call(*line)
+        assert status == 2 and "mine:Corridor is code" in err and "add env=mine:Corridor" in err
+        assert err.count("\n") == 1 and not (tmp_path / "imported").exists()
+    status, _, err = call("evaluate", "run", "env=mine:maze1")
+    assert status == 2 and "run was trained with env=mine:Corridor" in err
+    status, out, err = call("evaluate", "run", own)
+    assert status == 0 and "violation rate" in out, err
+    status, _, err = call("render", "run", own)
+    assert status == 2 and "only Safety Gym's environments can be drawn" in err
+    forget()
+    status, out, err = call("train", "resume=run", own, "total_steps=256")
+    assert status == 0 and "resuming at 128 steps" in out, err
+
+
+BAD = {
+    "mine:Coridor": "mine has no 'Coridor'; did you mean 'Corridor'?",
+    "mime:Corridor": "no module 'mime' in",
+    "mine:": "expected module:name",
+    "mine:number": "mine:number (int) is no Env",
+    "mine:maze1 env.hazard_num=3": "did you mean 'hazards_num'?",
+    "mine:Corridor env.half_width=wide": "env.half_width='wide': expected a number",
+}
+
+
+@pytest.mark.parametrize("arguments", BAD)
+def test_what_is_no_environment_is_one_line(arguments, call):
+    status, _, err = call("train", *f"env={arguments}".split())
+    assert status == 2 and err.count("\n") == 1 and BAD[arguments] in err
+
+
+def test_a_fault_inside_the_module_is_its_own(call, tmp_path):
+    (tmp_path / "mine.py").write_text("import nothing_like_this")
+    with pytest.raises(ModuleNotFoundError, match="nothing_like_this"):
+        call("train", "env=mine:maze1")
+
+
+def test_the_folder_of_its_runs_has_a_name_for_every_system(call):
+    settings = command.compose(["env=mine:maze1", "algo=cpo"], envs, algos)
+    assert settings.env_name == "mine:maze1" and settings.label == "mine.maze1-cpo"

@@ -1,0 +1,98 @@
+"""Who may import whom, and what a wheel must hold."""
+
+import ast
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent.parent
+SOURCES = ("jaxsafe", "envs", "algos")
+# Rooms from the lowest to the highest; one may import those below it and its own.
+ROOMS = (
+    {"jaxsafe.types", "jaxsafe.config"},
+    {"jaxsafe.nn"},
+    {"jaxsafe.learn"},
+    {"jaxsafe.envs", "jaxsafe.algos"},
+    {"jaxsafe.run", "jaxsafe.report"},
+    {"jaxsafe.interop"},
+    {"jaxsafe.api"},
+)
+LEVEL = {room: level for level, rooms in enumerate(ROOMS) for room in rooms}
+LINKS = (ROOT / "jaxsafe" / "envs", ROOT / "jaxsafe" / "algos")
+MODULES = sorted(
+    path
+    for folder in SOURCES
+    for path in (ROOT / folder).rglob("*.py")
+    if not any(link in path.parents for link in LINKS)
+)
+
+
+def dotted(path: Path) -> str:
+    """'jaxsafe.envs.check' of envs/check.py."""
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    parts = parts if parts[0] == "jaxsafe" else ("jaxsafe", *parts)
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def room_of(name: str) -> str | None:
+    return next((room for room in LEVEL if name == room or name.startswith(f"{room}.")), None)
+
+
+def imported(path: Path) -> set[str]:
+    """Every module that `path` imports, by its full name, wherever in the file."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return names
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda p: p.relative_to(ROOT).as_posix())
+def test_imports_point_one_way(path):
+    own = room_of(dotted(path))
+    for name in imported(path):
+        assert name.split(".")[0] not in ("envs", "algos", "scripts", "tests"), f"imports {name}"
+        if own and (other := room_of(name)) and other != own:
+            below = LEVEL[other] < LEVEL[own] or {own, other} <= {"jaxsafe.run", "jaxsafe.report"}
+            assert below, f"{own} imports {name}"
+
+
+def test_only_the_lazy_names_lead_to_the_api():
+    users = {path for path in MODULES for name in imported(path) if name.startswith("jaxsafe.api")}
+    assert users == {ROOT / "jaxsafe" / "__init__.py"}
+
+
+def test_the_links_into_the_package_exist_and_are_relative():
+    for name in ("envs", "algos"):
+        link = ROOT / "jaxsafe" / name
+        assert link.is_symlink() and link.readlink() == Path("..") / name
+
+
+def test_the_wheel_holds_every_module_and_asset(tmp_path):
+    source, out = tmp_path / "source", tmp_path / "out"
+    source.mkdir()
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        if (ROOT / name).exists():
+            shutil.copy(ROOT / name, source)
+    (source / "README.md").touch()
+    for name in ("jaxsafe", "envs", "algos"):
+        shutil.copytree(
+            ROOT / name, source / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__")
+        )
+    code = f"from setuptools.build_meta import build_wheel; build_wheel({str(out)!r})"
+    pytest.importorskip("setuptools", minversion="77")
+    done = subprocess.run([sys.executable, "-c", code], cwd=source, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    (wheel,) = out.glob("*.whl")
+    names = set(zipfile.ZipFile(wheel).namelist())
+    marker = ROOT / "jaxsafe" / "py.typed"
+    for path in [*MODULES, marker, *(ROOT / "envs").rglob("*.xml"), *(ROOT / "envs").rglob("*.cu")]:
+        inside = path.relative_to(ROOT).as_posix()
+        assert (inside if inside.startswith("jaxsafe/") else f"jaxsafe/{inside}") in names

@@ -1,0 +1,122 @@
+"""The site's pages: what docs/hooks.py makes of the files. `mkdocs build --strict` builds them."""
+
+import importlib
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent.parent
+DOCS = ROOT / "docs"
+sys.path.insert(0, str(DOCS))
+hooks = importlib.import_module("hooks")
+PAGES = sorted(DOCS.rglob("*.md"))
+
+
+def test_every_link_of_the_docs_leads_somewhere():
+    for page in PAGES:
+        text = re.sub(r"^(```.*?^```|    .*?$)", "", page.read_text(), flags=re.M | re.S)
+        for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", text):
+            assert target.startswith("https://") or (page.parent / target).exists(), (page, target)
+
+
+def test_every_anchor_of_the_docs_is_a_heading():
+    def headings(page: Path) -> set[str]:
+        lines = re.findall(r"^#+ (.*)$", page.read_text(), re.M)
+        return {re.sub(r"[^\w\- ]", "", line.lower()).replace(" ", "-") for line in lines}
+
+    found = 0
+    for page in [*PAGES, ROOT / "README.md"]:
+        text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.M | re.S)
+        for target, anchor in re.findall(r"\]\(([^)#:]*)#([^)]+)\)", text):
+            assert anchor in headings(page.parent / target if target else page), (page, target, anchor)
+            found += 1
+    assert found > 5
+
+
+@pytest.mark.parametrize(
+    "page", [pytest.param("concepts.md", marks=pytest.mark.slow), "howto/several_constraints.md"]
+)
+def test_the_python_of_a_page_runs(page, capsys):
+    blocks = re.findall(r"^```python\n(.*?)^```$", (DOCS / page).read_text(), re.M | re.S)
+    assert blocks
+    for text in blocks:
+        exec(compile(text, page, "exec"), {})
+    assert capsys.readouterr().out
+
+
+def test_the_list_of_pages_has_every_page_once():
+    found = [page for entry in hooks.listed(DOCS) for names in entry.values() for page in
+             ([names] if isinstance(names, str) else names)]  # fmt: skip
+    assert sorted(found) == sorted(str(page.relative_to(DOCS)) for page in PAGES)
+
+
+def test_pages_take_in_the_readme_and_show_a_link_on_github():
+    marks = [mark for page in PAGES for mark in hooks.MARK.finditer(page.read_text())]
+    assert len(marks) >= 7
+    assert all(re.match(r"\[.*\]\((\.\./)+README\.md(#[\w-]+)?\) <!--", mark[0]) for mark in marks)
+    for page in PAGES:
+        text = hooks.composed(page.read_text(), f"docs/{page.relative_to(DOCS)}", DOCS)
+        assert "<!-- readme:" not in text
+    sweep = hooks.composed((DOCS / "howto/sweep.md").read_text(), "docs/howto/sweep.md", DOCS)
+    assert "python scripts/sweep.py --summary SWEEP" in sweep and "## Environments" not in sweep
+    own = hooks.composed(
+        (DOCS / "howto/own_algorithm.md").read_text(), "docs/howto/own_algorithm.md", DOCS
+    )
+    assert "class PenaltyConfig(PPOConfig):" in own and "cost_limits" not in own
+    with pytest.raises(KeyError, match="Sweeep"):
+        hooks.section("# a\n\ntext\n\n## Sweep\n", "Sweeep")
+
+
+@pytest.mark.parametrize(
+    "link, expected",
+    [
+        ("[a](docs/fidelity.md)", "[a](../fidelity.md)"),
+        ("[a](docs/results/README.md#x)", "[a](../results/README.md#x)"),
+        ("[a](docs/results)", "[a](../results/README.md)"),
+        ("[a](envs/safety_gym/suite.py)", "[a](../source/envs/safety_gym/suite.py.txt)"),
+        ("[a](scripts)", "[a](../source/scripts.txt)"),
+        ("[a](docs/pages.py)", "[a](../source/docs/pages.py.txt)"),
+        ('<img src="docs/images/car_push2.png" width="270">',
+         '<img src="../images/car_push2.png" width="270">'),
+        ("[a](#sweep)", "[a](sweep.md)"),
+        ("[a](#several-gpus-and-hosts)", "[a](#several-gpus-and-hosts)"),
+        ("[a](#contributing-citing)", "[a](../source/README.md.txt)"),
+        ("[a](https://example.org/x)", "[a](https://example.org/x)"),
+        ("```text\n[a](envs/safety_gym/suite.py)\n```", "```text\n[a](envs/safety_gym/suite.py)\n```"),
+    ],
+)  # fmt: skip
+def test_links_of_the_readme_work_on_a_page(link, expected):
+    assert hooks.relinked(link, "README.md", "docs/howto/several_gpus.md", DOCS) == expected
+
+
+def test_a_table_replaces_what_stands_between_its_marks_alone():
+    tables = importlib.import_module("tables")
+    for old in ("", "| old |\n", "| old |\n\nmore\n"):
+        text = f"before\n<!-- table: a -->\n{old}<!-- end -->\nafter\n<!-- end -->\n"
+        new = tables.replaced(text, {"a": "| new |"})
+        assert new == "before\n<!-- table: a -->\n| new |\n<!-- end -->\nafter\n<!-- end -->\n"
+    with pytest.raises(ValueError, match="no <!-- table: a -->"):
+        tables.replaced("<!-- table: a -->\n", {"a": "| new |"})
+
+
+def test_files_that_pages_link_to_are_there():
+    found = hooks.sources(DOCS)
+    assert {"algos/cpo.py", "CONTRIBUTING.md"} - found == {"CONTRIBUTING.md"}
+    assert all((ROOT / path).exists() for path in found)
+
+
+def test_docstrings_show_fields_and_sections():
+    fields = "State.\n\nobs: float [O], of\n    it.\nreward, cost: float [].\n\n"
+    shown = "State.\n\n- `obs`: float [O], of\n    it.\n- `reward, cost`: float [].\n\n"
+    args = "Args:\n    x: y.\nReturns:\n    z."
+    assert hooks.laid_out(fields + args) == f"{shown}Args:\n    x: y.\n\nReturns:\n    z."
+    assert hooks.laid_out("Does.\nSource: A\n    (2020).") == "Does.\n\n*Source:* A (2020)."
+
+
+def test_every_task_of_the_suite_has_a_small_picture():
+    found = {path.stem: path.stat().st_size for path in (DOCS / "images/environments").glob("*.jpg")}
+    tasks = [f"{task}{level}" for task in ("goal", "button", "push") for level in "012"]
+    assert set(found) == {f"{robot}_{task}" for robot in ("point", "car", "doggo") for task in tasks}
+    assert max(found.values()) <= 25_000

@@ -1,0 +1,68 @@
+"""The notebooks, executed with small settings in place of those of their `parameters` cell."""
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import nbclient
+import nbformat
+import pytest
+
+ROOT = Path(__file__).parent.parent.parent
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+TINY: dict[str, Any] = {
+    "num_envs": 4, "horizon": 20, "minibatches": 2, "critic_epochs": 1, "hidden": (4, 4),
+    "total_steps": 240, "eval_episodes": 0, "video": False,
+}  # fmt: skip
+SMALL = {  # what the settings of each become
+    "quickstart": TINY | {"env.num_steps": 40},
+    "sweep": TINY | {"num_seeds": 2},
+    "own_environment": TINY,
+    "own_algorithm": TINY,
+    "comparison": TINY | {"num_seeds": 2},
+}
+TASK = "toys:Corridor"  # of tests/, where a notebook has a `task`: compiles in seconds, and is cached
+FAST_XLA = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+
+
+def cells(path: Path) -> list[dict[str, Any]]:
+    return json.loads(path.read_text())["cells"]
+
+
+def tagged(path: Path, tag: str) -> list[str]:
+    return ["".join(c["source"]) for c in cells(path) if tag in c["metadata"].get("tags", ())]
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
+def test_a_notebook_runs_from_top_to_bottom(path, tmp_path, monkeypatch):
+    monkeypatch.setenv("JAX_PLATFORMS", "cpu")
+    monkeypatch.setenv("XLA_FLAGS", FAST_XLA)
+    monkeypatch.setenv("PYTHONPATH", str(ROOT / "tests"), prepend=os.pathsep)
+    notebook: Any = nbformat.read(path, as_version=4)
+    for cell in notebook.cells:
+        tags = cell.metadata.get("tags", ())
+        if "parameters" in tags:
+            cell.source += f"\ntask, settings = {TASK!r}, settings | {SMALL[path.stem]!r}"
+    nbclient.NotebookClient(
+        notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": str(tmp_path)}}
+    ).execute()
+    outputs = [o for cell in notebook.cells if cell.cell_type == "code" for o in cell.outputs]
+    kinds = {kind for o in outputs for kind in o.get("data", ())}
+    assert kinds & {"image/png", "text/html"}, "it shows no picture"
+    assert not [o.text for o in outputs if o.output_type == "stream" and o.name == "stderr"]
+
+
+def test_every_notebook_has_small_settings():
+    assert [path.stem for path in NOTEBOOKS] == sorted(SMALL)
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
+def test_a_notebook_is_kept_clean_and_installs_what_it_needs(path):
+    for cell in cells(path):
+        if cell["cell_type"] == "code":
+            assert cell["outputs"] == [] and cell["execution_count"] is None
+    second = "".join(cells(path)[1]["source"])
+    assert tagged(path, "install") == [second] and '"jaxsafe @ git+{REPOSITORY}"' in second
+    (parameters,) = tagged(path, "parameters")
+    assert "settings = {" in parameters

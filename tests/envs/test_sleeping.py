@@ -1,0 +1,121 @@
+"""Sleeping objects: k awake ones go as all awake ones would, and k are the right ones."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tasks import HERE, Task, change, moved, task
+
+from jaxsafe import envs
+from jaxsafe.envs.safety_gym import sleeping
+
+
+def walk(t: Task, steps: int, count: int = 4):
+    """The states of `steps` random actions."""
+    state, states = t.begin(count), []
+    for key in jax.random.split(jax.random.key(7), steps):
+        action = jax.random.uniform(key, (count, t.env.action_size), minval=-1)
+        states.append(state := t.step(state, action))
+    return states
+
+
+@pytest.mark.parametrize("name", ["point_goal2", "point_button1"])
+def test_who_is_out_of_reach_may_sleep(name):
+    for some, everyone in zip(walk(task(name, awake=2), 20), walk(task(name), 20), strict=True):
+        np.testing.assert_allclose(some.obs, everyone.obs, atol=2e-5)
+        np.testing.assert_allclose(some.reward, everyone.reward, atol=1e-6)
+        np.testing.assert_array_equal(some.costs, everyone.costs)
+        world, whole = some.physics.physics, everyone.physics.physics
+        np.testing.assert_allclose(world.qpos, whole.qpos, atol=2e-5)
+        np.testing.assert_allclose(world.qvel, whole.qvel, atol=1e-3)
+
+
+def beside_the_robot(t: Task, vase: int):
+    """Worlds with the robot at the origin, facing `vase` 0.25 m ahead, the others behind its back."""
+    state = t.begin()
+    count = t.env.scene.frees["vases"]
+    places = np.array([[-1.5, 0.4 * i - 2] for i in range(count)])
+    places[vase] = [0.25, 0.0]
+    for i, xy in enumerate(places):
+        start = t.env.scene.qpos_slice("vases").start + 7 * i
+        state = moved(state, slice(start, start + 2), jnp.tile(jnp.asarray(xy), (4, 1)))
+    return state
+
+
+def test_a_vase_that_is_hit_wakes_and_costs():
+    options = HERE | {"vases_num": 6, "hazards_num": 0, "constrain_vases": True}
+    some, everyone = (task("point_goal1", awake=k, **options) for k in (2, None))
+    a, b = beside_the_robot(some, 4), beside_the_robot(everyone, 4)
+    ahead = jnp.tile(jnp.array([1.0, 0.0]), (4, 1))
+    total = 0.0
+    for _ in range(60):
+        a, b = some.step(a, ahead), everyone.step(b, ahead)
+        np.testing.assert_array_equal(a.costs, b.costs)
+        total += float(a.cost.sum())
+    np.testing.assert_allclose(a.obs, b.obs, atol=2e-3)
+    assert total > 0
+
+
+def test_a_moving_vase_stays_awake_and_the_others_rest():
+    t = task("point_goal1", awake=2, **(HERE | {"vases_num": 6, "hazards_num": 0}))
+    state = beside_the_robot(t, 4)
+    first = t.env.scene.qvel_slice("vases").start
+    qvel = state.physics.physics.qvel.at[:, first].set(1.0)  # vase 0, the farthest, slides along x
+    qvel = qvel.at[:, first + 12].set(5e-5)  # vase 2 does not count as moving
+    state = change(state, {"qvel": qvel})
+    after = t.idle(state).physics.physics
+    shift = (after.qpos - state.physics.physics.qpos)[:, t.env.scene.qpos_slice("vases")]
+    shift = shift.reshape(4, 6, 7)[:, :, 0]
+    assert (shift[:, 0] > 5e-3).all()
+    np.testing.assert_array_equal(shift[:, 1:4], 0)
+    resting = after.qvel[:, t.env.scene.qvel_slice("vases")].reshape(4, 6, 6)[:, [1, 2, 3, 5]]
+    np.testing.assert_array_equal(resting, 0)
+
+
+def test_a_vase_whose_speed_is_charged_stays_awake():
+    options = HERE | {"vases_num": 6, "hazards_num": 0, "vases_velocity_threshold": 1e-5}
+    t = task("point_goal1", awake=2, **options)
+    state = beside_the_robot(t, 4)
+    at = t.env.scene.qvel_slice("vases").start + 12  # vase 2
+    state = change(state, {"qvel": state.physics.physics.qvel.at[:, at].set(5e-5)})
+    after = t.idle(state).physics.physics
+    assert (after.qvel[:, at] != 0).all()  # asleep, it would rest
+
+
+def test_of_too_many_moving_vases_the_nearest_stay_awake():
+    t = task("point_goal1", awake=2, **(HERE | {"vases_num": 6, "hazards_num": 0}))
+    state = beside_the_robot(t, 4)
+    speeds = state.physics.physics.qvel.at[:, t.env.scene.qvel_slice("vases")].set(0.5)
+    physics = jax.tree.map(lambda x: x[0], change(state, {"qvel": speeds}).physics.physics)
+    small = envs.SafetyGym(sleeping.small_config(t.env.config, 2), "c").scene
+    chosen = sleeping.nearest(physics, t.env.scene, small, "vases")
+    np.testing.assert_array_equal(chosen, [4, 5])  # 0.25 m and 1.5 m away
+
+
+def test_a_gremlin_alone_goes_where_mujoco_takes_it():
+    options = HERE | {"gremlins_num": 3, "hazards_num": 0, "vases_num": 0}
+    some, everyone = (task("point_goal1", awake=k, **options) for k in (1, None))
+    a, b = some.begin(), everyone.begin()
+    for _ in range(70):
+        a, b = some.idle(a), everyone.idle(b)
+    for field, tolerance in (("qpos", 1e-5), ("qvel", 1e-3)):
+        ours, theirs = (getattr(s.physics.physics, field) for s in (a, b))
+        np.testing.assert_allclose(ours, theirs, atol=tolerance)
+
+
+def test_how_many_are_awake_by_default():
+    def simulated(name: str, **options) -> int:
+        env = envs.make(name, **options)
+        return sleeping.awake(env.config, env.engine)
+
+    assert simulated("point_goal2", engine="c") == 10
+    assert simulated("point_goal2", engine="warp") == sleeping.AWAKE
+    assert simulated("point_goal2", engine="warp", lidar_type="natural") == 10
+    assert simulated("point_goal2", engine="c", awake=3) == 3
+
+
+def test_settings_that_need_everyone_are_refused():
+    with pytest.raises(envs.ConfigError, match=r"env.awake=0: expected at least 1, or null"):
+        envs.make("point_goal2", engine="c", awake=0)
+    with pytest.raises(envs.ConfigError, match=r"env.awake=2: expected 10 or null with .*natural"):
+        envs.make("point_goal2", engine="c", awake=2, lidar_type="natural")

@@ -1,0 +1,377 @@
+"""Engine `warp`, on Warp's CPU device: the same kernels and packing as on a GPU, without its graphs."""
+# MuJoCo's bindings come without types:
+# pyright: reportAttributeAccessIssue=false
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from tasks import task
+
+from jaxsafe import envs
+from jaxsafe.envs.engines import physics
+from jaxsafe.envs.safety_gym import scene, sleeping, suite
+
+
+def errors(name: str, steps: int = 4, **options) -> dict[str, float]:
+    """The largest differences to engine `c` after a step from its states.
+
+    The first step is left out: what rests touches the floor at a distance of 0, give or take a digit.
+    """
+    c, twin = task(name, **options), task(name, engine="warp", **options)
+    state = c.idle(c.begin())
+    worst = {"qpos": 0.0, "qvel": 0.0, "obs": 0.0, "reward": 0.0}
+    for key in jax.random.split(jax.random.key(7), steps):
+        action = jax.random.uniform(key, (4, c.env.action_size), minval=-1)
+        ours, state = twin.step(state, action), c.step(state, action)
+        np.testing.assert_array_equal(ours.costs, state.costs)
+        np.testing.assert_array_equal(ours.info["goal_met"], state.info["goal_met"])
+        assert not ours.info["overflow"].any()
+        for k, a, b in (
+            ("qpos", ours.physics.physics.qpos, state.physics.physics.qpos),
+            ("qvel", ours.physics.physics.qvel, state.physics.physics.qvel),
+            ("obs", ours.obs, state.obs),
+            ("reward", ours.reward, state.reward),
+        ):
+            worst[k] = max(worst[k], float(jnp.abs(a - b).max()))
+    return worst
+
+
+def test_it_goes_where_c_goes():
+    worst = errors("point_goal1")
+    assert worst["qpos"] < 1e-5 and worst["qvel"] < 1e-3 and worst["reward"] < 1e-5
+    assert worst["obs"] < 5e-3  # accelerations of rounded forces
+
+
+def test_dogs_feet_have_the_contact_frames_of_c():
+    worst = errors("doggo_goal0", steps=8)
+    assert worst["qpos"] < 1e-4 and worst["qvel"] < 1e-2
+
+
+def test_guides_go_round_and_steps_of_different_length_live_side_by_side():
+    options = {"gremlins_num": 2, "frameskip_binom_p": 0.5, "constrain_gremlins": True}
+    worst = errors("point_goal0", **options)
+    assert worst["qpos"] < 1e-4 and worst["qvel"] < 1e-2
+    t = task("point_goal0", engine="warp", **options)
+    assert len(set(t.idle(t.begin()).physics.physics.substeps.tolist())) > 1
+
+
+def test_poses_that_a_task_asks_for_come_along():
+    worst = errors("point_goal1", lidar_type="natural", reward_orientation=True)
+    assert worst["obs"] < 5e-3 and worst["reward"] < 1e-5
+
+
+def test_sensors_of_what_the_dynamics_do_not_write():
+    sensors = ("velocimeter", "subtreelinvel", "subtreeangmom")
+    assert errors("car_goal0", sensors_obs=sensors)["obs"] < 1e-3
+
+
+def test_contacts_without_room_are_counted():
+    t = task("point_goal1", engine="warp", contact_room=0.01)
+    assert (t.idle(t.begin(64)).info["overflow"] == 1).all()
+    with pytest.raises(envs.ConfigError, match=r"env.contact_room=0.0: expected above 0"):
+        envs.make("point_goal1", contact_room=0.0)
+
+
+ROOM = """
+<mujoco>
+  <option timestep="0.01"/>
+  <worldbody>
+    <geom type="plane" size="5 5 1"/>
+    <body pos="0 0 .1">
+      <freejoint/><geom type="box" size=".1 .1 .1" condim="6" friction="1 .01 .01"/>
+    </body>
+    <body pos=".03 .02 .32">
+      <freejoint/><geom type="box" size=".1 .1 .1" condim="4"/>
+    </body>
+    <body pos="0 1 .1">
+      <freejoint/><geom type="sphere" size=".1" condim="1" priority="1"/>
+    </body>
+    <body pos="1 0 1">
+      <joint name="a" axis="0 1 0" frictionloss=".5" limited="true" range="-20 20"/>
+      <geom type="capsule" fromto="0 0 0 .5 0 0" size=".05"/>
+      <body pos=".5 0 0">
+        <joint name="b" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 .4 0 0" size=".05"/>
+      </body>
+    </body>
+    <body pos="-1 0 1">
+      <joint name="c" axis="0 1 0" frictionloss=".01"/>
+      <geom type="capsule" fromto="0 0 0 .5 0 0" size=".05"/>
+    </body>
+  </worldbody>
+  <equality><joint joint1="b" joint2="c" polycoef="0 .5 0 0 0"/></equality>
+</mujoco>
+"""
+
+
+def compiled(xml: str):
+    return mujoco.MjSpec.from_string(xml).compile()
+
+
+@pytest.fixture(params=[1, 32])
+def lanes(request, monkeypatch):
+    """One lane, as on a CPU, or those of a GPU's warp, which take turns."""
+    import warp as wp
+
+    monkeypatch.setattr(wp.config, "enable_cpu_blocks", request.param == 32)
+    return request.param
+
+
+def test_the_solver_finds_what_mujocos_finds(lanes):
+    """Contacts, limits, equalities and dry friction, from the states on the way of 30 steps."""
+    from mujoco.mjx.third_party import mujoco_warp
+
+    from jaxsafe.envs.engines import physics_warp, solver_warp
+
+    assert physics_warp.solver.solve is solver_warp.solve
+    assert physics_warp.constraint.make_constraint is solver_warp.make_constraint
+    model = compiled(ROOM)
+    m, worlds = mujoco_warp.put_model(model), 16
+    d = mujoco_warp.make_data(model, nworld=worlds, nconmax=40, njmax=160)
+    assert solver_warp.adopt(model, m, d)
+    rng = np.random.default_rng(0)
+    d.qpos.assign(np.tile(model.qpos0, (worlds, 1)) + np.r_[0, 0, 0.05, np.zeros(18), 0.3, 0.3, 0.3])
+    d.qvel.assign(rng.normal(size=(worlds, model.nv)))
+    kinds, most = set(), 0
+    for _ in range(30):
+        mujoco_warp.step(m, d)
+        mujoco_warp.forward(m, d)
+        found = {}
+        for make, solve in (
+            (solver_warp.their_constraints, solver_warp.theirs),
+            (solver_warp.make_constraint, solver_warp.solve),
+        ):
+            make(m, d)
+            if solve is solver_warp.theirs:
+                kinds |= {
+                    int(k)
+                    for row, n in zip(d.efc.type.numpy(), d.nefc.numpy(), strict=True)
+                    for k in row[:n]
+                }
+                rows = d.nefc.numpy().copy()
+            np.testing.assert_array_equal(d.nefc.numpy(), rows)
+            solve(m, d)
+            for name, x in (("qacc", d.qacc), ("qfrc", d.qfrc_constraint), ("Ma", d.efc.Ma)):
+                found.setdefault(name, []).append(x.numpy().copy())
+            given = np.arange(d.njmax) < d.nefc.numpy()[:, None]
+            found.setdefault("force", []).append(np.where(given, d.efc.force.numpy(), 0))
+            found.setdefault("iterations", []).append(d.solver_niter.numpy().copy())
+        for name, (theirs, ours) in found.items():
+            if name == "iterations":
+                assert (ours <= np.maximum(theirs, 1) + 2).all()
+                most = max(most, ours.max())
+            else:
+                scale = np.abs(theirs).max(axis=1, keepdims=True)
+                assert (np.abs(ours - theirs) < 2e-4 * (1 + scale)).all(), name
+    assert len(kinds) == 5 and most > 2, (kinds, most)
+
+
+def simulated(name: str, worlds: int, **options):
+    """Model and working data of a task's scene, its sleepers but two left out."""
+    from mujoco.mjx.third_party import mujoco_warp
+
+    env = task(name, **options).env
+    small = scene.build(sleeping.small_config(env.config, 2))
+    m = mujoco_warp.put_model(small.model)
+    contacts, rows = physics.contact_budget(small)
+    data = [
+        mujoco_warp.make_data(small.model, nworld=worlds, naconmax=contacts * worlds, njmax=rows)
+        for _ in range(2)
+    ]
+    return small.model, m, *data
+
+
+WRITTEN = (  # by the dynamics, for what comes after them
+    "xpos", "xquat", "xmat", "geom_xpos", "geom_xmat", "site_xpos", "site_xmat", "cinert", "cvel",
+    "cdof", "cdof_dot", "M", "qfrc_smooth", "subtree_com",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["point_push1", "car_goal1", "doggo_button2"])
+def test_the_dynamics_are_mujocos(name, lanes):
+    """All that the dynamics write, and steps, from states on the way of one that tumbles."""
+    from mujoco.mjx.third_party import mujoco_warp
+    from mujoco.mjx.third_party.mujoco_warp._src.forward import euler
+
+    from jaxsafe.envs.engines import dynamics_warp
+
+    worlds = 9  # not a multiple of those that share a block
+    model, m, theirs, ours = simulated(name, worlds)
+    assert dynamics_warp.adopt(model, m, ours) and dynamics_warp.solver_warp.adopt(model, m, theirs)
+    ours.dynamics.pillars = None  # whose contacts `theirs` does not get: they left the model's list
+    rng = np.random.default_rng(0)
+    theirs.qvel.assign(rng.normal(size=(worlds, model.nv)))
+    roots = np.unique(model.body_rootid[1:])
+    for _ in range(6):
+        theirs.ctrl.assign(rng.uniform(-1.5, 1.5, size=(worlds, model.nu)))
+        if model.nmocap:
+            theirs.mocap_pos.assign(rng.normal(size=(worlds, model.nmocap, 3)))
+        for k in ("qpos", "qvel", "qacc_warmstart", "ctrl", "mocap_pos"):
+            getattr(ours, k).assign(getattr(theirs, k).numpy().copy())
+        mujoco_warp.forward(m, theirs)
+        dynamics_warp.forward(m, ours)
+        for k in WRITTEN:
+            a, b = getattr(ours, k).numpy(), getattr(theirs, k).numpy()
+            if k in ("cinert", "cvel", "subtree_com"):  # others' are not written
+                a, b = (x[:, roots if k == "subtree_com" else slice(1, None)] for x in (a, b))
+            assert np.abs(a - b).max() < 2e-6 * np.abs(b).max(), k
+        assert np.abs(ours.sensordata.numpy() - theirs.sensordata.numpy()).max() < 0.01 * (
+            1 + np.abs(theirs.sensordata.numpy()).max()
+        )
+        # Euler's step from the same accelerations
+        for k in ("qacc", "qfrc_constraint"):
+            getattr(ours, k).assign(getattr(theirs, k).numpy().copy())
+        ours.efc.Ma.assign(theirs.efc.Ma.numpy().copy())
+        euler(m, theirs)
+        dynamics_warp.advance(m, ours)
+        for k in ("qpos", "qvel", "qacc_warmstart", "time"):
+            a, b = getattr(ours, k).numpy(), getattr(theirs, k).numpy()
+            assert np.abs(a - b).max() < 2e-6 * np.abs(b).max(), k
+
+
+def test_the_dynamics_are_for_every_task():
+    from jaxsafe.envs.engines import dynamics_warp
+
+    for name in (f"{robot}_{kind}2" for robot in suite.ROBOTS for kind in ("goal", "button", "push")):
+        model, m, ours, _ = simulated(name, 1)
+        assert dynamics_warp.adopt(model, m, ours), name
+
+
+ARM = """
+<mujoco>
+  <option timestep="0.01"/>
+  <worldbody>
+    <body name="upper" pos="0 0 1">
+      <joint name="a" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 .5 0 0" size=".05"/>
+      <body name="lower" pos=".5 0 0">
+        <joint name="b" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 .4 0 0" size=".05"/>
+        <site name="hand" pos=".4 0 0"/>
+      </body>
+    </body>
+    <body name="other" pos="1.2 0 1">
+      <joint name="c" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 .3 0 .1" size=".05"/>
+    </body>
+  </worldbody>
+  <equality/>
+  <actuator/>
+  <sensor/>
+</mujoco>
+"""
+
+
+def beside_c(xml: str, steps: int = 20, worlds: int = 2, **options):
+    """(adopted, our data, MuJoCo's) after steps that do not read sensors and a pass that does."""
+    from mujoco.mjx.third_party import mujoco_warp
+
+    from jaxsafe.envs.engines import dynamics_warp
+
+    model = compiled(xml)
+    m, off = mujoco_warp.put_model(model), int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+    blind = dataclasses.replace(m, opt=dataclasses.replace(m.opt, disableflags=off))
+    d = mujoco_warp.make_data(model, nworld=worlds, nconmax=40, njmax=160)
+    adopted = dynamics_warp.adopt(model, m, d)
+    c = mujoco.MjData(model)
+    if model.nu:
+        c.ctrl[:] = 0.5
+        d.ctrl.fill_(0.5)
+    for _ in range(steps):
+        dynamics_warp.step(blind, d)
+        mujoco.mj_step(model, c)
+    dynamics_warp.forward(m, d)
+    mujoco.mj_forward(model, c)
+    return adopted, d, c
+
+
+@pytest.mark.parametrize(
+    ("where", "what"),
+    [
+        ("actuator", '<motor joint="a" gear="3"/>'),
+        ("actuator", '<motor joint="a" damping="2"/>'),
+        ("actuator", '<general joint="a" gainprm="1" biasprm="5 -10 -1"/>'),  # of no bias
+        ("actuator", '<position joint="b" kp="3"/><velocity joint="a" kv="2" forcerange="-.1 .1"/>'),
+        ("actuator", '<general site="hand" gear="1 0 2 0 1 0"/>'),
+        ("equality", '<connect body1="lower" body2="other" anchor=".4 0 0"/>'),
+        ("equality", '<weld body1="lower" body2="other"/>'),
+        ("sensor", '<subtreelinvel body="upper"/><framepos objtype="body" objname="lower"/>'),
+        ("sensor", '<actuatorfrc actuator="m"/><jointactuatorfrc joint="a"/>'),
+    ],
+)
+def test_the_dynamics_go_where_c_goes(where, what):
+    """Motors, thrusters, equalities, and sensors of what the dynamics do not write."""
+    motor = '<motor name="m" joint="a" gear="3"/>' if "actuator=" in what else ""
+    xml = ARM.replace("<actuator/>", f"<actuator>{motor}</actuator>" if motor else "<actuator/>")
+    adopted, d, c = beside_c(xml.replace(f"<{where}/>", f"<{where}>{what}</{where}>"))
+    assert adopted
+    np.testing.assert_allclose(d.qpos.numpy()[1], c.qpos, atol=1e-4)
+    np.testing.assert_allclose(d.qvel.numpy()[1], c.qvel, atol=2e-3)
+    np.testing.assert_allclose(d.sensordata.numpy()[1], c.sensordata, atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        ('timestep="0.01"', 'timestep="0.01" integrator="implicitfast"'),
+        ('timestep="0.01"', 'timestep="0.01" density="1000"'),
+        ('<body name="upper"', '<body name="upper" gravcomp="1"'),
+        ('<joint name="b" axis="0 1 0"/>', '<joint name="b" type="ball" stiffness="1"/>'),
+        ("<actuator/>", '<actuator><muscle joint="a" lengthrange="0 1"/></actuator>'),
+        ("<actuator/>", '<actuator><intvelocity joint="a" actrange="-1 1"/></actuator>'),
+        ("<equality/>", "<!-- 400 bodies more, for which shared memory has no room -->"),
+    ],
+)
+def test_models_that_the_dynamics_are_not_for_keep_mujocos(change):
+    xml = ARM.replace(*change)
+    if "400" in change[1]:
+        bodies = "".join(f'<body pos="{k} 5 0"><geom size=".1"/></body>' for k in range(400))
+        xml = xml.replace("</worldbody>", f"{bodies}</worldbody>")
+    adopted, d, c = beside_c(xml, steps=3)
+    assert not adopted
+    np.testing.assert_allclose(d.qpos.numpy()[1], c.qpos, atol=1e-4)
+
+
+def test_a_world_without_constraints_forgets_its_warmstart():
+    from mujoco.mjx.third_party import mujoco_warp
+
+    from jaxsafe.envs.engines import dynamics_warp
+
+    model = compiled(ARM)
+    m, d = mujoco_warp.put_model(model), mujoco_warp.make_data(model, nworld=3, nconmax=40, njmax=160)
+    assert dynamics_warp.adopt(model, m, d)
+    warmstart = np.zeros((3, model.nv))
+    warmstart[1], warmstart[2] = np.nan, 1e6
+    d.qacc_warmstart.assign(warmstart)
+    dynamics_warp.forward(m, d)
+    c = mujoco.MjData(model)
+    mujoco.mj_forward(model, c)
+    np.testing.assert_allclose(d.qacc.numpy(), np.tile(c.qacc, (3, 1)), rtol=1e-4)
+
+
+def test_models_that_the_solver_is_not_for_keep_mujocos():
+    from mujoco.mjx.third_party import mujoco_warp
+
+    from jaxsafe.envs.engines import solver_warp
+
+    model = compiled(ROOM.replace("<option", '<option cone="elliptic"'))
+    m, d = mujoco_warp.put_model(model), mujoco_warp.make_data(model, nconmax=40, njmax=160)
+    assert not solver_warp.adopt(model, m, d)
+    mujoco_warp.forward(m, d)
+    assert np.isfinite(d.qacc.numpy()).all() and d.solver_niter.numpy()[0] > 0
+
+
+def test_the_solver_stops_where_numbers_have_ended():
+    from mujoco.mjx.third_party import mujoco_warp
+
+    from jaxsafe.envs.engines import solver_warp
+
+    model = compiled(ROOM)
+    m, d = mujoco_warp.put_model(model), mujoco_warp.make_data(model, nworld=2, nconmax=40, njmax=160)
+    assert solver_warp.adopt(model, m, d)
+    mujoco_warp.forward(m, d)
+    right = d.qacc.numpy().copy()
+    d.qfrc_smooth.assign(np.stack([np.full(model.nv, np.nan), d.qfrc_smooth.numpy()[1]]))
+    solver_warp.solve(m, d)
+    assert np.isnan(d.qacc.numpy()[0]).any() and d.solver_niter.numpy()[0] < 3
+    np.testing.assert_allclose(d.qacc.numpy()[1], right[1], rtol=1e-3, atol=1e-3)

@@ -1,0 +1,243 @@
+"""Our environments in Brax's and Playground's interface, and theirs in ours."""
+
+from typing import Any
+
+import brax.envs
+import brax.envs.fast
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from brax.envs.fast import ObservationMode
+from brax.envs.wrappers import training
+from brax.training.agents.ppo import train as ppo
+from tasks import FAST
+from toys import Clock, Corridor
+
+from jaxsafe import algos, envs
+from jaxsafe.config import ConfigError
+from jaxsafe.envs.check import check_env
+from jaxsafe.interop.brax import from_brax, mend_brax, to_brax, to_playground
+from jaxsafe.learn.rollout import collect, init_rollout
+
+
+class Fast(brax.envs.fast.Fast):
+    """Brax's own test environment, which ends after three steps.
+
+    With a cost in `info` and one in `metrics`, and a Python float where reset gave an array.
+    """
+
+    def reset(self, rng) -> Any:
+        zero = jnp.zeros(())
+        first: Any = super().reset(rng)
+        return first.replace(info={"cost": zero}, metrics={"heat": zero, "steps": zero})
+
+    def step(self, state, action) -> Any:
+        state.info["cost"] += 1.0  # in place, as many environments do
+        steps = state.metrics["steps"] + 1
+        metrics = {"heat": jnp.abs(action).sum(), "steps": steps}
+        done = jnp.float32(steps >= 3)
+        new: Any = super().step(state, action)
+        return new.replace(reward=1.0, done=done, metrics=metrics)
+
+
+def test_in_brax_s_wrappers_a_time_limit_truncates_and_an_end_does_not():
+    def run(lives: tuple[int, int]):
+        env = training.wrap(to_brax(Clock(lives=lives)), episode_length=3)
+
+        def step(state, _):
+            state = env.step(state, jnp.zeros((2, 1)))
+            return state, (state, 1 - state.done)
+
+        first = env.reset(jax.random.split(jax.random.PRNGKey(0), 2))
+        return jax.lax.scan(step, first, None, 4)[1]
+
+    states, discount = jax.jit(run, static_argnums=0)((2, 2))
+    np.testing.assert_array_equal(discount[:, 0], [1, 0, 1, 0])
+    np.testing.assert_array_equal(states.info["truncation"], np.zeros((4, 2)))
+    np.testing.assert_array_equal(states.info["cost"], np.full((4, 2), 2.0))
+    np.testing.assert_array_equal(states.info["episode_metrics"]["cost"][:, 0], [2, 4, 2, 4])
+    np.testing.assert_array_equal(states.metrics["cost_b"], np.full((4, 2), 1.5))
+    np.testing.assert_array_equal(states.obs[:, 0, 1], [1, 0, 1, 0])  # reset in the step it ends
+    states, discount = jax.jit(run, static_argnums=0)((99, 99))
+    np.testing.assert_array_equal(discount[:, 0], [1, 1, 0, 1])
+    np.testing.assert_array_equal(states.info["truncation"][:, 0], [0, 0, 1, 0])
+
+
+@pytest.mark.parametrize("adapt", [to_brax, to_playground])
+def test_either_state_steps_alike_and_keeps_what_wrappers_add(adapt):
+    env, key = adapt(Clock()), jax.random.key(3)
+    assert (env.observation_size, env.action_size) == (3, 1)
+    first = env.reset(key)
+    old = env.reset(jax.random.key_data(key))  # Brax's style of keys
+    np.testing.assert_array_equal(first.obs, old.obs)
+    first.info["mine"], first.metrics["reward"] = jnp.ones(()), jnp.ones(())
+    after = env.step(first, jnp.zeros(1))
+    assert {"mine", "cost"} == after.info.keys() and "reward" in after.metrics
+    assert (after.obs[1], after.reward, after.done, after.info["cost"]) == (1, 1, 0, 2)
+
+
+def test_point_goal1_steps_in_brax_as_it_does_here():
+    ours = envs.make("point_goal1", engine="c")
+    wrapped = training.wrap(to_brax(ours), episode_length=1000)
+    action = jnp.array([[1.0, 0.5], [-1.0, 0.2]])
+
+    def episode(reset, step, keys):
+        def advance(state, _):
+            state = step(state, action)
+            return state, state
+
+        return jax.lax.scan(advance, reset(keys), None, 5)[1]
+
+    def both(keys):
+        here = episode(jax.vmap(ours.reset), jax.vmap(ours.step), keys)
+        return episode(wrapped.reset, wrapped.step, jax.random.key_data(keys)), here
+
+    run = jax.jit(both, compiler_options=FAST)
+    there, here = run(jax.random.split(jax.random.key(0), 2))
+    np.testing.assert_allclose(there.obs, here.obs, atol=1e-5)
+    np.testing.assert_allclose(there.reward, here.reward, atol=1e-6)
+    np.testing.assert_array_equal(there.info["cost"], here.cost)
+    np.testing.assert_array_equal(there.metrics["cost_hazards"], here.costs[..., 0])
+    assert there.reward.any() and "goal_met" in there.metrics
+
+
+def test_a_foreign_environment_rolls_out_with_its_costs():
+    costs = {"cost": lambda s: s.info["cost"], "heat": lambda s: s.metrics["heat"]}
+    for given in (["cost", "heat"], costs):
+        env = check_env(from_brax(Fast(), given, episode_length=5), "fast")
+        assert env.cost_names == ("cost", "heat")
+    rollout = init_rollout(env, jax.random.key(0), 2, stagger=False)
+    assert not rollout.state.cost.any() and not rollout.pool.reward.any()
+    wide = jnp.full((2, env.action_size), 9.0)  # clipped to 1
+    run = jax.jit(lambda r: collect(env, lambda obs, key: (wide, obs[:, 0]), r, jax.random.key(1), 4))
+    _, traj = run(rollout)
+    np.testing.assert_array_equal(traj.costs[:, 0], [[1, 1], [2, 1], [3, 1], [1, 1]])
+    np.testing.assert_array_equal(traj.cost, traj.costs.sum(-1))
+    np.testing.assert_array_equal(traj.terminated[:, 0], [False, False, True, False])
+    np.testing.assert_array_equal(traj.episode.ret[:, 0], [1, 2, 3, 1])
+    np.testing.assert_array_equal(traj.episode.info["steps"][:, 0], [1, 3, 6, 1])
+
+
+def test_a_foreign_environment_is_left_as_it_was():
+    env = from_brax(Fast())
+    state = env.reset(jax.random.key(0))
+    env.step(state, jnp.zeros(env.action_size))
+    assert state.physics.info["cost"] == 0
+
+
+BAD = {
+    "its info or metrics, which hold cost, heat, steps": lambda: from_brax(Fast(), ["kost"]),
+    "Fast has no 'cost'": lambda: from_brax(brax.envs.get_environment("fast")),
+    "which hold nothing": lambda: from_brax(brax.envs.get_environment("fast")),
+    "comes in EpisodeWrapper, AutoResetWrapper": lambda: from_brax(brax.envs.create("fast")),
+    "comes in a VmapWrapper": lambda: from_brax(training.VmapWrapper(Fast(), 2)),
+    "from_brax": lambda: envs.register("raw", Fast()),
+}
+
+
+@pytest.mark.parametrize("message", BAD)
+def test_what_cannot_be_adapted_is_one_line(message):
+    with pytest.raises(ConfigError, match=message) as error:
+        BAD[message]()
+    assert "\n" not in str(error.value)
+
+
+def test_only_the_named_part_of_a_dict_is_observed():
+    both = Fast(obs_mode=ObservationMode.DICT_STATE, asymmetric_obs=True)
+    assert from_brax(both).obs_size == 2
+    assert from_brax(both, obs="privileged_state").obs_size == 4
+    with pytest.raises(ConfigError, match="no observation 'stat'; did you mean 'state'"):
+        from_brax(both, obs="stat")
+
+
+def train(env: Any, iterations: int, **options: Any) -> dict[str, np.ndarray]:
+    """Metrics of each update, [iterations], of PPO-Lagrangian."""
+    config, make, *_ = algos.ALGOS["ppo_lag"]
+    algo = make(env)
+    ts = jax.jit(algo.init)(jax.random.key(0), config(num_envs=64, horizon=50, **options))
+    update = jax.jit(algo.update)
+    rows = []
+    for _ in range(iterations):
+        ts, metrics = update(ts)
+        rows.append(jax.device_get(metrics))
+    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
+
+
+@pytest.mark.slow
+def test_brax_s_own_ppo_learns_to_reach_the_goals_of_point_goal1():
+    rewards, costs = [], []
+
+    def note(step, metrics):
+        rewards.append(metrics["eval/episode_reward"])
+        costs.append(metrics["eval/episode_cost"])
+
+    mend_brax()
+    ppo.train(
+        to_brax(envs.make("point_goal1", engine="c")),
+        num_timesteps=360_000,
+        episode_length=1000,
+        num_envs=128,
+        unroll_length=20,
+        batch_size=128,
+        num_minibatches=16,
+        num_updates_per_batch=8,
+        learning_rate=1e-3,
+        discounting=0.99,
+        normalize_observations=True,
+        num_evals=2,
+        num_eval_envs=32,
+        progress_fn=note,
+    )
+    assert rewards[0] < 3 and rewards[-1] > 10
+    assert all(cost > 5 for cost in costs)
+
+
+@pytest.mark.slow
+def test_brax_s_pendulum_learns_to_stand_within_a_limit_on_its_cost():
+    class Charged(brax.envs.Wrapper):
+        """A cost in `metrics`: 1 where the cart is more than 10 cm from the middle."""
+
+        def reset(self, rng):
+            state = self.env.reset(rng)
+            state.metrics["cost"] = jnp.zeros(())
+            return state
+
+        def step(self, state: Any, action):
+            state = self.env.step(state, action)
+            state.metrics["cost"] = jnp.float32(jnp.abs(state.obs[0]) > 0.1)
+            return state
+
+    pendulum = Charged(brax.envs.get_environment("inverted_pendulum"))
+    metrics = train(from_brax(pendulum, episode_length=200), 70, cost_limit=20.0)
+    assert metrics["train/return"][0] < 20 and metrics["train/cost"].max() > 60
+    assert metrics["train/return"][-20:].mean() > 190  # of at most 200
+    assert metrics["train/cost"][-20:].mean() < 20
+
+
+@pytest.mark.slow  # needs playground
+def test_playground_s_cartpole_trains_within_a_limit_on_its_cost():
+    from mujoco_playground import registry  # type: ignore[import-not-found]
+
+    cartpole = from_brax(
+        registry.load("CartpoleBalance", config_overrides={"impl": "jax"}),
+        costs={"far": lambda state: jnp.abs(state.data.qpos[0]) > 0.1},
+        episode_length=200,
+    )
+    metrics = train(check_env(cartpole, "cartpole"), 40, cost_limit=5.0)
+    assert metrics["train/cost_estimate"][:5].mean() > 10
+    assert metrics["train/cost_estimate"][-5:].mean() < 5
+    assert metrics["train/return_estimate"][-5:].mean() > 100  # of at most 200
+    assert metrics["train/nonfinite"].sum() == 0
+
+
+@pytest.mark.slow  # needs playground
+def test_ours_step_in_playground_s_wrappers():
+    from mujoco_playground._src import wrapper  # type: ignore[import-not-found]
+
+    ours: Any = to_playground(Corridor())
+    env = wrapper.wrap_for_brax_training(ours, episode_length=3, full_reset=True)
+    state = jax.jit(env.reset)(jax.random.split(jax.random.PRNGKey(0), 2))
+    for done in (0, 0, 1, 0):
+        state = jax.jit(env.step)(state, jnp.ones((2, 2)))
+        np.testing.assert_array_equal(state.done, done)

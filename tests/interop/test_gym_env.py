@@ -1,0 +1,160 @@
+"""Gymnasium's and Safety-Gymnasium's interface to our environments."""
+
+import importlib
+import sys
+from collections.abc import Iterator
+
+import gymnasium
+import jax
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from toys import Clock, Corridor
+
+from jaxsafe import envs
+from jaxsafe.config import ConfigError
+from jaxsafe.interop.gymnasium import GymEnv, GymVectorEnv, SixTuple, SixTupleVector
+
+UNBOUNDED = "ignore:.*Box observation space .* value is -?infinity"
+
+
+@pytest.fixture(autouse=True, scope="module")
+def quickly() -> Iterator[None]:
+    """Compile for a few steps, not for millions."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
+def walk(env, steps: int = 5, seed: int | None = 7) -> list:
+    """Observations, then rewards, of a few steps after a reset."""
+    first, _ = env.reset(seed=seed)
+    env.action_space.seed(0)
+    rest = [env.step(env.action_space.sample()) for _ in range(steps)]
+    return [first, *(row[0] for row in rest), np.array([row[1] for row in rest])]
+
+
+@pytest.mark.filterwarnings("error", UNBOUNDED)
+def test_gymnasium_s_checker_finds_nothing():
+    check_env(GymEnv(Corridor()), skip_render_check=True)
+    check_env(GymEnv(Clock(lives=(2, 4))), skip_render_check=True)
+
+
+@pytest.mark.filterwarnings("error", UNBOUNDED)
+def test_point_goal1_is_made_by_its_id_and_passes_the_checker_with_its_pictures():
+    env = gymnasium.make("jaxsafe.interop.gymnasium:jaxsafe/point_goal1", render_mode="rgb_array")
+    check_env(env.unwrapped)
+    obs, info = env.reset(seed=0)
+    assert env.observation_space.contains(obs) and info["cost_hazards"] == 0
+    frame = env.render()
+    assert isinstance(frame, np.ndarray) and frame.shape == (480, 640, 3) and frame.std() > 10
+
+
+def test_every_environment_of_the_suite_has_an_id():
+    ids = {key for key in gymnasium.registry if key.startswith("jaxsafe/")}
+    assert ids == {f"jaxsafe/{name}" for name in envs.ALIASES.values()}
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_vector_of_point_goal1_is_one_program():
+    vector = gymnasium.make_vec(
+        "jaxsafe/point_goal1", num_envs=3, vectorization_mode="vector_entry_point", num_steps=2
+    )
+    assert isinstance(vector, GymVectorEnv)
+    assert vector.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    obs, _ = vector.reset(seed=0)
+    assert vector.observation_space.contains(obs)
+    assert len(np.unique(obs, axis=0)) == 3  # layouts of their own
+    for last in (False, True):
+        obs, *_, truncated, info = vector.step(vector.action_space.sample())
+        np.testing.assert_array_equal(truncated, [last] * 3)
+        assert ("final_obs" in info) == last
+
+
+def test_a_seed_repeats_and_no_seed_goes_on():
+    for env in (GymEnv(Corridor()), GymVectorEnv(Corridor(episode_length=2), 3)):
+        one, two, other = walk(env), walk(env, seed=None), walk(env)
+        assert not np.array_equal(one[0], two[0])
+        for a, b in zip(one, other, strict=True):
+            np.testing.assert_array_equal(a, b)
+    assert not np.array_equal(walk(env, seed=8)[0], one[0])
+
+
+def test_time_runs_out_or_the_episode_ends():
+    env = GymEnv(Clock(episode_length=2))
+    env.reset(seed=0)
+    assert [env.step(np.zeros(1))[2:4] for _ in range(2)] == [(False, False), (False, True)]
+    env = GymEnv(Clock(episode_length=2, lives=(2, 2)))
+    env.reset(seed=0)
+    assert [env.step(np.zeros(1))[2:4] for _ in range(2)] == [(False, False), (True, False)]
+
+
+def shapes(infos: dict) -> dict:
+    """Names with types and shapes."""
+    return {k: shapes(x) if isinstance(x, dict) else (x.dtype, x.shape) for k, x in infos.items()}
+
+
+def test_a_vector_gives_what_gymnasium_s_own_gives():
+    clock = Clock(lives=(3, 3))
+    theirs = SyncVectorEnv([lambda: GymEnv(clock)] * 2, autoreset_mode=AutoresetMode.SAME_STEP)
+    ours = GymVectorEnv(clock, 2)
+    assert ours.observation_space == theirs.observation_space
+    assert ours.action_space == theirs.action_space
+    assert shapes(ours.reset(seed=0)[1]) == shapes(theirs.reset(seed=0)[1])
+    for t in range(1, 8):
+        a, b = ours.step(np.zeros((2, 1))), theirs.step(np.zeros((2, 1)))
+        np.testing.assert_array_equal(a[0][:, 1:], b[0][:, 1:])  # all but the name of the episode
+        for x, y in zip(a[1:4], b[1:4], strict=True):
+            assert x.dtype == y.dtype
+            np.testing.assert_array_equal(x, y)
+        assert shapes(a[4]) == shapes(b[4])
+        if t % 3:
+            np.testing.assert_array_equal(a[4]["cost"], b[4]["cost"])
+        else:
+            np.testing.assert_array_equal([x[1] for x in a[4]["final_obs"]], [3, 3])
+            for name in ("cost", "cost_b", "ticks"):
+                np.testing.assert_array_equal(a[4]["final_info"][name], b[4]["final_info"][name])
+
+
+def test_only_those_that_ended_have_a_last_observation():
+    vector = GymVectorEnv(Clock(lives=(1, 2)), 8)
+    first, _ = vector.reset(seed=0)
+    obs, _, terminated, _, info = vector.step(np.zeros((8, 1)))
+    np.testing.assert_array_equal(terminated, first[:, 2] == 1)
+    assert 0 < terminated.sum() < 8
+    np.testing.assert_array_equal(info["_final_obs"], terminated)
+    np.testing.assert_array_equal(info["final_info"]["cost"], 2 * terminated)
+    np.testing.assert_array_equal(info["cost"], [2] * 8)
+    for i, final in enumerate(info["final_obs"]):
+        assert (final is not None) == terminated[i]
+        assert obs[i, 1] == (0 if terminated[i] else 1)
+
+
+def test_six_tuples_have_the_cost_beside_the_reward():
+    one, several = SixTuple(GymEnv(Clock())), SixTupleVector(GymVectorEnv(Clock(episode_length=1), 2))
+    one.reset(seed=0)
+    several.reset(seed=0)
+    _, reward, cost, terminated, truncated, info = one.step(np.zeros(1))
+    assert (reward, cost, terminated, truncated, info["cost_a"]) == (1, 2, False, False, 0.5)
+    _, _, costs, _, truncated, _ = several.step(np.zeros((2, 1)))
+    np.testing.assert_array_equal(costs, [2, 2])
+    assert truncated.all()
+
+
+def test_bad_input_is_one_line():
+    with pytest.raises(ConfigError, match="did you mean 'hazards_num'"):
+        GymEnv("point_goal1", hazard_num=3)
+    with pytest.raises(ConfigError, match="options are for a name"):
+        GymEnv(Clock(), lives=(1, 1))
+    with pytest.raises(ConfigError, match="expected 'rgb_array'"):
+        GymVectorEnv(Clock(), render_mode="human")
+    with pytest.raises(ConfigError, match="only Safety Gym's environments can be drawn"):
+        GymEnv(Clock(), render_mode="rgb_array")
+
+
+def test_without_gymnasium_there_is_one_line(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gymnasium", None)
+    monkeypatch.delitem(sys.modules, "jaxsafe.interop.gymnasium")
+    with pytest.raises(ConfigError, match=r"pip install 'jaxsafe\[gymnasium\]'"):
+        importlib.import_module("jaxsafe.interop.gymnasium")

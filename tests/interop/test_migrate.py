@@ -1,0 +1,254 @@
+"""Configs of OmniSafe and of Safety Gym's Engine as command lines."""
+
+import dataclasses
+import json
+import sys
+from typing import Any
+
+import pytest
+
+from jaxsafe import algos, envs
+from jaxsafe.config import ConfigError
+from jaxsafe.interop import migrate
+from jaxsafe.run import command
+
+# What OmniSafe 0.5.0 and later takes where nothing is said: PPOLag, and what is other of TRPO.
+PPO_LAG: dict[str, Any] = {
+    "seed": 0,
+    "train_cfgs": {
+        "device": "cpu",
+        "torch_threads": 16,
+        "vector_env_nums": 1,
+        "parallel": 1,
+        "total_steps": 10000000,
+    },
+    "algo_cfgs": {
+        "steps_per_epoch": 20000,
+        "update_iters": 40,
+        "batch_size": 64,
+        "target_kl": 0.02,
+        "entropy_coef": 0.0,
+        "reward_normalize": False,
+        "cost_normalize": False,
+        "obs_normalize": True,
+        "kl_early_stop": True,
+        "use_max_grad_norm": True,
+        "max_grad_norm": 40.0,
+        "use_critic_norm": True,
+        "critic_norm_coef": 0.001,
+        "gamma": 0.99,
+        "cost_gamma": 0.99,
+        "lam": 0.95,
+        "lam_c": 0.95,
+        "clip": 0.2,
+        "adv_estimation_method": "gae",
+        "standardized_rew_adv": True,
+        "standardized_cost_adv": True,
+        "penalty_coef": 0.0,
+        "use_cost": True,
+    },
+    "logger_cfgs": {"use_wandb": False, "save_model_freq": 100, "log_dir": "./runs"},
+    "model_cfgs": {
+        "weight_initialization_mode": "kaiming_uniform",
+        "actor_type": "gaussian_learning",
+        "linear_lr_decay": True,
+        "exploration_noise_anneal": False,
+        "std_range": [0.5, 0.1],
+        "actor": {"hidden_sizes": [64, 64], "activation": "tanh", "lr": 0.0003},
+        "critic": {"hidden_sizes": [64, 64], "activation": "tanh", "lr": 0.0003},
+    },
+    "lagrange_cfgs": {
+        "cost_limit": 25.0,
+        "lagrangian_multiplier_init": 0.001,
+        "lambda_lr": 0.035,
+        "lambda_optimizer": "Adam",
+    },
+}
+TRPO: dict[str, Any] = {
+    "algo_cfgs": {
+        "update_iters": 10,
+        "batch_size": 128,
+        "target_kl": 0.01,
+        "kl_early_stop": False,
+        "cg_damping": 0.1,
+        "cg_iters": 15,
+        "fvp_obs": None,
+        "fvp_sample_freq": 1,
+    },
+    "model_cfgs": {"linear_lr_decay": False, "actor": {"lr": None}, "critic": {"lr": 0.001}},
+}
+PLAIN = ["env=point_goal1", "env.rules=safety_gymnasium"]
+
+
+def migrated(config: dict[str, Any], algo: str) -> migrate.Migrated:
+    found = migrate.omnisafe(config, envs, algos, algo, "SafetyPointGoal1-v0")
+    command.read_arguments(found.argv, envs, algos)  # train.py takes it
+    return found
+
+
+def lost(found: migrate.Migrated) -> list[str]:
+    return [line.key for line in found.lines if line.lost]
+
+
+@pytest.mark.parametrize(
+    "config, theirs, ours", [(PPO_LAG, "PPOLag", "ppo_lag"), (TRPO, "TRPO", "trpo")]
+)
+def test_the_defaults_are_the_published_preset(config, theirs, ours):
+    found = migrated(config, theirs)
+    assert found.argv == [*PLAIN, f"algo={ours}", "preset=published", "compat=omnisafe"]
+    assert lost(found) == []
+    assert {line.key for line in found.lines} == {"algo", "env_id", *migrate.flatten(config)}
+
+
+CHANGES = [  # algorithm, key, value, options
+    ("PPOLag", "seed", 5, "seed=5"),
+    ("PPOLag", "train_cfgs.total_steps", 1000000, "total_steps=1000000"),
+    (
+        "PPOLag",
+        "algo_cfgs.steps_per_epoch",
+        10000,
+        "num_envs=10 algo.minibatches=125 algo.cost_window=10",
+    ),
+    (
+        "PPOLag",
+        "algo_cfgs.steps_per_epoch",
+        512,
+        "num_envs=1 algo.horizon=512 algo.minibatches=8 algo.cost_window=100",
+    ),
+    ("PPOLag", "algo_cfgs.batch_size", 200, "algo.minibatches=100"),
+    ("PPOLag", "algo_cfgs.update_iters", 20, "algo.epochs=20 algo.critic_epochs=20"),
+    ("CPO", "algo_cfgs.update_iters", 20, "algo.critic_epochs=20"),
+    ("PPOLag", "algo_cfgs.target_kl", 0.03, "algo.target_kl=0.03"),
+    ("CPO", "algo_cfgs.target_kl", 0.02, "algo.target_kl=0.02"),
+    ("CPO", "logger_cfgs.window_lens", 40, "algo.cost_window=2"),
+    ("PPOLag", "algo_cfgs.kl_early_stop", False, "algo.target_kl=inf"),
+    ("PPOLag", "algo_cfgs.use_max_grad_norm", False, "algo.max_grad_norm=inf"),
+    ("PPOLag", "algo_cfgs.use_critic_norm", False, "algo.critic_norm_coef=0.0"),
+    ("PPOLag", "algo_cfgs.gamma", 0.9, "algo.discount=0.9 algo.cost_discount=0.9"),
+    ("PPOLag", "algo_cfgs.adv_estimation_method", "gae-rtg", "algo.estimator=gae_rtg"),
+    ("PPOLag", "model_cfgs.weight_initialization_mode", "orthogonal", "algo.init=orthogonal"),
+    ("PPOLag", "model_cfgs.actor.hidden_sizes", [256, 256], "algo.hidden=[256,256]"),
+    ("PPOLag", "lagrange_cfgs.cost_limit", 10, "algo.cost_limit=10.0"),
+    ("CPO", "algo_cfgs.cost_limit", 10, "algo.cost_limit=10.0"),
+    ("CPPOPID", "lagrange_cfgs.pid_kp", 0.2, "algo.pid_kp=0.2"),
+    ("P3O", "algo_cfgs.kappa", 10.0, "algo.kappa=10.0"),
+    ("IPO", "algo_cfgs.kappa", 0.1, "algo.barrier=0.1"),
+    ("PPOSaute", "algo_cfgs.safety_budget", 15.0, "algo.cost_limit=15.0"),
+    ("PPOSimmerPID", "algo_cfgs.safety_budget", 15.0, "algo.budget_init=0.6"),
+]
+
+
+def test_a_changed_key_is_a_changed_option():
+    for algo, key, value, options in CHANGES:
+        found = migrated({key: value}, algo)
+        assert " ".join(found.argv[5:]) == options, key
+        assert lost(found) == []
+
+
+@pytest.mark.parametrize(
+    "algo, key, value, reason",
+    [
+        ("PPOLag", "train_cfgs.parallel", 4, "devices=N"),
+        ("PPOLag", "algo_cfgs.penalty_coef", 0.5, "ppo_penalty"),
+        ("PPOLag", "algo_cfgs.standardized_rew_adv", False, "always"),
+        ("PPOLag", "model_cfgs.actor.activation", "sigmoid", "one option"),
+        ("PPOLag", "algo_cfgs.cg_iters", 5, "ppo_lag has no algo.cg_iterations"),
+    ],
+)
+def test_what_has_no_counterpart_is_named(algo, key, value, reason):
+    found = migrated({key: value}, algo)
+    assert lost(found) == [key]
+    assert reason in migrate.report(found.lines).splitlines()[-1]
+    assert len(found.argv) == 5
+
+
+def test_two_keys_of_one_option_say_which_counts():
+    sizes = {"actor": {"hidden_sizes": [32]}, "critic": {"hidden_sizes": [64]}}
+    found = migrated({"model_cfgs": sizes}, "PPOLag")
+    assert found.argv[5:] == ["algo.hidden=[32]"]
+    assert "algo.hidden=[32] in place of algo.hidden=[64]" in migrate.report(found.lines)
+
+
+def test_sections_of_environments_count_for_theirs():
+    config = {"defaults": PPO_LAG, "SafetyPointGoal1-v0": {"algo_cfgs": {"gamma": 0.9}}, "Other": {}}
+    assert migrated(config, "PPOLag").argv[5:] == ["algo.discount=0.9", "algo.cost_discount=0.9"]
+
+
+def test_every_option_that_a_key_becomes_exists():
+    fields = {f"algo.{f.name}" for e in algos.ALGOS.values() for f in dataclasses.fields(e.config)}
+    fields |= {"algo", "env", "env.rules", "seed", "total_steps", "num_envs"}
+    assert {o for rule in migrate.OMNISAFE.values() for o in rule.ours.split()} <= fields
+    assert set(migrate.ALGORITHMS.values()) == set(algos.ALGOS) - {"ppo_penalty"}
+
+
+@pytest.mark.parametrize(
+    "config, algo, env, message",
+    [
+        ({"algo_cfgs": {"gama": 0.9}}, "PPOLag", "point_goal1", "did you mean 'algo_cfgs.gamma'"),
+        ({"algo_cfgs": {"gamma": "high"}}, "PPOLag", "point_goal1", "expected a number"),
+        (
+            {"algo_cfgs": {"batch_size": 0}},
+            "PPOLag",
+            "point_goal1",
+            "batch_size=0: expected at least 1",
+        ),
+        ({}, "PPOlag", "point_goal1", "did you mean 'PPOLag'"),
+        ({}, "SACLag", "point_goal1", "off-policy"),
+        ({}, "", "point_goal1", "add --algo"),
+        ({}, "CPO", "", "add --env"),
+        ({}, "CPO", "SafetyHalfCheetahVelocity-v1", "no counterpart"),
+        ({}, "CPO", "point_gaol1", "did you mean 'point_goal1'"),
+    ],
+)
+def test_bad_input_is_one_line(config, algo, env, message):
+    with pytest.raises(ConfigError, match=message) as error:
+        migrate.omnisafe(config, envs, algos, algo, env)
+    assert "\n" not in str(error.value)
+
+
+def test_the_options_of_every_registered_environment_are_its_name():
+    for name, options in envs.ENVS.items():
+        assert migrate.safety_gym(options, envs).argv == [f"env={name}"]
+
+
+def test_an_engine_dict_is_the_nearest_environment_and_the_rest():
+    config = {
+        **envs.ENVS["point_push1"],
+        "hazards_num": 3,
+        "hazards_locations": [[1, 1], [-1, 0.5]],
+        "goal_placements": None,
+        "constrain_indicator": False,
+        "vision_size": [60, 40],
+    }
+    found = migrate.safety_gym(config, envs)
+    expected = ["env.hazards_num=3", "env.hazards_locations=[[1.0,1.0],[-1.0,0.5]]"]
+    assert sorted(found.argv) == sorted(["env=point_push1", *expected, "env.constrain_indicator=false"])
+    assert {line.key for line in found.lines} == set(config)
+    request = command.read_arguments(found.argv, envs, algos)
+    assert expected[1] in request.argv
+    for name, message in (("hazard_num", "did you mean 'hazards_num'"), ("awake", "of Engine")):
+        with pytest.raises(ConfigError, match=message):
+            migrate.safety_gym({name: 3}, envs)
+    assert lost(migrate.safety_gym({"observe_vision": True}, envs)) == ["observe_vision"]
+
+
+def test_the_script_prints_a_command_and_refuses_in_a_line(tmp_path, monkeypatch, capsys):
+    path = tmp_path / "config.json"
+    path.write_text(json.dumps(PPO_LAG | {"algo": "PPOLag", "env_id": "SafetyCarPush2-v0", "seed": 3}))
+    monkeypatch.setattr(sys, "argv", ["migrate.py", "omnisafe", str(path)])
+    assert migrate.main(envs, algos) == 0
+    out, err = capsys.readouterr()
+    rules = "env=car_push2 env.rules=safety_gymnasium"
+    assert (
+        out == f"python scripts/train.py {rules} algo=ppo_lag preset=published compat=omnisafe seed=3\n"
+    )
+    assert len(err.splitlines()) == len(migrate.flatten(PPO_LAG)) + 2
+    for text, message in (
+        ("{", "is no JSON"),
+        ("[1]", "expected names with values"),
+        (None, "cannot read"),
+    ):
+        path.unlink() if text is None else path.write_text(text)
+        assert migrate.main(envs, algos) == 2
+        error = capsys.readouterr().err
+        assert message in error and error.count("\n") == 1

@@ -1,0 +1,101 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxsafe.run import checkpoint
+from jaxsafe.run.checkpoint import CheckpointError, checkpoints, restore, save
+
+
+def state(scale: float = 1.0):
+    return {
+        "params": {"w": scale * jnp.arange(6.0).reshape(2, 3), "empty": jnp.zeros((0, 3))},
+        "key": jax.random.split(jax.random.key(3)),
+        "half": jnp.bfloat16(0.1),
+        "flags": (jnp.array([True, False]), ()),
+        "iteration": jnp.int32(7),
+    }
+
+
+def assert_same(a, b):
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        x, y = (jax.random.key_data(v) if checkpoint.is_key(v) else v for v in (x, y))
+        assert x.dtype == y.dtype
+        np.testing.assert_array_equal(np.asarray(x), np.asarray(y))
+
+
+def flip_a_byte(path):
+    largest = max(
+        (p for p in (path / "state").rglob("*") if p.is_file()), key=lambda p: p.stat().st_size
+    )
+    data = bytearray(largest.read_bytes())
+    data[len(data) // 2] ^= 1
+    largest.write_bytes(data)
+
+
+def test_a_train_state_comes_back_bit_for_bit_with_its_random_keys(tmp_path):
+    save(tmp_path, state(0.1), iteration=7, steps=70)
+    restored, manifest = restore(tmp_path, jax.eval_shape(state))
+    assert_same(restored, state(0.1))
+    assert (manifest.iteration, manifest.steps) == (7, 70)
+    assert jax.random.normal(restored["key"][0]) == jax.random.normal(state()["key"][0])
+
+
+def test_the_last_two_checkpoints_stay(tmp_path):
+    for i in range(4):
+        save(tmp_path, state(), i, i)
+    assert [p.name for p in checkpoints(tmp_path)] == ["00000003", "00000002"]
+
+
+@pytest.mark.parametrize("damage", ["byte", "truncated", "missing", "manifest"])
+def test_a_corrupt_newest_checkpoint_is_passed_over_with_one_line(tmp_path, damage):
+    save(tmp_path, state(1.0), 1, 1)
+    newest = save(tmp_path, state(2.0), 2, 2)
+    if damage == "byte":
+        flip_a_byte(newest)
+    elif damage == "manifest":
+        (newest / "manifest.json").write_text("{")
+    else:
+        file = newest / "state" / "_METADATA"
+        file.write_bytes(file.read_bytes()[:10]) if damage == "truncated" else file.unlink()
+    lines: list[str] = []
+    restored, manifest = restore(tmp_path, jax.eval_shape(state), lines.append)
+    assert manifest.iteration == 1
+    assert_same(restored, state(1.0))
+    assert len(lines) == 1 and "00000002 is corrupt" in lines[0] and "\n" not in lines[0]
+
+
+def test_no_sound_checkpoint_is_one_clear_error(tmp_path):
+    with pytest.raises(CheckpointError, match="no checkpoint in"):
+        restore(tmp_path, jax.eval_shape(state))
+    flip_a_byte(save(tmp_path, state(), 1, 1))
+    with pytest.raises(CheckpointError, match="is corrupt"):
+        restore(tmp_path, jax.eval_shape(state), lambda line: None)
+
+
+def test_another_train_state_is_refused_by_the_leaf_that_differs(tmp_path):
+    save(tmp_path, state(), 1, 1)
+    other = {**state(), "params": {"w": jnp.zeros((2, 4)), "empty": jnp.zeros((0, 3))}}
+    with pytest.raises(CheckpointError, match=r"params\.w is float32\[2, 3\], not float32\[2, 4\]"):
+        restore(tmp_path, jax.eval_shape(lambda: other))
+
+
+def test_a_full_disk_is_one_error_and_the_last_good_checkpoint_stays(tmp_path, monkeypatch):
+    good = save(tmp_path, state(1.0), 1, 1)
+
+    def full(*args, **kwargs):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(checkpoint.ocp.Checkpointer, "save", full)
+    with pytest.raises(CheckpointError, match=f"No space left on device; the last good one is {good}"):
+        save(tmp_path, state(2.0), 2, 2)
+    assert checkpoints(tmp_path) == [good] and not list(tmp_path.glob("*.part"))
+    assert_same(restore(tmp_path, jax.eval_shape(state))[0], state(1.0))
+
+
+def test_what_a_killed_process_left_behind_is_ignored_and_cleared(tmp_path):
+    save(tmp_path, state(), 1, 1)
+    (tmp_path / "00000002.part" / "state").mkdir(parents=True)
+    assert [p.name for p in checkpoints(tmp_path)] == ["00000001"]
+    save(tmp_path, state(), 3, 3)
+    assert not list(tmp_path.glob("*.part"))

@@ -1,0 +1,75 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxsafe.algos.ppo import PPOConfig
+from jaxsafe.nn.gaussian import log_prob
+from jaxsafe.nn.networks import LOG_STD, init_params, policy, value
+
+
+def params(**settings):
+    return init_params(jax.random.key(0), 5, 3, PPOConfig(**settings))
+
+
+def test_torch_weights_and_biases_fill_their_interval():
+    layers = params(init="torch", hidden=(400, 100))["critic_r"]["params"]
+    for layer, fan_in in (("Dense_0", 5), ("Dense_1", 400), ("Dense_2", 100)):
+        for x in layers[layer].values():
+            assert (jnp.abs(x) <= fan_in**-0.5).all()
+        if layer != "Dense_2":
+            np.testing.assert_allclose(jnp.abs(layers[layer]["bias"]).max(), fan_in**-0.5, rtol=0.05)
+
+
+def test_orthogonal_layers_keep_angles_and_the_policy_starts_near_zero():
+    tree = params(hidden=(64, 64))
+    kernel = tree["actor"]["mean"]["params"]["Dense_1"]["kernel"]
+    np.testing.assert_allclose(kernel.T @ kernel, 2 * np.eye(64), atol=1e-5)
+    dist = policy(tree["actor"], jax.random.normal(jax.random.key(1), (9, 5)), PPOConfig())
+    assert jnp.abs(dist.mean).max() < 0.1
+    np.testing.assert_array_equal(dist.log_std, jnp.full((9, 3), -0.5))
+
+
+def test_the_critics_differ_and_give_one_value_a_state():
+    tree, obs = params(), jnp.ones((4, 2, 5))
+    a, b = (value(tree[k], obs, PPOConfig()) for k in ("critic_r", "critic_c"))
+    assert a.shape == (4, 2) and (a != b).all()
+
+
+def test_relu_networks_are_piecewise_linear_and_tanh_networks_are_bounded():
+    far = 1e4 * jax.random.normal(jax.random.key(1), (20, 5))
+    relu, tanh = (PPOConfig(activation=name, init="torch", hidden=(8,)) for name in ("relu", "tanh"))
+    tree = params(init="torch", hidden=(8,))  # of either: the activation has no parameters
+    twice, once = value(tree["critic_r"], 2 * far, relu), value(tree["critic_r"], far, relu)
+    np.testing.assert_allclose(twice, 2 * once, rtol=1e-2, atol=1)  # biases are lost in the distance
+    assert jnp.abs(once).max() > 100
+    bound = sum(jnp.abs(x).sum() for x in tree["critic_r"]["params"]["Dense_1"].values())
+    assert (jnp.abs(value(tree["critic_r"], far, tanh)) <= bound).all()
+    means = [policy(tree["actor"], far, cfg).mean for cfg in (relu, tanh)]
+    assert jnp.abs(means[0]).max() > 100 and jnp.abs(means[1]).max() < 10
+
+
+def test_a_std_of_the_state_starts_near_the_free_one_differs_by_state_and_is_clipped():
+    cfg = PPOConfig(std="state")
+    tree, obs = params(std="state"), jax.random.normal(jax.random.key(1), (4, 9, 5))
+    dist = policy(tree["actor"], obs, cfg)
+    assert dist.mean.shape == dist.log_std.shape == (4, 9, 3)
+    np.testing.assert_allclose(dist.log_std, -0.5, atol=0.1)
+    assert (dist.log_std[0, 0] != dist.log_std[0, 1]).all()
+    for offset, bound in zip((-99.0, 99.0), LOG_STD, strict=True):
+        moved = tree["actor"] | {"log_std": tree["actor"]["log_std"] + offset}
+        np.testing.assert_array_equal(policy(moved, obs, cfg).log_std, jnp.full((4, 9, 3), bound))
+
+
+@pytest.mark.parametrize("settings", [{"activation": "relu"}, {"std": "state"}, {"init": "torch"}])
+def test_gradients_reach_every_parameter_and_are_finite(settings):
+    cfg = PPOConfig(**settings)
+    tree, obs = params(**settings), jax.random.normal(jax.random.key(1), (64, 5))
+
+    def total(tree):
+        dist = policy(tree["actor"], obs, cfg)
+        likelihood = log_prob(dist, jnp.ones((64, 3))).sum()
+        return likelihood + sum(value(tree[k], obs, cfg).sum() for k in ("critic_r", "critic_c"))
+
+    for x in jax.tree.leaves(jax.grad(total)(tree)):
+        assert jnp.isfinite(x).all() and (x != 0).any()

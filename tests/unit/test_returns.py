@@ -1,0 +1,165 @@
+from typing import get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxsafe.learn.batch import batch_mean
+from jaxsafe.learn.returns import Estimator, advantages, gae, mean_length, vtrace
+
+NO, YES = jnp.zeros((1, 1), bool), jnp.ones((1, 1), bool)
+ONE = jnp.ones((1, 1))
+
+
+def column(*values):
+    return jnp.array(values)[:, None]
+
+
+def test_a_time_limit_bootstraps_and_a_failure_does_not():
+    timed_out = gae(ONE, 0 * ONE, 2 * ONE, NO, YES, discount=0.5, decay=1.0)
+    failed = gae(ONE, 0 * ONE, 2 * ONE, YES, YES, discount=0.5, decay=1.0)
+    assert (timed_out.item(), failed.item()) == (2.0, 1.0)
+
+
+def test_a_value_that_is_not_finite_stays_behind_a_failure():
+    assert gae(ONE, 0 * ONE, jnp.nan * ONE, YES, YES, discount=0.5, decay=1.0).item() == 1.0
+    grad = jax.grad(lambda v: gae(ONE, 0 * ONE, v, YES, YES, discount=0.5, decay=1.0).sum())
+    assert grad(jnp.inf * ONE).item() == 0.0
+
+
+def test_three_steps_by_hand():
+    # deltas with discount 1/2: 1 + 1 - 1 = 1, 2 + 2 - 2 = 2, 3 + 4 - 4 = 3; decay 1/2 weighs by 1/4
+    advantage = gae(
+        column(1.0, 2.0, 3.0),
+        column(1.0, 2.0, 4.0),
+        column(2.0, 4.0, 8.0),
+        column(False, False, False),
+        column(False, False, True),
+        discount=0.5,
+        decay=0.5,
+    )
+    np.testing.assert_allclose(advantage[:, 0], [1 + (2 + 3 / 4) / 4, 2 + 3 / 4, 3])
+
+
+def test_nothing_leaks_from_the_next_episode():
+    reward = column(1.0, 100.0)
+    advantage = gae(
+        reward, 0 * reward, 0 * reward, NO.repeat(2, 0), column(True, False), discount=0.9, decay=0.9
+    )
+    assert advantage[0].item() == 1.0
+
+
+def test_without_decay_the_sum_is_the_discounted_return():
+    key = jax.random.split(jax.random.key(0), 2)
+    reward, value = jax.random.normal(key[0], (6, 3)), jax.random.normal(key[1], (7, 3))
+    no = jnp.zeros((6, 3), bool)
+    advantage = gae(reward, value[:-1], value[1:], no, no, discount=0.9, decay=1.0)
+    ret = sum(0.9**t * reward[t] for t in range(6)) + 0.9**6 * value[6]
+    np.testing.assert_allclose(advantage[0] + value[0], ret, rtol=1e-5)
+
+
+def test_the_mean_length_stays_exactly_at_the_time_limit():
+    length, ended = jnp.float32(1000), jax.random.bernoulli(jax.random.key(0), 0.1, (7, 13))
+    assert mean_length(length, ended, jnp.full((7, 13), 1000)) == 1000
+    assert mean_length(length, jnp.zeros((7, 13), bool), jnp.full((7, 13), 3)) == 1000
+
+
+def test_episode_cost_is_the_plain_mean_over_synchronous_episodes():
+    cost = jax.random.uniform(jax.random.key(0), (10, 4))
+    ended = jnp.zeros((10, 4), bool).at[-1].set(True)
+    length = mean_length(jnp.float32(10), ended, jnp.full((10, 4), 10))
+    np.testing.assert_allclose(batch_mean(cost, None) * length, cost.sum(0).mean(), rtol=1e-6)
+
+
+def test_the_mean_length_finds_that_of_early_terminations():
+    rng, length, clock = np.random.default_rng(0), jnp.float32(50), np.zeros(64, int)
+    step = jax.jit(mean_length)
+    for _ in range(60):  # each step ends an episode with probability 1/10: mean length 10
+        ended, lengths = [], []
+        for _ in range(20):
+            clock += 1
+            done = (rng.random(64) < 0.1) | (clock == 50)
+            ended, lengths = [*ended, done], [*lengths, clock.copy()]
+            clock[done] = 0
+        length = step(length, jnp.array(ended), jnp.array(lengths))
+    np.testing.assert_allclose(length, 10 * (1 - 0.9**50), rtol=0.15)
+
+
+# Three steps of one environment: the first ends by its time limit, the second by a failure, the third
+# goes on beyond the batch. Discount 1/2, so deltas 1 + 4/2 - 1, 2 - 3, 4 + 6/2 - 5.
+ENDS = {
+    "reward": column(1.0, 2.0, 4.0),
+    "value": column(1.0, 3.0, 5.0),
+    "next_value": column(4.0, 100.0, 6.0),
+    "terminated": column(False, True, False),
+    "done": column(True, True, False),
+}
+# Three steps of an episode that ends by a failure: rewards to go 1 + (2 + 4/2)/2 = 3, 4, 4, so
+# errors 2, 1, -1 of the values 1, 3, 5; deltas 1 + 3/2 - 1, 2 + 5/2 - 3, 4 - 5.
+FAILS = {
+    "reward": column(1.0, 2.0, 4.0),
+    "value": column(1.0, 3.0, 5.0),
+    "next_value": column(3.0, 5.0, 100.0),
+    "terminated": column(False, False, True),
+    "done": column(False, False, True),
+}
+
+
+@pytest.mark.parametrize("estimator", get_args(Estimator))
+def test_every_estimator_bootstraps_at_time_limits_and_not_at_failures(estimator):
+    ratio = jnp.ones((3, 1))
+    both = advantages(estimator, **ENDS, ratio=ratio, discount=0.5, decay=0.5)
+    for x in both:  # nothing to sum: advantages and errors are the deltas
+        np.testing.assert_allclose(x[:, 0], [2, -1, 2])
+
+
+@pytest.mark.parametrize(
+    ("estimator", "advantage", "error"),
+    [
+        ("gae", [1.5 + (1.5 - 1 / 4) / 4, 1.5 - 1 / 4, -1], [1.5 + (1.5 - 1 / 4) / 4, 1.5 - 1 / 4, -1]),
+        ("gae_rtg", [1.5 + (1.5 - 1 / 4) / 4, 1.5 - 1 / 4, -1], [2, 1, -1]),
+        ("plain", [1.5, 1.5, -1], [2, 1, -1]),
+        ("vtrace", [2, 1, -1], [2, 1, -1]),
+    ],
+)
+def test_every_estimator_by_hand(estimator, advantage, error):
+    ratio = jnp.ones((3, 1))
+    found = advantages(estimator, **FAILS, ratio=ratio, discount=0.5, decay=0.5)
+    np.testing.assert_allclose(found[0][:, 0], advantage)
+    np.testing.assert_allclose(found[1][:, 0], error)
+
+
+def test_vtrace_by_hand():
+    # the ratio 3 is clipped to 1; from the back -1, (1.5 - 1/2)/2 = 1/2, 1.5 + 1/4
+    advantage = vtrace(**FAILS, ratio=column(3.0, 0.5, 1.0), discount=0.5)
+    np.testing.assert_allclose(advantage[:, 0], [1.75, 0.5, -1])
+
+
+def test_vtrace_is_the_papers_sum_and_its_policy_gradients_advantage():
+    """Equation 1 as it stands, a sum of products, on each episode apart; A from section 4.2."""
+    rng, steps, envs, discount = np.random.default_rng(0), 30, 4, 0.9
+    reward, value = rng.normal(size=(steps, envs)), rng.normal(size=(steps, envs))
+    done = rng.random((steps, envs)) < 0.2
+    terminated = done & (rng.random((steps, envs)) < 0.5)
+    after = rng.normal(size=(steps, envs))
+    after[:-1] = np.where(
+        done[:-1], after[:-1], value[1:]
+    )  # only a reset parts V(s') from the next V(s)
+    ratio = np.exp(rng.normal(size=(steps, envs)))
+    clipped = np.minimum(1, ratio)
+    boot = np.where(terminated, 0, after)
+    target = value.copy()
+    for n in range(envs):
+        for s in range(steps):
+            for t in range(s, steps):
+                delta = clipped[t, n] * (reward[t, n] + discount * boot[t, n] - value[t, n])
+                target[s, n] += discount ** (t - s) * np.prod(clipped[s:t, n]) * delta
+                if done[t, n]:
+                    break
+    last = done | (np.arange(steps) == steps - 1)[:, None]
+    next_target = np.where(last, boot, np.roll(target, -1, 0))
+    advantage = clipped * (reward + discount * next_target - value)
+    found = vtrace(*map(jnp.array, (reward, value, after, terminated, done, ratio)), discount=discount)
+    np.testing.assert_allclose(found, advantage, atol=1e-4)
+    np.testing.assert_allclose(found + value, target, atol=1e-4)

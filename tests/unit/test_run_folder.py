@@ -1,0 +1,147 @@
+import json
+import lzma
+import math
+import sys
+
+import jax
+import numpy as np
+import pytest
+from toys import Clock
+
+from jaxsafe.config import ConfigError
+from jaxsafe.report import plots, scores
+from jaxsafe.run import evaluation, run_folder
+from jaxsafe.run.run_folder import Metrics, read_config, read_metrics
+
+
+def write(folder, iterations, resume_at=0):
+    log = Metrics(folder, ["train/cost", "train/return"], resume_at)
+    for i in iterations:
+        log.append(
+            i, 10 * i, [4, 5], float(i), {"train/return": [i, math.nan], "train/cost": [0.1, 2.0]}
+        )
+    log.close()
+    return log
+
+
+def test_metrics_have_a_row_for_each_seed_and_empty_cells_for_no_value(tmp_path):
+    write(tmp_path, [1])
+    assert (tmp_path / "metrics.csv").read_text().splitlines() == [
+        "iteration,steps,seed,seconds,train/cost,train/return",
+        "1,10,4,1.000,0.1,1.0",
+        "1,10,5,1.000,2.0,",
+    ]
+    assert np.isnan(read_metrics(tmp_path)["train/return"][1])
+
+
+def test_resuming_drops_rows_after_the_checkpoint_and_a_torn_last_line(tmp_path):
+    write(tmp_path, [1, 2, 3, 4])
+    whole = (tmp_path / "metrics.csv").read_text()
+    with (tmp_path / "metrics.csv").open("a") as file:
+        file.write("5,50,4,5.0")
+    log = write(tmp_path, [3, 4], resume_at=2)
+    assert (tmp_path / "metrics.csv").read_text() == whole
+    assert log.seconds == 2.0
+
+
+def test_packed_metrics_are_read_like_the_plain_ones(tmp_path):
+    write(tmp_path, [1, 2])
+    plain, path = read_metrics(tmp_path), tmp_path / "metrics.csv"
+    path.with_name("metrics.csv.xz").write_bytes(lzma.compress(path.read_bytes() + b"3,30,4"))
+    path.unlink()
+    packed = read_metrics(tmp_path)
+    assert packed.keys() == plain.keys()
+    for name, column in plain.items():
+        np.testing.assert_array_equal(packed[name], column)
+    for text in (b"not packed", lzma.compress(b"iteration,seed\n1,many\n")):
+        path.with_name("metrics.csv.xz").write_bytes(text)
+        with pytest.raises(ConfigError, match=r"metrics.csv.xz cannot be read: "):
+            read_metrics(tmp_path)
+
+
+def test_metrics_of_other_columns_are_refused(tmp_path):
+    write(tmp_path, [1])
+    with pytest.raises(ConfigError, match="other columns"):
+        Metrics(tmp_path, ["train/return"], 1)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "a: [", "env: 3", "!!python/object/apply:os.system ['touch owned']", "\x00", "env: {name: 3}"],
+)
+def test_a_strangers_config_is_read_as_plain_values_or_refused_in_one_line(tmp_path, monkeypatch, text):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "config.yaml").write_text(text)
+    with pytest.raises(ConfigError) as error:
+        read_config(tmp_path)
+    assert "\n" not in str(error.value)
+    assert not (tmp_path / "owned").exists()
+
+
+def test_a_folder_without_config_is_no_run(tmp_path):
+    with pytest.raises(ConfigError, match="not a run folder"):
+        read_config(tmp_path)
+
+
+def test_curves_carry_the_last_value_over_iterations_without_an_episode():
+    metrics = {
+        "steps": np.array([1, 1, 2, 2, 3, 3.0]),
+        "seed": np.array([0, 1, 0, 1, 0, 1.0]),
+        "x": np.array([np.nan, 5, 2, np.nan, np.nan, 7]),
+    }
+    _, values = plots.by_seed(metrics, "x")
+    np.testing.assert_array_equal(values, [[np.nan, 2, 2], [5, 5, 7]])
+
+
+def test_curves_are_drawn_for_one_seed_for_several_and_for_none(tmp_path):
+    write(tmp_path, [1, 2, 3])
+    plots.curves(read_metrics(tmp_path), tmp_path / "several.png", "title", 25.0)
+    plots.curves({}, tmp_path / "none.png", "title", 25.0)
+    assert (tmp_path / "several.png").stat().st_size > (tmp_path / "none.png").stat().st_size > 1000
+
+
+def test_an_interval_is_over_seeds_and_of_one_seed_over_its_episodes():
+    two = np.array([[0.0, 8.0], [6.0, 6.0]])
+    assert evaluation.estimate(two) == (5.0, 4.0, 6.0)  # a quarter of the draws is one seed twice
+    assert evaluation.estimate(two[:1]) == (4.0, 0.0, 8.0)
+
+
+def test_discounted_sums_and_named_costs_of_an_episode_by_hand():
+    three = evaluation.episode(Clock(lives=(3, 3)), lambda obs, _: obs[:1], jax.random.key(0), 0.5, 0.1)
+    assert (three.ret, three.length) == (3, 3) and three.cost == 6  # 1 and 2 a step
+    np.testing.assert_allclose(three.discounted_ret, 1 + 0.5 + 0.25)
+    np.testing.assert_allclose(three.discounted_cost, 2 * (1 + 0.1 + 0.01), rtol=1e-6)
+    own = evaluation.Episodes(*(np.asarray(x)[None, None] for x in three))
+    a, b = own.costs[0, 0]
+    found = evaluation.measures(own, ("a", "b"), {"a": a - 0.5, "b": b})
+    assert [found[f"cost {name}"].item() for name in "ab"] == [a, b]
+    assert [found[k].item() for k in (f"a over {a - 0.5:g}", f"b over {b:g}")] == [True, False]
+    assert found["violation rate"].item() and "cost wall" not in found
+
+
+def test_cost_rate_is_total_cost_over_total_steps_of_each_seed():
+    metrics = {"seed": np.array([0, 1, 0, 1.0]), "train/cost_rate": np.array([0.1, 0.2, 0.3, 0.4])}
+    rate = evaluation.cost_rate(metrics)
+    assert rate is not None
+    np.testing.assert_allclose(rate, [0.2, 0.3])
+
+
+def test_unconstrained_ppo_scores_one_and_a_safe_policy_violates_by_zero():
+    for env, ppo in scores.CHARACTERISTIC.items():
+        assert scores.normalized_return(env, ppo.ret) == 1
+        assert scores.normalized_violation(env, ppo.cost) == pytest.approx(1)
+        assert str(scores.normalized_violation(env, 3.0)) == "0.0"
+    assert len(scores.SG18) == 18 and set(scores.SG6) < set(scores.SG18)
+    assert len(scores.SG1) == len(scores.SG2) == 9 and len(scores.SG_DOGGO) == 6
+
+
+def test_progress_reads_the_newest_manifest(tmp_path):
+    assert run_folder.progress(tmp_path) is None
+
+
+def test_the_command_of_a_run_is_recorded_as_it_was_typed(tmp_path, monkeypatch):
+    # `command.read_arguments` puts ++ before a named limit, which the command line does not take
+    monkeypatch.setattr(sys, "argv", ["train.py", "algo=cpo", "++algo.cost_limits.hazards=5"])
+    run_folder.append_versions(tmp_path, "cpu", None)
+    (start,) = json.loads((tmp_path / "versions.json").read_text())
+    assert start["command"].endswith(" train.py algo=cpo algo.cost_limits.hazards=5")

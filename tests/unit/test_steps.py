@@ -1,0 +1,161 @@
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxsafe.algos.ppo import PPOConfig
+from jaxsafe.learn.on_policy import Batch
+from jaxsafe.learn.steps import adam, adam_epochs, fit_critic, one_pass
+from jaxsafe.learn.surrogates import clipped, plain, with_entropy
+from jaxsafe.nn.gaussian import log_prob, sample
+from jaxsafe.nn.networks import init_params, policy, value
+
+SMALL: dict[str, Any] = {"hidden": (8,), "num_envs": 8, "horizon": 8, "minibatches": 4}
+
+
+def problem(cfg, seed=0, size=64):
+    """A policy, a batch of its actions, and the objective of earning more for large actions."""
+    keys = jax.random.split(jax.random.key(seed), 3)
+    params = init_params(keys[0], 3, 2, cfg)
+    obs = jax.random.normal(keys[1], (size, 3))
+    old = policy(params["actor"], obs, cfg)
+    action = sample(old, keys[2])
+    adv = action.sum(-1)
+    batch = Batch(obs, action, log_prob(old, action), old, adv, -adv, adv, obs[:, 0])
+
+    def objective(actor, batch):
+        return clipped(policy(actor, batch.obs, cfg), batch, batch.adv_r, cfg)
+
+    return params, batch, objective
+
+
+def improve(cfg, objective=None, seed=0, iteration=0):
+    params, batch, default = problem(cfg, seed)
+    state = adam_epochs.init(params["actor"], cfg)._replace(iteration=jnp.int32(iteration))
+    actor, _, metrics = adam_epochs.update(
+        params["actor"], state, objective or default, batch, jax.random.key(1), cfg, None
+    )
+    return params["actor"], actor, metrics
+
+
+def test_a_pass_sees_every_sample_once():
+    data = jnp.arange(12)
+    _, seen = one_pass(lambda carry, x: (carry, x), (), data, jax.random.key(0), 3)
+    assert seen.shape == (3, 4) and sorted(seen.ravel().tolist()) == data.tolist()
+    assert (seen.ravel() != data).any()
+
+
+def test_epochs_of_adam_raise_the_objective():
+    _, _, metrics = improve(PPOConfig(**SMALL, lr=1e-2, target_kl=1e9))
+    assert metrics["train/objective"] > 0.01 and metrics["train/passes"] == 10
+
+
+def test_the_first_pass_beyond_the_kl_limit_is_the_last():
+    free = [
+        improve(PPOConfig(**SMALL, lr=1e-2, target_kl=1e9, epochs=n))[2]["train/kl"] for n in (1, 2, 3)
+    ]
+    assert free[0] < free[1] < free[2]
+    limit = float(free[0] + free[1]) / 2
+    _, _, metrics = improve(PPOConfig(**SMALL, lr=1e-2, target_kl=limit))
+    assert metrics["train/passes"] == 2 and metrics["train/kl"] == free[1]
+
+
+def test_the_learning_rate_falls_to_zero_at_the_last_iteration():
+    def move(iteration, total):
+        cfg = PPOConfig(**SMALL, total_iterations=total, lr_decay=True, epochs=1, max_grad_norm=1e9)
+        before, after, _ = improve(cfg, iteration=iteration)
+        return float(jnp.abs(after["log_std"] - before["log_std"]).max())
+
+    whole = move(0, 10.0)
+    np.testing.assert_allclose(move(5, 10.0), whole / 2, rtol=0.05)
+    assert move(10, 10.0) == 0 and move(11, 10.0) == 0
+    assert move(10**6, float("inf")) == move(10**6, 0.0) == whole
+
+
+def test_steps_with_gradients_that_are_not_finite_are_skipped_and_counted():
+    cfg = PPOConfig(**SMALL)
+
+    def broken(actor, batch):
+        bad = jnp.isin(batch.obs[:, 0], problem(cfg)[1].obs[:1, 0]).any()  # one minibatch of a pass
+        return jnp.where(bad, jnp.nan, 1.0) * problem(cfg)[2](actor, batch)[0], {}
+
+    before, after, metrics = improve(cfg, broken)
+    assert metrics["train/nonfinite"] == cfg.epochs
+    assert all(jnp.isfinite(x).all() for x in jax.tree.leaves(after))
+    assert any((a != b).any() for a, b in zip(*map(jax.tree.leaves, (before, after)), strict=True))
+
+
+def test_two_devices_take_the_step_of_one():
+    cfg = dataclasses.replace(PPOConfig(**SMALL, lr=1e-2), minibatches=1)
+    params, batch, objective = problem(cfg)
+    args = (params["actor"], adam_epochs.init(params["actor"], cfg), objective)
+    whole = adam_epochs.update(*args, batch, jax.random.key(1), cfg, None)
+    halves = jax.tree.map(lambda x: x.reshape(2, -1, *x.shape[1:]), batch)
+    parts = jax.vmap(
+        lambda half: adam_epochs.update(*args, half, jax.random.key(1), cfg, "devices"),
+        axis_name="devices",
+    )(halves)
+    for a, b in zip(jax.tree.leaves(whole), jax.tree.leaves(parts), strict=True):
+        np.testing.assert_allclose(b[0], b[1], rtol=1e-6)
+        np.testing.assert_allclose(a, b[0], rtol=1e-3, atol=1e-5)
+
+
+def test_a_critic_learns_its_targets():
+    cfg = PPOConfig(**SMALL, critic_epochs=200, critic_lr=1e-2, critic_norm_coef=0.0)
+    params, batch, _ = problem(cfg)
+    state = adam(cfg.critic_lr, cfg).init(params["critic_c"])
+    critic, _, error, skipped = fit_critic(
+        params["critic_c"], state, batch.obs, batch.ret_c, 200, jax.random.key(0), cfg, None
+    )
+    assert error < 0.01 and skipped == 0
+    np.testing.assert_allclose(value(critic, batch.obs, cfg), batch.ret_c, atol=0.4)
+
+
+def test_passes_of_a_critic_beyond_those_that_count_change_nothing():
+    cfg = PPOConfig(**SMALL, critic_epochs=5)
+    params, batch, _ = problem(cfg)
+    start = params["critic_c"], adam(cfg.critic_lr, cfg).init(params["critic_c"])
+
+    def fit(passes, cfg):
+        arrays = batch.obs, batch.ret_c, passes, jax.random.key(0)
+        return fit_critic(*start, *arrays, cfg, None)[:2]
+
+    for passes in (0, 2, 5):
+        few = fit(passes, dataclasses.replace(cfg, critic_epochs=passes)) if passes else start
+        for a, b in zip(*map(jax.tree.leaves, (fit(jnp.int32(passes), cfg), few)), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "w, advantage, expected", [(1.5, 1, 1.2), (1.5, -1, -1.5), (0.5, 1, 0.5), (0.5, -1, -0.8)]
+)
+def test_the_clipped_surrogate_by_hand(w, advantage, expected):
+    cfg = PPOConfig(**SMALL, clip=0.2)
+    params, batch, _ = problem(cfg, size=1)
+    batch = dataclasses.replace(batch, log_prob=batch.log_prob - jnp.log(w))
+    adv = jnp.array([advantage], jnp.float32)
+    objective, metrics = clipped(policy(params["actor"], batch.obs, cfg), batch, adv, cfg)
+    np.testing.assert_allclose(objective, expected, rtol=1e-4)
+    assert metrics["train/clip_fraction"] == 1
+    np.testing.assert_allclose(plain(batch.old, batch, adv, cfg)[0], w * advantage, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("iteration", "decay", "share"), [(0, True, 1.0), (3, True, 0.7), (12, True, 0.0), (3, False, 1.0)]
+)
+def test_the_entropy_bonus_by_hand(iteration, decay, share):
+    cfg = PPOConfig(**SMALL, entropy_coef=0.2, entropy_decay=decay, total_iterations=10.0)
+    params, batch, _ = problem(cfg)
+
+    def bonus(log_std):
+        dist = policy(params["actor"] | {"log_std": log_std}, batch.obs, cfg)
+        surrogate = with_entropy(plain, jnp.int32(iteration))
+        return surrogate(dist, batch, batch.adv_r, cfg)[0] - plain(dist, batch, batch.adv_r, cfg)[0]
+
+    gain, slope = jax.value_and_grad(bonus)(jnp.array([0.0, -1.0]))
+    # entropies log std + log(2 pi e) / 2, of two dimensions: 1.41894 each at a std of 1
+    np.testing.assert_allclose(gain, 0.2 * share * (2 * 1.4189385 - 1), rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(slope, 0.2 * share * np.ones(2), rtol=1e-3, atol=1e-6)

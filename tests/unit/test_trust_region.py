@@ -1,0 +1,148 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+
+from jaxsafe.algos.cpo import CPOConfig
+from jaxsafe.algos.trpo import TRPOConfig
+from jaxsafe.learn.on_policy import Batch
+from jaxsafe.learn.surrogates import plain
+from jaxsafe.learn.trust_region import (
+    conjugate_gradient,
+    fisher_product,
+    line_search,
+    natural_gradient,
+    trust_region,
+)
+from jaxsafe.nn.gaussian import kl, log_prob, sample
+from jaxsafe.nn.networks import init_params, policy
+
+
+def spd(rng, n):
+    root = rng.standard_normal((n, n))
+    return root @ root.T / n + 0.1 * np.eye(n)
+
+
+@pytest.mark.parametrize("n", [1, 4, 12])
+@pytest.mark.parametrize("scale", [1e-8, 1.0, 1e6])
+def test_conjugate_gradients_solve_as_numpy_does(n, scale):
+    rng = np.random.default_rng(n)
+    a, b = spd(rng, n), scale * rng.standard_normal(n)
+    matrix = jnp.array(a, jnp.float32)
+    x, residual = conjugate_gradient(lambda v: matrix @ v, jnp.array(b, jnp.float32), 40)
+    np.testing.assert_allclose(x / scale, np.linalg.solve(a, b) / scale, rtol=2e-3, atol=1e-4)
+    assert residual < 1e-4
+
+
+def test_the_residual_reported_is_the_residual_left():
+    rng = np.random.default_rng(0)
+    a, b = jnp.array(spd(rng, 30), jnp.float32), jnp.array(rng.standard_normal(30), jnp.float32)
+    for iterations in (0, 3, 8):
+        x, residual = conjugate_gradient(lambda v: a @ v, b, iterations)
+        left = jnp.linalg.norm(b - a @ x) / jnp.linalg.norm(b)
+        np.testing.assert_allclose(residual, left, rtol=1e-2)
+
+
+def test_no_gradient_gives_no_direction():
+    x, residual = conjugate_gradient(lambda v: 2 * v, jnp.zeros(3), 15)
+    assert not x.any() and residual == 0
+
+
+def test_the_fisher_product_is_that_of_the_kls_hessian():
+    cfg = CPOConfig(hidden=(3,), init="torch")
+    actor = init_params(jax.random.key(0), 2, 2, cfg)["actor"]
+    obs = jax.random.normal(jax.random.key(1), (16, 2))
+    params, unravel = ravel_pytree(actor)
+
+    def dist(params):
+        return policy(unravel(params), obs, cfg)
+
+    old = dist(params)
+    hessian = jax.hessian(lambda p: jnp.mean(kl(old, dist(p))))(params)
+    product = fisher_product(dist, params, old, cfg, None)  # its damping is 0.1
+    v = jax.random.normal(jax.random.key(2), params.shape)
+    np.testing.assert_allclose(product(v), hessian @ v + 0.1 * v, rtol=1e-4, atol=1e-5)
+    assert (
+        np.linalg.eigvalsh(np.array(hessian)).min() > -1e-5
+    )  # at the old policy it is a Fisher matrix
+
+
+def test_a_kl_per_action_is_half_the_kl_of_two_actions():
+    def step(**options):
+        cfg = TRPOConfig(hidden=(8,), init="torch", **options)
+        keys = jax.random.split(jax.random.key(0), 3)
+        actor = init_params(keys[0], 3, 2, cfg)["actor"]
+        obs = jax.random.normal(keys[1], (64, 3))
+        old = policy(actor, obs, cfg)
+        action = sample(old, keys[2])
+        adv = action[:, 0] - action[:, 0].mean()
+        batch = Batch(obs, action, log_prob(old, action), old, adv, adv, adv, adv)
+
+        def objective(actor, batch):
+            return plain(policy(actor, batch.obs, cfg), batch, batch.adv_r, cfg)
+
+        update = jax.jit(trust_region.update, static_argnums=(2, 6))
+        return update(actor, (), objective, batch, keys[2], cfg, None)
+
+    mean, _, metrics = step(target_kl=0.01, damping=0.1, kl_per_action=True)
+    total, _, twice = step(target_kl=0.02, damping=0.2)
+    for a, b in zip(jax.tree.leaves(mean), jax.tree.leaves(total), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6)
+    assert metrics["train/kl"] > 0.005
+    np.testing.assert_allclose(twice["train/kl"], 2 * metrics["train/kl"], rtol=1e-3)
+
+
+@pytest.mark.parametrize("bound, index", [(1.0, 0), (0.5, 1), (0.2, 3), (0.0, 5)])
+def test_the_line_search_takes_the_first_step_that_is_accepted(bound, index):
+    start, step = jnp.array([2.0]), jnp.array([1.0])
+    x, accepted, i = line_search(lambda x: x[0] - 2.0 <= bound, start, step, 5, 0.5)
+    assert i == index and accepted == (index < 5)
+    assert x[0] == 2.0 + (0.5**index if accepted else 0.0)
+
+
+def test_the_line_search_stays_where_it_is_when_nothing_is_finite():
+    x, accepted, _ = line_search(lambda x: x[0] < jnp.inf, jnp.ones(1), jnp.full(1, jnp.nan), 5, 0.5)
+    assert not accepted and x[0] == 1.0
+
+
+def natural(step, **options):
+    """A policy, the flat step taken, its gradient and Fisher matrix (dense), and the metrics."""
+    cfg = TRPOConfig(hidden=(4,), cg_iterations=60, **options)
+    keys = jax.random.split(jax.random.key(0), 3)
+    actor = init_params(keys[0], 3, 2, cfg)["actor"]
+    obs = jax.random.normal(keys[1], (256, 3))
+    old = policy(actor, obs, cfg)
+    action = sample(old, keys[2])
+    adv = action.sum(-1) - action.sum(-1).mean()
+    batch = Batch(obs, action, log_prob(old, action), old, adv, adv, adv, adv)
+
+    def objective(actor, batch):
+        return plain(policy(actor, batch.obs, cfg), batch, batch.adv_r, cfg)
+
+    after, _, metrics = step.update(actor, (), objective, batch, jax.random.key(0), cfg, None)
+    start, unravel = ravel_pytree(actor)
+    g = jax.grad(lambda x: objective(unravel(x), batch)[0])(start)
+    hessian = jax.hessian(lambda x: kl(old, policy(unravel(x), obs, cfg)).mean())(start)
+    return ravel_pytree(after)[0] - start, g, hessian + cfg.damping * jnp.eye(len(g)), metrics, cfg
+
+
+def test_the_natural_gradient_is_numpys_and_as_long_as_the_trust_region():
+    step, g, h, metrics, cfg = natural(natural_gradient, target_kl=1e-3)
+    exact = np.linalg.solve(np.asarray(h, np.float64), np.asarray(g, np.float64))
+    exact *= np.sqrt(2 * cfg.target_kl / (g @ exact))
+    np.testing.assert_allclose(step, exact, rtol=2e-2, atol=2e-4)
+    np.testing.assert_allclose(step @ h @ step / 2, cfg.target_kl, rtol=1e-2)
+    # less than the model's: it has the damping besides
+    assert 0.1 * cfg.target_kl < metrics["train/kl"] < 1.1 * cfg.target_kl
+
+
+def test_a_trust_region_step_is_the_natural_one_shortened_until_it_holds():
+    long, *_ = natural(natural_gradient, target_kl=0.5, damping=1e-3)
+    step, _, _, metrics, cfg = natural(trust_region, target_kl=0.5, damping=1e-3)
+    assert metrics["train/accepted"] == 1 and metrics["train/objective"] > 0
+    assert metrics["train/kl"] <= cfg.target_kl
+    shrunk = cfg.line_search_shrink ** float(metrics["train/line_search"])
+    np.testing.assert_allclose(step, shrunk * long, rtol=1e-3, atol=1e-5)
+    _, _, _, unsearched, _ = natural(natural_gradient, target_kl=0.5, damping=1e-3)
+    assert (unsearched["train/kl"] > cfg.target_kl) == (metrics["train/line_search"] > 0)
