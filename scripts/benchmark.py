@@ -24,8 +24,10 @@ import jax.numpy as jnp
 from jaxsafe import algos, envs
 from jaxsafe.config import ConfigError
 from jaxsafe.learn.rollout import collect, init_rollout
-from jaxsafe.run import run_folder, runner
-from jaxsafe.run.runner import device_name, use_compilation_cache
+from jaxsafe.run import run_folder
+from jaxsafe.run.devices import check_devices, device_name, use_compilation_cache
+from jaxsafe.run.settings import TrainConfig
+from jaxsafe.run.spread import build
 
 
 def timed(fn, *args, before: int, repeats: int) -> tuple[float, list[float]]:
@@ -63,9 +65,9 @@ def stepping(env, num_envs: int, seeds: int, horizon: int):
 
 def training(env, algo: str, cfg, seeds: int, devices: int):
     """(state, fn): one update of `algo`."""
-    settings = runner.TrainConfig(num_seeds=seeds, devices=devices)
-    runner.check_devices(settings)
-    program = runner.build(env, algos.ALGOS[algo].make, [cfg], settings)
+    settings = TrainConfig(num_seeds=seeds, devices=devices)
+    check_devices(settings)
+    program = build(env, algos.ALGOS[algo].make, [cfg], settings)
     state = jax.jit(program.init)(jax.device_put(program.start, program.sharding))
     return state, lambda ts: program.update(ts)[0]
 
