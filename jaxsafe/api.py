@@ -284,17 +284,7 @@ def sweep(env: Any = None, algo: Any = None, **options: Any) -> SweepResult:
         KeyboardInterrupt: stopped, with a checkpoint.
     """
     choice = chosen(env, algo)
-    given: dict[str, Any] = {}
-    several: dict[str, list[Any]] = {}
-    for name, value in {**choice.given, **named(choice, flat(options), "max_parallel")}.items():
-        values = as_list(value)
-        if isinstance(values, list) and not values:
-            raise ConfigError(f"{name.removeprefix('algo.')}=[]: expected values to sweep")
-        if isinstance(values, list):
-            several[name] = [to_plain(v, name) for v in values]
-        else:
-            given[name] = to_plain(value, name)
-    asked = sweeps.plan(nested(given), several, choice.entries)
+    asked = sweeps.plan(*asked_for(choice, options), choice.entries)
     report = Report(hosted=True)
     choice.say_whose(report)
     again = "the same call of jaxsafe.sweep"
@@ -475,6 +465,24 @@ def named(choice: Chosen, options: dict[str, Any], *more: str) -> dict[str, Any]
         return f"algo.{name}"
 
     return {full(name): value for name, value in options.items()}
+
+
+def asked_for(choice: Chosen, options: dict[str, Any]) -> tuple[dict[str, Any], dict[str, list[Any]]]:
+    """What to sweep, as `run.sweep.plan` takes it: a list holds the values of an option.
+
+    Raises:
+        ConfigError: a list is empty, or there is no such option.
+    """
+    given, several = {}, {}
+    for name, value in {**choice.given, **named(choice, flat(options), "max_parallel")}.items():
+        values = as_list(value)
+        if not isinstance(values, list):
+            given[name] = value
+        elif values:
+            several[name] = [to_plain(v, name) for v in values]
+        else:
+            raise ConfigError(f"{name.removeprefix('algo.')}=[]: expected values to sweep")
+    return to_plain(nested(given)), several
 
 
 def as_list(value: Any) -> Any:
