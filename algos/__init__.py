@@ -34,7 +34,7 @@ from jaxsafe.algos import (
     trpo_simmer_pid,
 )
 from jaxsafe.config import ConfigError, nearest
-from jaxsafe.learn.on_policy import Algorithm
+from jaxsafe.types import Algorithm
 
 
 class Entry(NamedTuple):

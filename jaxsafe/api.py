@@ -22,6 +22,7 @@ from jaxsafe.config import ConfigError, flat, nearest
 from jaxsafe.envs import SafetyGym, SafetyGymConfig
 from jaxsafe.envs.check import check_env
 from jaxsafe.envs.engines.physics import default_engine
+from jaxsafe.learn.acting import Player
 from jaxsafe.report import evaluation, film, sweep_summary
 from jaxsafe.report.evaluation import Scores
 from jaxsafe.report.finish import finish
@@ -144,6 +145,8 @@ class Run:
     def policy(self, obs: jax.Array, key: jax.Array | None = None, index: int = 0) -> jax.Array:
         """The action of a trained policy, compiled; it may be used inside `jit`, `vmap` and `scan`.
 
+        It is that of the first step of an episode where the policy has a memory; see `player`.
+
         Args:
             obs: float [..., obs_size] of `run.env(index)`, as the environment gives it.
             key: a random key to sample with; None is the mean, which `evaluate` uses too.
@@ -156,7 +159,22 @@ class Run:
             ConfigError: no such policy, or no checkpoint yet.
         """
         self._opened.actor(index)
-        return self._act(self._opened.ts, index, obs, key)
+        return self._act(self._opened.params, index, obs, key)
+
+    def player(self, index: int = 0) -> Player:
+        """A trained policy with its memory: `carry = player.begin()`, then at each step
+        `action, carry = player.act(carry, state)` with the `state` of `player.task`.
+
+        Args:
+            index: which policy.
+
+        Returns:
+            The policy, with its parameters and `task`, the environment that it meets.
+
+        Raises:
+            ConfigError: no such policy, or no checkpoint yet.
+        """
+        return self._opened.actor(index).player
 
     def env(self, index: int = 0) -> Env:
         """The environment as a policy meets it: with what an algorithm adds to the observation, as
@@ -171,7 +189,7 @@ class Run:
         Raises:
             ConfigError: no such policy, or no checkpoint yet.
         """
-        return self._opened.algo.task(self._opened.actor(index).ts)
+        return self.player(index).task
 
     @functools.cached_property
     def _opened(self) -> Opened:
@@ -182,8 +200,9 @@ class Run:
     def _act(self) -> Any:
         algo = self._opened.algo
 
-        def act(states: PyTree, index: Any, obs: jax.Array, key: jax.Array | None) -> jax.Array:
-            return algo.act(jax.tree.map(lambda x: x[index], states), obs, key)
+        def act(every: PyTree, index: Any, obs: jax.Array, key: jax.Array | None) -> jax.Array:
+            params = jax.tree.map(lambda x: x[index], every)
+            return algo.policy.act(params, algo.policy.init(params), obs, key)[0]
 
         return jax.jit(act)
 

@@ -20,6 +20,7 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxsafe import algos, envs
 from jaxsafe.config import ConfigError
@@ -28,6 +29,7 @@ from jaxsafe.run import run_folder
 from jaxsafe.run.devices import check_devices, device_name, use_compilation_cache
 from jaxsafe.run.settings import TrainConfig
 from jaxsafe.run.spread import build
+from jaxsafe.types import Shared
 
 
 def timed(fn, *args, before: int, repeats: int) -> tuple[float, list[float]]:
@@ -68,8 +70,9 @@ def training(env, algo: str, cfg, seeds: int, devices: int):
     settings = TrainConfig(num_seeds=seeds, devices=devices)
     check_devices(settings)
     program = build(env, algos.ALGOS[algo].make, [cfg], settings)
-    state = jax.jit(program.init)(jax.device_put(program.start, program.sharding))
-    return state, lambda ts: program.update(ts)[0]
+    shared = Shared(np.int32(0))
+    state = jax.jit(program.init)(jax.device_put(program.start, program.sharding), shared)
+    return state, lambda ts: program.update(ts, shared)[0]
 
 
 def per_seed(init, seeds: int):

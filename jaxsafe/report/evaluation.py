@@ -32,9 +32,9 @@ class Scores(NamedTuple):
 def evaluate(run: Opened, num: int, seed: int) -> list[Scores]:
     """`num` fresh episodes of each seed in each setting."""
     settings = run.settings
-    episodes = run_episodes(run.algo, run.ts, num, seed)
+    episodes = run_episodes(run.algo, run.params, num, seed)
     tables = list(run_folder.by_setting(run_folder.read_metrics(run.folder)).values())
-    cost_names = run.algo.task(jax.tree.map(lambda x: x[0], run.ts)).cost_names
+    cost_names = run.algo.task(jax.tree.map(lambda x: x[0], run.params)).cost_names
     seeds, scores = settings.train.num_seeds, []
     for i, member in enumerate(members(settings.configs, settings.train)[::seeds]):
         own = Episodes(*(x[i * seeds : (i + 1) * seeds] for x in episodes))

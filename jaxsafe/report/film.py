@@ -27,7 +27,7 @@ def film(actors: list[Actor], path: Path, seed: int, labels: list[str] | None = 
     key = jax.random.fold_in(jax.random.key(seed), 0x66696C6D)
     try:
         films = [
-            render.render_episode(a.env, a.act, key, task=a.algo.task(a.ts), label=label)  # type: ignore[arg-type]
+            render.render_episode(a.env, a.player, key, label=label)  # type: ignore[arg-type]
             for a, label in zip(actors, labels or [None] * len(actors), strict=True)
         ]
     except render.NoDisplay as error:

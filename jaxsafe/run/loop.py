@@ -19,7 +19,7 @@ from jaxsafe.run.log import Log
 from jaxsafe.run.progress import Report
 from jaxsafe.run.settings import TrainConfig
 from jaxsafe.run.spread import Program
-from jaxsafe.types import PyTree
+from jaxsafe.types import PyTree, Shared
 
 
 class Outcome(NamedTuple):
@@ -51,8 +51,7 @@ def train(
     Raises:
         checkpoint.CheckpointError, OSError: the disk failed; the last good checkpoint stays.
     """
-    cfg = program.members[0].algo
-    per_update = cfg.num_envs * cfg.horizon  # steps of one seed
+    per_update = program.clocks.steps
     iterations = -(-settings.total_steps // per_update)
     store = folder / "checkpoints"
     resuming = bool(distributed.first(np.array(bool(checkpoint.checkpoints(store)))))
@@ -60,22 +59,23 @@ def train(
         stop.nothing_to_save = (
             f"stopped before the first update; {resume_command if resuming else 'nothing to save'}"
         )
-        start = time.perf_counter()
+        begun = time.perf_counter()
         iteration = 0
         if resuming:
-            like = jax.eval_shape(program.init, program.start)
+            like = jax.eval_shape(program.init, program.start, Shared(np.int32(0)))
             ts, iteration = restored(store, like, report)
             ts = distributed.place(ts, program.sharding)
             report.line(f"resuming at {iteration * per_update:,} steps")
         else:
-            ts = jax.jit(program.init)(distributed.place(program.start, program.sharding))
+            start = distributed.place(program.start, program.sharding)
+            ts = jax.jit(program.init)(start, Shared(np.int32(0)))
             ts = distributed.place(adapt(ts), program.sharding) if adapt else ts
         if iteration >= iterations:
             report.line("nothing left to train")
             return Outcome(ts, iteration, iteration * per_update, False)
-        names = sorted(jax.eval_shape(program.update, ts)[1])
+        names = sorted(jax.eval_shape(program.update, ts, Shared(np.int32(0)))[1])
         update = spread.compiled(program, ts)
-        report.line(f"compiled in {time.perf_counter() - start:.1f} s")
+        report.line(f"compiled in {time.perf_counter() - begun:.1f} s")
         stop.nothing_to_save = ""
 
         vote = distributed.Vote(program.sharding)
@@ -88,7 +88,7 @@ def train(
             report.start(iterations * per_update, iteration * per_update, limits)
             saved_at = time.perf_counter()
             while iteration < iterations:
-                ts, metrics = update(ts)
+                ts, metrics = update(ts, Shared(np.int32(iteration)))
                 metrics, iteration = distributed.whole(metrics), iteration + 1
                 if log:
                     log.append(iteration, metrics)
@@ -102,6 +102,10 @@ def train(
                     if log:
                         log.sync()
                         checkpoint.save(store, state, iteration, iteration * per_update)
+                        acting = jax.tree.map(
+                            lambda x: x[: len(program.members)], program.params(state)
+                        )
+                        checkpoint.save(folder / "policy", acting, iteration, iteration * per_update)
                     saved_at = time.perf_counter()
                 if stopping:
                     break

@@ -5,12 +5,13 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 
 from jaxsafe.config import ConfigError
 from jaxsafe.run import checkpoint, spread
 from jaxsafe.run.settings import TrainConfig
 from jaxsafe.run.spread import Program
-from jaxsafe.types import Env
+from jaxsafe.types import Env, Shared
 
 ROOM = 0.8  # of the memory that a program may take by `capacity`
 
@@ -38,7 +39,7 @@ def check_memory(env: Env, algo_config: Any, num_members: int, devices: int) -> 
 def check_state_memory(program: Program, settings: TrainConfig) -> None:
     """Like `check_memory`, for the train state itself (old and new), known once it is traced."""
     limit, what = device_memory()
-    leaves = jax.tree.leaves(jax.eval_shape(program.init, program.start))
+    leaves = jax.tree.leaves(jax.eval_shape(program.init, program.start, Shared(np.int32(0))))
     need = (
         2
         * sum(x.size * (8 if checkpoint.is_key(x) else x.dtype.itemsize) for x in leaves)
@@ -55,7 +56,7 @@ def capacity(program: Program) -> int:
     """How many of its members fit the memory at once, by the compiled update's own account."""
     like = jax.tree.map(
         lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=program.sharding),
-        jax.eval_shape(program.init, program.start),
+        jax.eval_shape(program.init, program.start, Shared(np.int32(0))),
     )
     used: Any = spread.compiled(program, like).memory_analysis()
     need = used.temp_size_in_bytes + used.argument_size_in_bytes + used.output_size_in_bytes

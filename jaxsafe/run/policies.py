@@ -1,6 +1,7 @@
 """The policies of a run folder: to act with, and to start another run from.
 
-A policy is the part of a checkpoint that `act` and `task` read. Nothing in the folder is executed.
+A policy is what acts: networks, normaliser, config. It has a file of its own beside the checkpoints.
+Nothing in the folder is executed.
 """
 
 import dataclasses
@@ -13,26 +14,24 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsafe.config import ConfigError, flat
-from jaxsafe.learn.on_policy import Algorithm
+from jaxsafe.learn.acting import Player
 from jaxsafe.run import checkpoint, run_folder
 from jaxsafe.run.settings import DEFAULT, REGISTERED, Entries, Settings, load, make_env, settle
 from jaxsafe.run.spread import Program, members
-from jaxsafe.types import Env, PyTree
+from jaxsafe.types import Algorithm, Env, PyTree, Shared
 
-POLICY = ("params", "normaliser")  # the fields of a train state that another run can start from
-
-ACTING = (*POLICY, "dual")  # what an algorithm's `act` and `task` read, beside its config
+POLICY = ("params", "normaliser")  # the parts of what acts that another run can start from
 
 
 class Opened(NamedTuple):
-    """The policies of a run folder, ready to act. `ts` is a train state with a leading axis over them:
+    """The policies of a run folder, ready to act. `params` is what acts, with a leading axis over them:
     every seed of the first setting, then of the next."""
 
     folder: Path
     settings: Settings
     env: Env
     algo: Algorithm
-    ts: PyTree
+    params: PyTree
 
     def actor(self, index: int) -> "Actor":
         """One of the policies.
@@ -43,8 +42,8 @@ class Opened(NamedTuple):
         count = len(self.settings.configs) * self.settings.train.num_seeds
         if not 0 <= index < count:
             raise ConfigError(f"index {index}: the run has {count} policies, from 0, in {self.folder}")
-        ts = jax.tree.map(lambda x: x[index], self.ts)
-        return Actor(self.settings, self.env, self.algo, ts)
+        params = jax.tree.map(lambda x: x[index], self.params)
+        return Actor(self.settings, self.env, self.algo, params)
 
 
 def open_run(folder: Path, code: Sequence[str] = (), entries: Entries = REGISTERED) -> Opened:
@@ -67,80 +66,93 @@ def open_run(folder: Path, code: Sequence[str] = (), entries: Entries = REGISTER
             raise ConfigError(f"{text}: {folder} was trained with {kind}={saved[kind]['name']}")
         load(kind, name)
     settings = settle(saved, entries)
-    if not checkpoint.checkpoints(folder / "checkpoints"):
+    if not checkpoint.checkpoints(policy_folder(folder)):
         raise ConfigError(f"{folder} holds no checkpoint")
     env = make_env(settings)
     return Opened(folder, settings, env, *policy_of(settings, env, folder))
 
 
 class Actor(NamedTuple):
-    """One policy of a run, ready to act. `ts` is the train state of that member alone."""
+    """One policy of a run, ready to act. `params` is what acts of that member alone."""
 
     settings: Settings
     env: Env
     algo: Algorithm
-    ts: PyTree
+    params: PyTree
 
-    def act(self, obs: jax.Array, key: jax.Array | None = None) -> jax.Array:
-        """The deterministic action [A]; what a film calls."""
-        return self.algo.act(self.ts, obs, None)
+    @property
+    def player(self) -> Player:
+        return Player(self.algo.policy, self.params, self.algo.task(self.params))
 
 
 def policy_of(settings: Settings, env: Env, folder: Path) -> tuple[Algorithm, PyTree]:
-    """The algorithm, and the newest policy of each seed in a train state."""
+    """The algorithm, and what acts of the newest policy of each member, [S, ...]."""
     algo = settings.row.make(env, None)
 
     def one_step(cfg: Any) -> Any:
         return dataclasses.replace(cfg, num_envs=1, horizon=1, minibatches=1)
 
-    state = jax.eval_shape(
-        lambda: algo.init(jax.random.key(0), jax.tree.map(np.float32, one_step(settings.algo)))
-    )
+    def first(cfg: Any) -> PyTree:
+        return algo.params(algo.init(jax.random.key(0), cfg, Shared(np.int32(0))))
+
     run = members(settings.configs, settings.train)
-    arrays = read_policy(folder, len(run), fields=ACTING)
-    ts = policy_state(state, arrays, len(run), folder)
     floats = jax.tree.map(lambda *x: np.array(x, np.float32), *[one_step(m.algo) for m in run])
-    return algo, dataclasses.replace(ts, config=floats)
+    like = jax.eval_shape(first, jax.tree.map(lambda x: x[0], floats))
+    arrays = read_policy(folder, len(run))
+    return algo, acting(like, arrays, floats, folder)
+
+
+def policy_folder(folder: Path) -> Path:
+    """Where the policies of a run lie: beside its checkpoints or, in runs before 0.2, in them."""
+    alone = folder / "policy"
+    return alone if checkpoint.checkpoints(alone) else folder / "checkpoints"
 
 
 def read_policy(
     folder: Path,
     rows: int,
     warn: Callable[[str], None] | None = None,
-    fields: Sequence[str] = POLICY,
 ) -> dict[str, np.ndarray]:
-    """`fields` of the newest checkpoint of a run folder, by leaf name, [rows, ...].
+    """The newest policies of a run folder by leaf name, [rows, ...], with whatever else lies there.
 
     Rows beyond the run's members are the copies on the other devices of a split one.
     """
-    arrays, _ = checkpoint.load(folder / "checkpoints", warn)
-    policy = {name: x[:rows] for name, x in arrays.items() if name.split(".")[0] in fields}
+    arrays, _ = checkpoint.load(policy_folder(folder), warn)
+    policy = {name: x[:rows] for name, x in arrays.items()}
     if any(len(x) != rows for x in policy.values()):
         raise ConfigError(f"{folder} holds fewer than the {rows} policies of its config.yaml")
     return policy
 
 
-def policy_state(like: PyTree, policy: dict[str, np.ndarray], rows: int, source: Path) -> PyTree:
-    """A train state with `rows` policies and zeros elsewhere; `like` is one, without that axis."""
+def acting(like: PyTree, policy: dict[str, np.ndarray], configs: PyTree, source: Path) -> PyTree:
+    """What acts of each of S policies, [S, ...].
+
+    Args:
+        like: of one, without that axis.
+        policy: from `read_policy`.
+        configs: the algorithm's, floats [S], from config.yaml.
+        source: the run folder, for messages.
+    Raises:
+        ConfigError: the policies are of other networks.
+    """
+    rows = len(jax.tree.leaves(configs)[0])
     like = jax.tree.map(lambda x: jax.ShapeDtypeStruct((rows, *x.shape), x.dtype), like)
-    check_policy(like, policy, source, ACTING)
-    arrays = {
-        name: policy[name] if name in policy else np.zeros(x.shape, x.dtype)
-        for name, x in checkpoint.as_data(like).items()
-    }
+    check_policy(like, policy, source)
+    arrays = policy | checkpoint.to_arrays({"config": configs})
+    for name in checkpoint.leaf_names(like):
+        if name not in arrays:
+            raise ConfigError(f"the policy of {source} does not fit: {name} is absent")
     return checkpoint.from_arrays(like, arrays)
 
 
-def check_policy(
-    like: PyTree,
-    policy: dict[str, np.ndarray],
-    source: Path,
-    fields: Sequence[str] = POLICY,
-    why: str = "",
-) -> None:
-    """Raise ConfigError unless `policy` fits `fields` of the train state `like`, whatever its rows."""
+def check_policy(like: PyTree, policy: dict[str, np.ndarray], source: Path, why: str = "") -> None:
+    """Raise ConfigError unless `policy` has the networks of `like`, whatever its rows."""
+
+    def networks(named: dict[str, Any]) -> dict[str, Any]:
+        return {k: v for k, v in named.items() if k.split(".")[0] in POLICY}
+
     expected = dict(zip(checkpoint.leaf_names(like), jax.tree.leaves(like), strict=True))
-    expected = {k: v for k, v in expected.items() if k.split(".")[0] in fields}
+    expected, policy = networks(expected), networks(policy)
     for name in sorted({*expected, *policy}):
         have, want = (
             str(list(x[name].shape[1:])) if name in x else "absent" for x in (policy, expected)
@@ -164,7 +176,7 @@ def warm_start(
     """
     source = Path(settings.train.init_from or "").expanduser()
     saved = settle(run_folder.read_config(source), settings.entries)
-    if not checkpoint.checkpoints(source / "checkpoints"):
+    if not checkpoint.checkpoints(policy_folder(source)):
         raise ConfigError(f"init_from={source} holds no checkpoint")
     first, count = saved.train.seed, saved.train.num_seeds
     policy = read_policy(source, count, say)
@@ -182,7 +194,7 @@ def warm_start(
         )
         if there.get(name) != here[name]
     ]
-    like = jax.eval_shape(program.init, program.start)
+    like = jax.eval_shape(program.init, program.start, Shared(np.int32(0)))
     check_policy(like, policy, source, why="; ".join(["", *differ[:3]]))
     units = [plain.get("algo.activation") for plain in (there, here)]  # no shape tells them apart
     if units[0] != units[1]:
@@ -202,13 +214,16 @@ def warm_start(
 
 
 def with_policy(ts: PyTree, policy: dict[str, np.ndarray], rows: Sequence[int]) -> PyTree:
-    """`ts` with the parameters and normaliser of `policy`: row `rows[i]` of it for member i.
+    """`ts` with the networks and normaliser of `policy`: row `rows[i]` of it for member i.
 
     The copies of a member on several devices share its row.
     """
     leaves, treedef = jax.tree.flatten(ts)
     picks = np.resize(rows, len(leaves[0]))
+
+    def start(name: str, x: jax.Array) -> jax.Array:
+        taken = name in policy and name.split(".")[0] in POLICY
+        return jnp.asarray(policy[name][picks], x.dtype) if taken else x
+
     named = zip(checkpoint.leaf_names(ts), leaves, strict=True)
-    return treedef.unflatten(
-        [jnp.asarray(policy[name][picks], x.dtype) if name in policy else x for name, x in named]
-    )
+    return treedef.unflatten([start(name, x) for name, x in named])

@@ -17,7 +17,7 @@ from jax.sharding import AxisType, NamedSharding, PartitionSpec
 from jaxsafe.config import ConfigError, flat
 from jaxsafe.run import checkpoint, run_folder
 from jaxsafe.run.settings import TrainConfig
-from jaxsafe.types import Env, PyTree
+from jaxsafe.types import Algorithm, Clocks, Env, PyTree, Shared
 
 AXIS = "devices"
 
@@ -46,10 +46,13 @@ def members(configs: Sequence[Any], settings: TrainConfig) -> list[Member]:
 
 
 class Program(NamedTuple):
-    """`init(start) -> ts` and `update(ts) -> (ts, metrics)` over the leading axis, not yet compiled."""
+    """`init(start, shared) -> ts` and `update(ts, shared) -> (ts, metrics)` over the leading axis, not
+    yet compiled. `params(ts)` is what acts, on the same axis; `clocks` are those of one seed."""
 
-    init: Callable[[PyTree], PyTree]
-    update: Callable[[PyTree], tuple[PyTree, dict[str, jax.Array]]]
+    init: Callable[[PyTree, Shared], PyTree]
+    update: Callable[[PyTree, Shared], tuple[PyTree, dict[str, jax.Array]]]
+    params: Callable[[PyTree], PyTree]
+    clocks: Clocks
     start: PyTree  # (keys, config): [M], or [devices] for one split member
     members: list[Member]
     sharding: jax.sharding.Sharding
@@ -76,59 +79,68 @@ def build(env: Env, make: Callable, configs: Sequence[Any], settings: TrainConfi
     if configs[0].num_envs % share:
         raise ConfigError(f"num_envs={configs[0].num_envs} does not split over devices={devices}")
 
+    algo: Algorithm = make(env, AXIS if share > 1 else None)
+    clocks = algo.clocks(configs[0])
+
     def settled(cfg: Any) -> Any:
         ends = cfg.total_iterations
         if math.isinf(ends):
-            ends = float(-(-settings.total_steps // (cfg.num_envs * cfg.horizon)))
+            ends = float(-(-settings.total_steps // clocks.steps))
         return dataclasses.replace(cfg, num_envs=cfg.num_envs // share, total_iterations=ends)
 
     # A split seed has one key for all its devices: the algorithm folds the device's index in.
     keys = jax.vmap(jax.random.key)(np.array([m.seed for m in run] * share, np.uint32))
     floats = jax.tree.map(lambda *x: np.array(x, np.float32), *[settled(m.algo) for m in run * share])
-    algo = make(env, AXIS if share > 1 else None)
     rows = max(1, len(run) // devices)  # on each device
-    init = over_rows(lambda start: algo.init(*start), rows)
+    init = over_rows(lambda start, shared: algo.init(start[0], start[1], shared), rows)
     update = over_rows(algo.update, rows)
     if devices == 1:
         one = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
-        return Program(init, update, (keys, floats), run, one)
+        return Program(init, update, algo.params, clocks, (keys, floats), run, one)
     mesh = jax.make_mesh(
         (devices,), (AXIS,), devices=jax.devices()[:devices], axis_types=(AxisType.Auto,)
     )
     spec = PartitionSpec(AXIS)
 
     def split(fn: Callable) -> Callable:
-        def parted(tree: PyTree) -> PyTree:
+        def parted(tree: PyTree, shared: Shared) -> PyTree:
             leaves, treedef = jax.tree.flatten(tree)
 
-            def own_part(full: list[jax.Array]) -> PyTree:
+            def own_part(full: list[jax.Array], shared: Shared) -> PyTree:
                 given = iter(full)
-                return fn(treedef.unflatten([next(given) if x.size else empty(x) for x in leaves]))
+                tree = treedef.unflatten([next(given) if x.size else empty(x) for x in leaves])
+                return fn(tree, shared)
 
             # arrays without elements stay outside: jax 0.11 crashes on them as inputs
             full = [x for x in leaves if x.size]
-            fields = {"mesh": mesh, "in_specs": spec, "out_specs": spec, "check_vma": False}
-            return jax.shard_map(own_part, **fields)(full)
+            specs = {"in_specs": (spec, PartitionSpec()), "out_specs": spec}
+            return jax.shard_map(own_part, mesh=mesh, **specs, check_vma=False)(full, shared)
 
         return parted
 
     def empty(x: jax.Array) -> jax.Array:
         return jnp.zeros((x.shape[0] // devices, *x.shape[1:]), x.dtype)
 
-    return Program(split(init), split(update), (keys, floats), run, NamedSharding(mesh, spec))
+    sharding = NamedSharding(mesh, spec)
+    return Program(split(init), split(update), algo.params, clocks, (keys, floats), run, sharding)
 
 
-def over_rows(fn: Callable[[PyTree], PyTree], rows: int) -> Callable[[PyTree], PyTree]:
+def over_rows(fn: Callable[[PyTree, Shared], PyTree], rows: int) -> Callable[[PyTree, Shared], PyTree]:
     """`fn` over a leading axis of `rows`. One row is no vmap, which would run both sides of a cond."""
 
     def strong(tree: PyTree) -> PyTree:  # no weak types, so that a restored state is the same program
         return jax.tree.map(lambda x: x if checkpoint.is_key(x) else jnp.asarray(x, x.dtype), tree)
 
-    if rows > 1:
-        return lambda xs: strong(jax.vmap(fn)(xs))
-    return lambda xs: strong(jax.tree.map(lambda y: y[None], fn(jax.tree.map(lambda x: x[0], xs))))
+    def alone(tree: PyTree, shared: Shared) -> PyTree:
+        out = fn(jax.tree.map(lambda x: x[0], tree), shared)
+        return strong(jax.tree.map(lambda x: x[None], out))
+
+    def together(tree: PyTree, shared: Shared) -> PyTree:
+        return strong(jax.vmap(fn, in_axes=(0, None))(tree, shared))
+
+    return together if rows > 1 else alone
 
 
 def compiled(program: Program, ts: PyTree) -> Any:
     """The update for a train state of these shapes; JAX remembers it."""
-    return jax.jit(program.update, donate_argnums=0).lower(ts).compile()
+    return jax.jit(program.update, donate_argnums=0).lower(ts, Shared(np.int32(0))).compile()

@@ -32,6 +32,7 @@ from shell import (
     wait_for,
 )
 from tasks import FAST
+from toys import FIRST
 
 from jaxsafe import algos, envs
 from jaxsafe.config import ConfigError
@@ -280,16 +281,16 @@ def test_the_policy_of_a_run_is_read_whatever_its_minibatches_divide(tmp_path, n
     program = spread.build(env, run.row.make, run.configs, run.train)
     ones = jax.tree.map(
         lambda x: np.ones(x.shape, x.dtype),
-        {k: getattr(jax.eval_shape(program.init, program.start), k) for k in policies.ACTING},
+        program.params(jax.eval_shape(program.init, program.start, FIRST)),
     )
     run_folder.write_config(tmp_path, run.plain())
-    checkpoint.save(tmp_path / "checkpoints", ones, 1, 40)
-    algo, ts = policies.policy_of(run, env, tmp_path)
-    ts = jax.tree.map(lambda x: x[0], ts)
-    action = algo.act(ts, jnp.zeros((1, algo.task(ts).obs_size)), None)
-    assert action.shape == (1, env.action_size)
-    assert ts.config.cost_limit == 25.0  # `task` may need the settings, and the dual
-    assert all((x == 1).all() for x in jax.tree.leaves((ts.params, ts.normaliser, ts.dual)))
+    checkpoint.save(tmp_path / "policy", ones, 1, 40)
+    algo, params = policies.policy_of(run, env, tmp_path)
+    params = jax.tree.map(lambda x: x[0], params)
+    action, _, _ = algo.policy.act(params, (), jnp.zeros(algo.task(params).obs_size), None)
+    assert action.shape == (env.action_size,)
+    assert params.config.cost_limit == 25.0  # `task` may need the settings, and the dual
+    assert all((x == 1).all() for x in jax.tree.leaves((params.params, params.normaliser, params.dual)))
 
 
 def test_evaluate_render_and_watch_refuse_a_bad_folder_in_one_line(tmp_path, capsys):
@@ -342,7 +343,7 @@ def warm(*args: str, **algo: Any):
     said: list[str] = []
     _, program = session.prepare(run)
     adapt = policies.warm_start(run, program, said.append)
-    fresh = jax.jit(program.init, compiler_options=FAST)(program.start)
+    fresh = jax.jit(program.init, compiler_options=FAST)(program.start, FIRST)
     return checkpoint.to_arrays(fresh), checkpoint.to_arrays(adapt(fresh)), said[0]
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import shell
 from tasks import FAST
-from toys import Corridor
+from toys import FIRST, Corridor
 
 from jaxsafe import algos
 from jaxsafe.config import ConfigError, float_fields
@@ -77,7 +77,7 @@ def compiled_quickly():
         return jax.jit(update, donate_argnums=0, compiler_options=FAST)
 
     def quick(program: spread.Program, ts: Any) -> Any:
-        return compiled(program.update).lower(ts).compile()
+        return compiled(program.update).lower(ts, FIRST).compile()
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(spread, "compiled", quick)
@@ -198,7 +198,7 @@ def test_every_float_of_every_algorithm_may_differ_between_members(name):
     cfg = kind(num_envs=2, horizon=4, minibatches=1, hidden=(4,))
     other = replace(cfg, **{field: 0.25 for field in float_fields(kind)})
     program = build(Corridor(), algos.ALGOS[name].make, (cfg, other), TrainConfig(num_seeds=2))
-    ts = jax.eval_shape(program.init, program.start)
+    ts = jax.eval_shape(program.init, program.start, FIRST)
     assert all(x.shape == (4,) for x in jax.tree.leaves(ts.config))
     assert jax.tree.leaves(program.start[1])[0].dtype == np.float32
 
@@ -265,7 +265,7 @@ def test_the_memory_decides_how_many_members_run_at_once(monkeypatch):
     (settings,) = asked.groups.values()
     parallel, program = sweep.fitting(settings, None)
     assert parallel == len(program.members) == 8
-    like = jax.eval_shape(program.init, program.start)
+    like = jax.eval_shape(program.init, program.start, FIRST)
     used = spread.compiled(program, like).memory_analysis()
     need = used.temp_size_in_bytes + used.output_size_in_bytes  # arguments are reused for the output
     monkeypatch.setattr(memory, "device_memory", lambda: (need * 0.5 / memory.ROOM, "this machine"))
@@ -302,7 +302,7 @@ def test_the_policies_of_a_group_are_evaluated_setting_by_setting(finished):
         for rate in (0.01, 1.0)
     ]
     for i, s in enumerate(found):
-        own = jax.tree.map(lambda x, i=i: x[2 * i : 2 * i + 2], run.ts)
+        own = jax.tree.map(lambda x, i=i: x[2 * i : 2 * i + 2], run.params)
         alone = run_episodes(run.algo, own, 3, 0)
         assert s.rows["return"].mean == pytest.approx(alone.ret.mean(), rel=1e-5)
 
