@@ -19,11 +19,11 @@ import jax.numpy as jnp
 from jaxsafe.algos import ppo
 from jaxsafe.config import config
 from jaxsafe.learn.batch import pmean
-from jaxsafe.learn.on_policy import Algorithm, on_policy_pair
+from jaxsafe.learn.on_policy import on_policy_pair
 from jaxsafe.learn.steps import Objective, Step, adam_epochs
 from jaxsafe.learn.surrogates import clipped, pessimistic, plain
 from jaxsafe.nn.gaussian import Gaussian
-from jaxsafe.types import Env, Metrics, PyTree
+from jaxsafe.types import Algorithm, Env, Metrics, PyTree
 
 
 @config
