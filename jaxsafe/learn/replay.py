@@ -21,6 +21,7 @@ from typing import NamedTuple
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxsafe.types import PyTree
 
@@ -82,6 +83,8 @@ class Transitions(NamedTuple):
     weight: jax.Array
 
 
+Whole = jax.Array | np.int32 | int  # a whole number, known or traced
+
 # (ring, span, index) -> the observations there, pytree [B, ...]
 Look = Callable[[Row, Span, Index], PyTree]
 
@@ -96,9 +99,7 @@ def empty_ring(row: Row, rows: int) -> Row:
     return jax.tree.map(lambda x: jnp.zeros((rows, *x.shape), x.dtype), row)
 
 
-def held(
-    rows: int, block: int, written: jax.Array | int, iteration: jax.Array, since: jax.Array
-) -> Span:
+def held(rows: int, block: int, written: Whole, iteration: Whole, since: Whole) -> Span:
     """What a ring of `rows` rows holds in the course of an iteration.
 
     Args:
@@ -127,7 +128,7 @@ def take(leaves: PyTree, span: Span, index: Index) -> PyTree:
     """The entries of `leaves` [R, N, ...] at `index`, a pytree of [B, ...]."""
 
     def entries(x: jax.Array) -> jax.Array:
-        rows = (span.oldest + index.position) % x.shape[0]
+        rows = jax.lax.rem(span.oldest + index.position, jnp.int32(x.shape[0]))
         return x.at[rows, index.env].get(mode="promise_in_bounds")
 
     return jax.tree.map(entries, leaves)

@@ -11,7 +11,7 @@ from jaxsafe.nn.gaussian import Gaussian
 def test_the_density_is_that_of_the_gaussian_over_the_slope_of_tanh(mean, log_std):
     dist = Gaussian(jnp.full((1000, 2), mean), jnp.full((1000, 2), log_std))
     action, log_prob = squashed_sample(dist, jax.random.key(0))
-    a = np.float64(action)
+    a = np.asarray(action, np.float64)
     close = (np.abs(a) < 0.99).all(-1)  # where atanh keeps its digits
     z = (np.arctanh(a[close]) - mean) / np.exp(log_std)
     gaussian = -0.5 * z**2 - log_std - 0.5 * np.log(2 * np.pi)

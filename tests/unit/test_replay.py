@@ -1,6 +1,7 @@
 """The replay against plain lists of episodes."""
 
 from functools import cache, partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -49,12 +50,13 @@ def life(rng, length, mean_steps):
 def as_rows(lives, begin, end):
     """Rows begin .. end - 1 of all environments, [T, N, ...]."""
 
-    def field(name, dtype=np.float32):
+    def field(name, dtype: Any = np.float32) -> Any:
         return np.array([[life[t][name] for life in lives] for t in range(begin, end)], dtype)
 
     names, envs = field("name"), np.arange(len(lives))
     pixels = np.stack([names % 256, names // 256, names + envs], -1) % 256
-    return Row(
+    make: Any = Row  # of NumPy's arrays
+    return make(
         obs={"vector": np.stack([names, field("episode")], -1), "pixels": pixels.astype(np.uint8)},
         action=field("action")[..., None],
         reward=field("reward"),
