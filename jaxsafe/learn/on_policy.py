@@ -23,7 +23,7 @@ from jaxsafe.learn.constraints import Names, check_names, each, limit, signal, s
 from jaxsafe.learn.normalise import init_normaliser, merge, normalise
 from jaxsafe.learn.returns import Estimator, Window, advantages, empty_window, mean_length, window_mean
 from jaxsafe.learn.rollout import RolloutState, Trajectory, collect, init_rollout
-from jaxsafe.learn.steps import Step, adam, fit_critic, stops_critics
+from jaxsafe.learn.steps import Context, Pair, Step, adam, fit_critic, stops_critics
 from jaxsafe.learn.surrogates import Surrogate, with_entropy
 from jaxsafe.learn.treatments import Treatment
 from jaxsafe.nn.gaussian import Gaussian, entropy, log_prob, sample
@@ -146,24 +146,17 @@ def on_policy(
 ) -> Algorithm:
     """Algorithms with one objective: the surrogate of the advantage that the treatment mixes."""
 
-    def improve(
-        ts: TrainState,
-        iteration: jax.Array,
-        batch: Batch,
-        cost: jax.Array,
-        length: jax.Array,
-        key: jax.Array,
-    ):
-        cfg = ts.config
-        dual = treatment.update(ts.dual, cost, cfg)
+    def improve(ts: TrainState, batch: Batch, context: Context):
+        cfg = context.cfg
+        dual = treatment.update(ts.dual, context.cost, cfg)
 
         def objective(actor: PyTree, batch: Batch) -> tuple[jax.Array, Metrics]:
             advantage = treatment.advantage(dual, batch.adv_r, batch.adv_c)
-            earned = with_entropy(surrogate, iteration)
+            earned = with_entropy(surrogate, context.iteration)
             return earned(policy(actor, batch.obs, cfg), batch, advantage, cfg)
 
         actor, opt_state, metrics = step.update(
-            ts.params["actor"], ts.opt_state["actor"], objective, batch, key, cfg, axis_name
+            ts.params["actor"], ts.opt_state["actor"], objective, batch, context
         )
         return actor, opt_state, dual, metrics | treatment.metrics(dual)
 
@@ -178,26 +171,18 @@ def on_policy_pair(
     surrogate_c: Surrogate | None = None,
     named: Callable[[Any], Names] = unnamed,
 ) -> Algorithm:
-    """Algorithms whose step weighs reward against cost itself, so that it takes two objectives:
+    """Algorithms whose step weighs reward against cost itself, so that it takes a `Pair` of objectives:
     `surrogate` of the reward's advantage, and `surrogate_c` (or the same) of the cost's.
 
-    update(actor, opt_state, objective_r, objective_c, excess, length, batch, key, cfg, axis_name),
-    where excess = J_c - cost_limit, in cost per episode, and length is the mean episode's in steps:
-    objective_c is in cost per step, the unit of excess / length. For K costs `named(cfg)` both are [K].
+    The cost's objective is in cost per step, the unit of `context.excess / context.length`. For K costs
+    `named(cfg)` it is [K].
     """
 
-    def improve(
-        ts: TrainState,
-        iteration: jax.Array,
-        batch: Batch,
-        cost: jax.Array,
-        length: jax.Array,
-        key: jax.Array,
-    ):
-        cfg = ts.config
+    def improve(ts: TrainState, batch: Batch, context: Context):
+        cfg = context.cfg
 
         def objective_r(actor: PyTree, batch: Batch) -> tuple[jax.Array, Metrics]:
-            earned = with_entropy(surrogate, iteration)
+            earned = with_entropy(surrogate, context.iteration)
             return earned(policy(actor, batch.obs, cfg), batch, batch.adv_r, cfg)
 
         def objective_c(actor: PyTree, batch: Batch) -> tuple[jax.Array, Metrics]:
@@ -211,14 +196,9 @@ def on_policy_pair(
         actor, opt_state, metrics = step.update(
             ts.params["actor"],
             ts.opt_state["actor"],
-            objective_r,
-            objective_c,
-            cost - limit(cfg, named(cfg)),
-            length,
+            Pair(objective_r, objective_c),
             batch,
-            key,
-            cfg,
-            axis_name,
+            context,
         )
         return actor, opt_state, (), metrics
 
@@ -242,8 +222,7 @@ def loop(
     augmentation: Augmentation = nothing,
     named: Callable[[Any], Names] = unnamed,
 ) -> Algorithm:
-    """The loop around `improve(ts, iteration, batch, episode_cost, episode_length, key)`, which returns
-    (actor, opt_state, dual, metrics). episode_cost is of `cost` or, [K], of the costs `named(cfg)`."""
+    """The loop around `improve(ts, batch, context)` -> (actor, opt_state, dual, metrics)."""
 
     def init(key: jax.Array, cfg: Any, shared: Shared) -> TrainState:
         check(cfg)
@@ -305,7 +284,9 @@ def loop(
         episode_cost = batch_mean(charged, axis_name, (0, 1)) * length
         recent, past_costs = window_mean(ts.past_costs, episode_cost)
 
-        actor, opt_actor, dual, metrics = improve(ts, shared.iteration, batch, recent, length, step_key)
+        excess = recent - limit(cfg, names)
+        context = Context(shared.iteration, cfg, step_key, axis_name, recent, excess, length)
+        actor, opt_actor, dual, metrics = improve(ts, batch, context)
         critics, opt_critics, skipped = {}, (), 0
         if cfg.trunk == "separate":
             passes = metrics["train/passes"] if stops_critics(cfg) else cfg.critic_epochs
