@@ -237,7 +237,7 @@ def off_policy(env: Env, learner: Learner, axis_name: str | None = None) -> Algo
         rounds = jnp.arange(sizes.rounds), jax.random.split(rounds_key, sizes.rounds)
         cycle, (steps, metrics, ready, skipped) = jax.lax.scan(one_round, cycle, rounds)
 
-        steps = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), steps)
+        steps = jax.tree.map(lambda x: x.reshape(cfg.horizon, *x.shape[2:]), steps)
         length = mean_length(ts.episode_length, steps.ended, steps.length, axis_name)
         length = jnp.where(jnp.isfinite(length), length, ts.episode_length)
         nonfinite = metrics.pop("train/nonfinite").sum() + skipped.sum()
@@ -343,7 +343,7 @@ def usable(found: Transitions, axis_name: str | None) -> tuple[Transitions, jax.
     """`found` with weights whose sum is 1, and 0 for transitions that are not finite, which are
     replaced by zeros; and how many of those there are, over all devices."""
     floats = [x for x in jax.tree.leaves(found) if jnp.issubdtype(x.dtype, jnp.floating)]
-    finite = jnp.isfinite(sum(x.reshape(len(x), -1).sum(1) for x in floats))
+    finite = jnp.isfinite(sum(x.sum(tuple(range(1, x.ndim))) for x in floats))
 
     def keep(x: jax.Array) -> jax.Array:
         return jnp.where(finite.reshape(-1, *(1,) * (x.ndim - 1)), x, jnp.zeros_like(x))

@@ -21,9 +21,8 @@ from typing import NamedTuple
 import flax.struct
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from jaxsafe.types import PyTree
+from jaxsafe.types import Count, PyTree
 
 
 @flax.struct.dataclass
@@ -83,8 +82,6 @@ class Transitions(NamedTuple):
     weight: jax.Array
 
 
-Whole = jax.Array | np.int32 | int  # a whole number, known or traced
-
 # (ring, span, index) -> the observations there, pytree [B, ...]
 Look = Callable[[Row, Span, Index], PyTree]
 
@@ -99,7 +96,7 @@ def empty_ring(row: Row, rows: int) -> Row:
     return jax.tree.map(lambda x: jnp.zeros((rows, *x.shape), x.dtype), row)
 
 
-def held(rows: int, block: int, written: Whole, iteration: Whole, since: Whole) -> Span:
+def held(rows: int, block: int, written: Count, iteration: Count, since: Count) -> Span:
     """What a ring of `rows` rows holds in the course of an iteration.
 
     Args:
