@@ -7,19 +7,14 @@ from typing import Any
 
 import jax.numpy as jnp
 import pytest
+import shell
 from toys import Clock, Corridor
 
-from jaxsafe import algos, envs
+from jaxsafe import envs
 from jaxsafe.config import ConfigError
 from jaxsafe.envs.check import check_env
 from jaxsafe.envs.safety_gym.suite import ROBOTS, TASKS
-from jaxsafe.run import command, viewing
-
-MAINS = {
-    "train": command.train_main,
-    "evaluate": command.evaluate_main,
-    "render": viewing.render_main,
-}
+from jaxsafe.run.arguments import compose
 
 
 @pytest.fixture(autouse=True)
@@ -136,7 +131,7 @@ def test_a_member_that_is_missing_or_odd_is_one_line():
 MINE = """
 from pathlib import Path
 from toys import Corridor
-from jaxsafe.envs.suite import ROBOTS, TASKS
+from jaxsafe.envs.safety_gym.suite import ROBOTS, TASKS
 
 Path("imported").touch()
 maze1 = TASKS["goal1"] | ROBOTS["point"]
@@ -155,12 +150,7 @@ def call(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
 
     def call(script: str, *args: str) -> tuple[int | str | None, str, str]:
-        monkeypatch.setattr(sys, "argv", [f"{script}.py", *args])
-        try:
-            status = MAINS[script](envs, algos)
-        except SystemExit as stop:
-            status = stop.code
-        return status, *capsys.readouterr()
+        return shell.typed(script, *args), *capsys.readouterr()
 
     return call
 
@@ -220,5 +210,5 @@ def test_a_fault_inside_the_module_is_its_own(call, tmp_path):
 
 
 def test_the_folder_of_its_runs_has_a_name_for_every_system(call):
-    settings = command.compose(["env=mine:maze1", "algo=cpo"], envs, algos)
+    settings = compose(["env=mine:maze1", "algo=cpo"])
     assert settings.env_name == "mine:maze1" and settings.label == "mine.maze1-cpo"
