@@ -26,6 +26,7 @@ from jaxsafe.types import PyTree
 
 KEEP = 2  # the newest ones that stay
 REPLAY = "replay"  # the part of a train state that may be left out
+SMALL_REPLAY = 2e9  # bytes up to which it is kept, unless the user says otherwise
 
 
 class CheckpointError(RuntimeError):
@@ -90,6 +91,11 @@ def in_replay(name: str) -> bool:
 def replay_bytes(like: PyTree) -> int:
     """What the replay of a train state takes, 0 without one; `like` is arrays or their shapes."""
     return sum(x.size * x.dtype.itemsize for name, x in as_data(like).items() if in_replay(name))
+
+
+def keeps_replay(like: PyTree, wanted: bool | None) -> bool:
+    """Whether checkpoints hold the replay of such a train state, by the setting `checkpoint_replay`."""
+    return replay_bytes(like) <= SMALL_REPLAY if wanted is None else wanted
 
 
 def save(
