@@ -24,7 +24,7 @@ import numpy as np
 
 from jaxsafe import algos, envs
 from jaxsafe.config import ConfigError
-from jaxsafe.learn.rollout import collect, init_rollout
+from jaxsafe.learn.rollout import collect, init_rollout, memoryless
 from jaxsafe.run import run_folder
 from jaxsafe.run.devices import check_devices, device_name, use_compilation_cache
 from jaxsafe.run.settings import TrainConfig
@@ -55,7 +55,7 @@ def stepping(env, num_envs: int, seeds: int, horizon: int):
     def run(state):
         rollout, key = state
         key, next_key = jax.random.split(key)
-        rollout, trajectory = collect(env, policy, rollout, key, horizon)
+        rollout, trajectory = collect(env, memoryless(policy), rollout, key, horizon)
         return (rollout, next_key), trajectory.reward.sum() + trajectory.obs.sum()
 
     def init(key):
