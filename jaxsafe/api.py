@@ -220,7 +220,7 @@ def train(env: str | Env | None = None, algo: Any = None, **options: Any) -> Run
         env: a name, default 'point_goal1'; an environment from `make`; or any `Env` of yours
             (jaxsafe.types), which is recorded under the name of its class.
         algo: a name, default 'ppo_lag'; or one of yours: an object with `config`, a class under
-            `jaxsafe.config.config`, and `make(env, axis_name=None)`, such as `jaxsafe.algos.Entry`,
+            `jaxsafe.config.config`, and `make(env, axis_name=None)`, such as `jaxsafe.algos.Row`,
             which is recorded under the name of that class.
         options: settings of the run as on the command line (`total_steps` of each seed, `num_envs`,
             `num_seeds`, `seed`, `devices`, `preset`, `compat`, `run_dir`, `resume`, `init_from`,
@@ -442,7 +442,7 @@ def choose_algo(algo: Any) -> tuple[Any, list[str], dict[str, str]]:
     if algo is None:
         return algos, [], {}
     names, own = [], {}
-    for one in algo if type(algo) in (list, tuple) else [algo]:  # an Entry is a tuple too
+    for one in algo if type(algo) in (list, tuple) else [algo]:  # a Row is a tuple too
         if isinstance(one, str):
             names.append(one)
             continue
@@ -453,7 +453,7 @@ def choose_algo(algo: Any) -> tuple[Any, list[str], dict[str, str]]:
                 f"algo: expected a name or an object with a config class and make, not {one!r}"
             )
         name = kind.__name__.removesuffix("Config")
-        own[name] = algos.Entry(kind, make_algo, "", {})
+        own[name] = algos.Row(kind, make_algo)
         names.append(name)
     known = SimpleNamespace(ALGOS={**algos.ALGOS, **own}) if own else algos
     whose = {"algo": ", ".join(own)} if own else {}

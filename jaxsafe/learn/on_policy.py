@@ -10,7 +10,7 @@ import dataclasses
 import operator
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import flax.struct
 import jax
@@ -20,6 +20,7 @@ from jaxsafe.config import ConfigError, config
 from jaxsafe.learn.augment import Augmentation, nothing
 from jaxsafe.learn.batch import all_finite, batch_mean, centre, masked_mean, psum, select, standardise
 from jaxsafe.learn.constraints import Names, check_names, each, limit, signal, spread, unnamed
+from jaxsafe.learn.conventions import Convention
 from jaxsafe.learn.normalise import init_normaliser, merge, normalise
 from jaxsafe.learn.returns import Estimator, Window, advantages, empty_window, mean_length, window_mean
 from jaxsafe.learn.rollout import RolloutState, Trajectory, collect, init_rollout
@@ -34,6 +35,15 @@ from jaxsafe.types import Env, Metrics, PyTree
 @config
 class OnPolicyConfig:
     """What the on-policy algorithms share. [O] OmniSafe's default, [S] safety-starter-agents'."""
+
+    CONVENTIONS: ClassVar = (
+        Convention(
+            {"cost_window": 5},
+            "J_c is the mean of the last 100 episodes, those of 5 iterations (of 50 in release 0.5.0 "
+            "and in the published figures)",
+            "of the last iteration",
+        ),
+    )
 
     num_envs: int = 512  # per device; with horizon 20,480 steps a batch, near the 20,000 of [O]
     horizon: int = 40  # steps of each environment per iteration; shorter ones learn less from a step

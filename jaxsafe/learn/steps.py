@@ -6,14 +6,15 @@ passes alone. OmniSafe alternates them on each minibatch and stops all three tog
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 
-from jaxsafe.config import ConfigError
+from jaxsafe.config import ConfigError, config
 from jaxsafe.learn.batch import batch_mean, pmean, select
+from jaxsafe.learn.conventions import Convention
 from jaxsafe.nn.gaussian import Gaussian, kl
 from jaxsafe.nn.networks import outputs, policy, stack, value
 from jaxsafe.types import Metrics, PyTree
@@ -34,6 +35,25 @@ class Step(NamedTuple):
 
     init: Callable[[PyTree, Any], PyTree]
     update: Callable[..., tuple[PyTree, PyTree, Metrics]]
+
+
+@config
+class AdamConfig:
+    """For algorithms whose policy moves by epochs of Adam."""
+
+    CONVENTIONS: ClassVar = (
+        Convention(
+            {"critics_stop": True},
+            "where the KL stops the policy's passes over a batch, the critics' passes stop too",
+            "critics make all their passes",
+        ),
+    )
+
+    lr: float = 3e-4  # of the policy; OmniSafe, safety-starter-agents
+    lr_decay: bool = False  # of lr, linearly to 0 at total_iterations; OmniSafe: True
+    epochs: int = 10  # passes over each batch; with 8 minibatches the 80 steps of safety-starter-agents
+    target_kl: float = 0.02  # nats, checked after each pass; OmniSafe
+    critics_stop: bool = False  # the critics have no more passes than the policy had; OmniSafe
 
 
 class AdamState(NamedTuple):
@@ -215,4 +235,4 @@ def fit_critic(
 
 def stops_critics(cfg: Any) -> bool:
     """Whether the critics stop with a policy that Adam moves; other policies have no passes."""
-    return getattr(cfg, "critics_stop", False)
+    return isinstance(cfg, AdamConfig) and cfg.critics_stop

@@ -130,6 +130,14 @@ pid = Treatment(
 )
 
 
+@config
+class BarrierConfig:
+    """For `barrier`."""
+
+    barrier: float = 0.01  # 1 / t of the paper; OmniSafe
+    price_max: float = 1.0  # standard deviations of A_r per unit of cost; OmniSafe
+
+
 def barrier_price(dual: jax.Array, episode_cost: jax.Array, cfg: Any) -> jax.Array:
     """The slope of the barrier -barrier log(cost_limit - J_c), or price_max where there is none."""
     slack = cfg.cost_limit - episode_cost
@@ -146,12 +154,28 @@ barrier = Treatment(
     metrics=lambda price: {"train/lam": price},
 )
 
+
+@config
+class PenaltyConfig:
+    """For `penalty`."""
+
+    price: float = 0.5  # standard deviations of A_r per unit of cost; ours, published by nobody
+
+
 penalty = Treatment(
     init=lambda cfg: jnp.asarray(cfg.price, jnp.float32),
     update=lambda price, episode_cost, cfg: price,
     advantage=lambda price, adv_r, adv_c: adv_r - price * adv_c,
     metrics=lambda price: {"train/lam": price},
 )
+
+
+@config
+class SwitchConfig:
+    """For `switch`."""
+
+    tolerance: float = 2.0  # cost per episode; OmniSafe
+
 
 # Xu, Liang and Lan (2021), "CRPO: A New Approach for Safe Reinforcement Learning with Convergence
 # Guarantee", arXiv:2011.05869, algorithm 1

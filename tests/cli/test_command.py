@@ -20,6 +20,7 @@ from tasks import FAST
 
 from jaxsafe import algos, envs
 from jaxsafe.config import ConfigError
+from jaxsafe.learn.conventions import conventions
 from jaxsafe.run import checkpoint, command, compat, run_folder, runner, viewing
 
 SCRIPTS = Path(__file__).parent.parent.parent / "scripts"
@@ -178,12 +179,11 @@ def test_the_conventions_of_omnisafe_are_defaults_of_either_preset():
         assert settings.plain()["compat"] == "omnisafe"
 
 
-def test_each_convention_is_of_some_algorithm_and_differs_from_its_defaults():
-    for convention in compat.OMNISAFE:
-        takers = [e.config for e in algos.ALGOS.values() if convention.applies(e.config)]
-        assert takers
-        for config in takers:
-            assert all(getattr(config(), k) != v for k, v in convention.options.items())
+def test_each_convention_differs_from_the_defaults_of_every_algorithm_that_has_it():
+    for row in algos.ALGOS.values():
+        assert compat.overrides("omnisafe", row.config)
+        for convention in conventions(row.config):
+            assert all(getattr(row.config(), k) != v for k, v in convention.options.items())
 
 
 def test_a_run_folder_holds_what_a_reader_needs(finished):

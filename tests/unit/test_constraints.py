@@ -14,8 +14,7 @@ from toys import Clock, Corridor
 
 from jaxsafe import algos, envs
 from jaxsafe.algos import ALGOS, cpo, pcpo
-from jaxsafe.algos.cppo_pid import CPPOPIDConfig
-from jaxsafe.algos.ppo_lag import PPOLagConfig
+from jaxsafe.algos.ppo import CPPOPIDConfig, PPOLagConfig
 from jaxsafe.config import ConfigError
 from jaxsafe.learn.constraints import spread
 from jaxsafe.learn.halfspaces import furthest_point, nearest_point
