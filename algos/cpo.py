@@ -14,13 +14,13 @@ from jaxsafe.learn.batch import all_finite, pmean
 from jaxsafe.learn.constraints import LimitsConfig, limit, named
 from jaxsafe.learn.conventions import Convention
 from jaxsafe.learn.halfspaces import dot, furthest_point
-from jaxsafe.learn.on_policy import Algorithm, on_policy_pair
+from jaxsafe.learn.on_policy import on_policy_pair
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.steps import Objective, Step, own_trunk
 from jaxsafe.learn.surrogates import plain
 from jaxsafe.learn.trust_region import conjugate_gradient, distance, fisher_product, line_search
 from jaxsafe.nn.networks import policy
-from jaxsafe.types import Env, Metrics, PyTree
+from jaxsafe.types import Algorithm, Env, Metrics, PyTree
 
 
 @config

@@ -9,14 +9,14 @@ import jax.numpy as jnp
 from jaxsafe.algos import pg, ppo
 from jaxsafe.config import config
 from jaxsafe.learn.constraints import each, named
-from jaxsafe.learn.on_policy import Algorithm, Batch, TrainState, loop
+from jaxsafe.learn.on_policy import Batch, TrainState, loop
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.steps import AdamState, adam_epochs
 from jaxsafe.learn.surrogates import clipped, plain, with_entropy
 from jaxsafe.learn.treatments import LagrangianConfig, lagrangian
 from jaxsafe.nn.gaussian import kl
 from jaxsafe.nn.networks import policy
-from jaxsafe.types import Env, Metrics, PyTree
+from jaxsafe.types import Algorithm, Env, Metrics, PyTree
 
 
 @config
@@ -51,13 +51,20 @@ def projection(
 
 
 def make(env: Env, axis_name: str | None = None) -> Algorithm:
-    def improve(ts: TrainState, batch: Batch, cost: jax.Array, length: jax.Array, key: jax.Array):
+    def improve(
+        ts: TrainState,
+        iteration: jax.Array,
+        batch: Batch,
+        cost: jax.Array,
+        length: jax.Array,
+        key: jax.Array,
+    ):
         cfg = ts.config
         dual = lagrangian.update(ts.dual, cost, cfg)
         keys = jax.random.split(key)
 
         def earn(actor: PyTree, batch: Batch) -> tuple[jax.Array, Metrics]:
-            earned = with_entropy(clipped, ts.iteration)
+            earned = with_entropy(clipped, iteration)
             return earned(policy(actor, batch.obs, cfg), batch, batch.adv_r, cfg)
 
         actor, opt_state, metrics = adam_epochs.update(

@@ -5,12 +5,12 @@ from typing import ClassVar
 from jaxsafe.algos import pg
 from jaxsafe.config import config
 from jaxsafe.learn.conventions import Convention
-from jaxsafe.learn.on_policy import Algorithm, on_policy
+from jaxsafe.learn.on_policy import on_policy
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.steps import adam_epochs
 from jaxsafe.learn.surrogates import near_old
 from jaxsafe.learn.treatments import LagrangianConfig, lagrangian
-from jaxsafe.types import Env
+from jaxsafe.types import Algorithm, Env
 
 
 @config

@@ -4,12 +4,12 @@ from functools import partial
 from typing import Any
 
 from jaxsafe.config import config
-from jaxsafe.learn.on_policy import OMNISAFE, Algorithm, OnPolicyConfig, on_policy
+from jaxsafe.learn.on_policy import OMNISAFE, OnPolicyConfig, on_policy
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.surrogates import plain
 from jaxsafe.learn.treatments import LagrangianConfig, Treatment, lagrangian, none
 from jaxsafe.learn.trust_region import NaturalConfig, natural_gradient
-from jaxsafe.types import Env
+from jaxsafe.types import Algorithm, Env
 
 
 @config

@@ -9,12 +9,12 @@ from jaxsafe.algos import pg, ppo
 from jaxsafe.config import config
 from jaxsafe.learn.batch import pmean
 from jaxsafe.learn.conventions import Convention
-from jaxsafe.learn.on_policy import Algorithm, on_policy_pair
+from jaxsafe.learn.on_policy import on_policy_pair
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.steps import Objective, Step, adam_epochs
 from jaxsafe.learn.surrogates import clipped, pessimistic, plain
 from jaxsafe.nn.gaussian import Gaussian
-from jaxsafe.types import Env, Metrics, PyTree
+from jaxsafe.types import Algorithm, Env, Metrics, PyTree
 
 
 @config

@@ -10,10 +10,10 @@ from jaxsafe.config import config
 from jaxsafe.learn.constraints import named
 from jaxsafe.learn.conventions import Convention
 from jaxsafe.learn.halfspaces import dot, nearest_point
-from jaxsafe.learn.on_policy import Algorithm, on_policy_pair
+from jaxsafe.learn.on_policy import on_policy_pair
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.surrogates import plain
-from jaxsafe.types import Env
+from jaxsafe.types import Algorithm, Env
 
 
 @config

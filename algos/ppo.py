@@ -18,7 +18,7 @@ from jaxsafe.learn.augment import (
     schedule,
     simmer,
 )
-from jaxsafe.learn.on_policy import Algorithm, on_policy
+from jaxsafe.learn.on_policy import on_policy
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.steps import adam_epochs
 from jaxsafe.learn.surrogates import clipped
@@ -34,7 +34,7 @@ from jaxsafe.learn.treatments import (
     penalty,
     pid,
 )
-from jaxsafe.types import Env
+from jaxsafe.types import Algorithm, Env
 
 
 @config

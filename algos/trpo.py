@@ -18,7 +18,7 @@ from jaxsafe.learn.augment import (
     schedule,
     simmer,
 )
-from jaxsafe.learn.on_policy import Algorithm, OnPolicyConfig, on_policy
+from jaxsafe.learn.on_policy import OnPolicyConfig, on_policy
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.surrogates import plain
 from jaxsafe.learn.treatments import (
@@ -32,7 +32,7 @@ from jaxsafe.learn.treatments import (
     switch,
 )
 from jaxsafe.learn.trust_region import TrustRegionConfig, trust_region
-from jaxsafe.types import Env
+from jaxsafe.types import Algorithm, Env
 
 
 @config

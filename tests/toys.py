@@ -1,11 +1,20 @@
-"""Environments small enough to know the answers of."""
+"""Environments small enough to know the answers of, and updates outside a training loop."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from jaxsafe.types import State
+from jaxsafe.types import Algorithm, Shared, State
+
+FIRST = Shared(np.int32(0))
+
+
+def updated(algo: Algorithm) -> Callable:
+    """ts -> (ts, metrics), for what does not depend on the iteration."""
+    return lambda ts: algo.update(ts, FIRST)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import dataclasses
 import operator
 from collections.abc import Callable
 from functools import partial
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal
 
 import flax.struct
 import jax
@@ -29,7 +29,7 @@ from jaxsafe.learn.surrogates import Surrogate, with_entropy
 from jaxsafe.learn.treatments import Treatment
 from jaxsafe.nn.gaussian import Gaussian, entropy, log_prob, sample
 from jaxsafe.nn.networks import init_params, policy, share_trunk, stack, stack_critics, values
-from jaxsafe.types import Env, Metrics, PyTree
+from jaxsafe.types import Algorithm, Clocks, Env, Metrics, Policy, PyTree, Shared
 
 
 @config
@@ -90,7 +90,7 @@ OMNISAFE: dict[str, Any] = {
 
 @flax.struct.dataclass
 class TrainState:
-    """All that an update needs. Environment steps so far: iteration * num_envs * horizon.
+    """All that an update needs besides `Shared`. Environment steps: iteration * num_envs * horizon.
 
     config: the algorithm's, with its floats as arrays.
     params: {'actor', 'critic_r', 'critic_c'}; of several constraints critic_c is stacked, [K, ...].
@@ -114,7 +114,16 @@ class TrainState:
     episode_length: jax.Array
     past_costs: Window
     key: jax.Array
-    iteration: jax.Array
+
+
+@flax.struct.dataclass
+class Learned:
+    """What acts: `config`, `params`, `dual` and `normaliser` of a train state."""
+
+    config: Any
+    params: dict[str, PyTree]
+    dual: PyTree
+    normaliser: PyTree
 
 
 @flax.struct.dataclass
@@ -137,16 +146,6 @@ class Batch:
     ret_c: jax.Array
 
 
-class Algorithm(NamedTuple):
-    """init(key, cfg) -> ts; update(ts) -> (ts, metrics); act(ts, obs [..., O], key) -> action,
-    sampled, or the mean where key is None; task(ts) -> the Env whose observations `act` takes."""
-
-    init: Callable[[jax.Array, Any], TrainState]
-    update: Callable[[TrainState], tuple[TrainState, Metrics]]
-    act: Callable[[TrainState, jax.Array, jax.Array | None], jax.Array]
-    task: Callable[[TrainState], Env]
-
-
 def on_policy(
     env: Env,
     treatment: Treatment,
@@ -157,13 +156,20 @@ def on_policy(
 ) -> Algorithm:
     """Algorithms with one objective: the surrogate of the advantage that the treatment mixes."""
 
-    def improve(ts: TrainState, batch: Batch, cost: jax.Array, length: jax.Array, key: jax.Array):
+    def improve(
+        ts: TrainState,
+        iteration: jax.Array,
+        batch: Batch,
+        cost: jax.Array,
+        length: jax.Array,
+        key: jax.Array,
+    ):
         cfg = ts.config
         dual = treatment.update(ts.dual, cost, cfg)
 
         def objective(actor: PyTree, batch: Batch) -> tuple[jax.Array, Metrics]:
             advantage = treatment.advantage(dual, batch.adv_r, batch.adv_c)
-            earned = with_entropy(surrogate, ts.iteration)
+            earned = with_entropy(surrogate, iteration)
             return earned(policy(actor, batch.obs, cfg), batch, advantage, cfg)
 
         actor, opt_state, metrics = step.update(
@@ -190,11 +196,18 @@ def on_policy_pair(
     objective_c is in cost per step, the unit of excess / length. For K costs `named(cfg)` both are [K].
     """
 
-    def improve(ts: TrainState, batch: Batch, cost: jax.Array, length: jax.Array, key: jax.Array):
+    def improve(
+        ts: TrainState,
+        iteration: jax.Array,
+        batch: Batch,
+        cost: jax.Array,
+        length: jax.Array,
+        key: jax.Array,
+    ):
         cfg = ts.config
 
         def objective_r(actor: PyTree, batch: Batch) -> tuple[jax.Array, Metrics]:
-            earned = with_entropy(surrogate, ts.iteration)
+            earned = with_entropy(surrogate, iteration)
             return earned(policy(actor, batch.obs, cfg), batch, batch.adv_r, cfg)
 
         def objective_c(actor: PyTree, batch: Batch) -> tuple[jax.Array, Metrics]:
@@ -239,10 +252,10 @@ def loop(
     augmentation: Augmentation = nothing,
     named: Callable[[Any], Names] = unnamed,
 ) -> Algorithm:
-    """The loop around `improve(ts, batch, episode_cost, episode_length, key)`, which returns
+    """The loop around `improve(ts, iteration, batch, episode_cost, episode_length, key)`, which returns
     (actor, opt_state, dual, metrics). episode_cost is of `cost` or, [K], of the costs `named(cfg)`."""
 
-    def init(key: jax.Array, cfg: Any) -> TrainState:
+    def init(key: jax.Array, cfg: Any, shared: Shared) -> TrainState:
         check(cfg)
         cfg = jax.tree.map(jnp.float32, cfg)
         params_key, rollout_key, key = jax.random.split(key, 3)
@@ -269,13 +282,12 @@ def loop(
             episode_length=jnp.float32(env.episode_length),
             past_costs=empty_window(cfg.cost_window, jnp.shape(limit(cfg, named(cfg)))),
             key=key,
-            iteration=jnp.int32(0),
         )
 
-    def task(ts: TrainState) -> Env:
-        return augmentation.wrap(env, ts.config, ts.dual)
+    def task(learned: Learned | TrainState) -> Env:
+        return augmentation.wrap(env, learned.config, learned.dual)
 
-    def update(ts: TrainState) -> tuple[TrainState, Metrics]:
+    def update(ts: TrainState, shared: Shared) -> tuple[TrainState, Metrics]:
         cfg = ts.config
         key, rollout_key, step_key, critic_key = jax.random.split(ts.key, 4)
 
@@ -303,7 +315,7 @@ def loop(
         episode_cost = batch_mean(charged, axis_name, (0, 1)) * length
         recent, past_costs = window_mean(ts.past_costs, episode_cost)
 
-        actor, opt_actor, dual, metrics = improve(ts, batch, recent, length, step_key)
+        actor, opt_actor, dual, metrics = improve(ts, shared.iteration, batch, recent, length, step_key)
         critics, opt_critics, skipped = {}, (), 0
         if cfg.trunk == "separate":
             passes = metrics["train/passes"] if stops_critics(cfg) else cfg.critic_epochs
@@ -340,15 +352,25 @@ def loop(
             episode_length=length,
             past_costs=past_costs,
             key=key,
-            iteration=ts.iteration + 1,
         )
         return ts, jax.tree.map(jnp.float32, metrics)
 
-    def act(ts: TrainState, obs: jax.Array, key: jax.Array | None) -> jax.Array:
-        dist = policy(ts.params["actor"], see(ts, obs), ts.config)
-        return dist.mean if key is None else sample(dist, key)
+    def act(
+        learned: Learned, carry: PyTree, obs: jax.Array, key: jax.Array | None
+    ) -> tuple[jax.Array, PyTree, dict[str, Any]]:
+        dist = policy(learned.params["actor"], see(learned, obs), learned.config)
+        return (dist.mean if key is None else sample(dist, key)), carry, {}
 
-    return Algorithm(init, update, act, task)
+    acting = Policy(init=lambda learned: (), act=act)
+    return Algorithm(init, update, acting, learned_of, task, clocks)
+
+
+def learned_of(ts: TrainState) -> Learned:
+    return Learned(ts.config, ts.params, ts.dual, ts.normaliser)
+
+
+def clocks(cfg: Any) -> Clocks:
+    return Clocks(cfg.num_envs * cfg.horizon, cfg.critic_epochs * cfg.minibatches)
 
 
 def fit_critics(
@@ -376,7 +398,7 @@ def own(key: jax.Array, axis_name: str | None) -> jax.Array:
     return key if axis_name is None else jax.random.fold_in(key, jax.lax.axis_index(axis_name))
 
 
-def see(ts: TrainState, obs: jax.Array) -> jax.Array:
+def see(ts: TrainState | Learned, obs: jax.Array) -> jax.Array:
     """`obs` [..., O] as the networks see it: what an augmentation appended is left as it is."""
     if not ts.config.obs_normalize:
         return obs

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
-from jaxsafe.learn.on_policy import Algorithm
+from jaxsafe.types import Algorithm
 
 NOTHING: Mapping[str, Any] = MappingProxyType({})
 
