@@ -71,11 +71,13 @@ class CPOConfig(LimitsConfig, trpo.TRPOConfig):
         ),
     )
 
-    line_search_tries: int = 20  # OmniSafe
-    per_step: bool = True  # the violation v in cost per step, as b is; OmniSafe: per episode
-    violation_gain: float = 5.0  # times v, which a step is asked to take back
-    margin_lr: float = 0.05  # safety-starter-agents, who leave it off; 0: no margin
-    margin_max: float = 2.0  # times the most that a step can promise
+    line_search_tries: int = 20  # Steps that the line search tries at most, as in OmniSafe.
+    # Whether the violation v is in cost per step, as b is. OmniSafe's is per episode.
+    per_step: bool = True
+    violation_gain: float = 5.0  # A step is asked to take back this many times v.
+    # How fast the margin grows with v, as in safety-starter-agents, where it is off. 0: no margin.
+    margin_lr: float = 0.05
+    margin_max: float = 2.0  # Bound of the margin, as a multiple of the most that a step can promise.
 
 
 RECOVER, RETURN, BOUNDED, FREE = range(4)  # cases of the dual

@@ -36,8 +36,9 @@ class CUPConfig(LagrangianConfig, ppo.PPOConfig):
     On a shared trunk both steps train the values, too.
     """
 
-    target_kl: float = 0.01  # nats, of each step; OmniSafe
-    lam_max: float = 2.0  # OmniSafe
+    # Passes of each of the two steps stop when the KL is above this (nats), as in OmniSafe.
+    target_kl: float = 0.01
+    lam_max: float = 2.0  # The highest price, as in OmniSafe.
 
 
 def projection(

@@ -37,10 +37,14 @@ class FOCOPSConfig(LagrangianConfig, pg.PGConfig):
         ),
     )
 
-    temperature: float = 1.5  # lambda of the paper; OmniSafe
-    near_kl: float = 0.02  # eta, nats; OmniSafe
-    per_state: bool = True  # each state's KL gates its own gain; OmniSafe: the mean gain, by the share
-    lam_max: float = 2.0  # nu_max of the paper; OmniSafe
+    # Advantages are divided by it (lambda of the paper), as in OmniSafe: higher keeps closer to the
+    # old policy.
+    temperature: float = 1.5
+    near_kl: float = 0.02  # eta: states whose KL is above this (nats) do not count, as in OmniSafe.
+    # Whether the KL of a state gates its own gain. In OmniSafe the share of near states multiplies
+    # the mean gain.
+    per_state: bool = True
+    lam_max: float = 2.0  # The highest price, nu_max of the paper, as in OmniSafe.
 
 
 def make(env: Env, axis_name: str | None = None) -> Algorithm:

@@ -40,9 +40,12 @@ class P3OConfig(ppo.PPOConfig):
         ),
     )
 
-    kappa: float = 20.0  # reward advantages, of standard deviation 1, per unit of cost; OmniSafe
-    per_step: bool = True  # the violation c in cost per step; OmniSafe: per episode
-    clip_cost: bool = True  # max(w A_c, clip(w) A_c); OmniSafe: w A_c
+    # Price of a unit of cost beyond the limit, in standard deviations of A_r, as in OmniSafe.
+    kappa: float = 20.0
+    # Whether the violation c is in cost per step. OmniSafe's is per episode.
+    per_step: bool = True
+    # Whether the cost's surrogate is max(w A_c, clip(w) A_c). OmniSafe's is w A_c.
+    clip_cost: bool = True
 
 
 def update(

@@ -40,9 +40,12 @@ class PCPOConfig(cpo.CPOConfig):
         ),
     )
 
-    line_search_tries: int = 200  # OmniSafe
-    natural: bool = True  # the reward's step is along H^-1 g; OmniSafe: along g
-    margin_max: float = 5.0  # more than CPO's, for the reward's step is taken first, whatever c is
+    line_search_tries: int = 200  # Steps that the line search tries at most, as in OmniSafe.
+    # Whether the reward's step is along H^-1 g. OmniSafe's is along g.
+    natural: bool = True
+    # Bound of the margin, as a multiple of the most that a step can promise. It is larger than CPO's,
+    # because the reward's step is taken first, whatever c is.
+    margin_max: float = 5.0
 
 
 def projection(p: cpo.Problem, cfg: Any) -> cpo.Direction:

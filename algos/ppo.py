@@ -49,7 +49,7 @@ class PPOConfig(pg.PGConfig):
     trained for its metrics alone.
     """
 
-    clip: float = 0.2  # eps; the paper
+    clip: float = 0.2  # eps: ratios count as if they were at most this far from 1, as in the paper.
 
 
 @config

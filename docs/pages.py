@@ -146,8 +146,6 @@ The code: [algos/{module}.py](../../algos/{module}.py).
 
 ## Settings
 
-[O] is OmniSafe's default, [S] that of safety-starter-agents.
-
 {settings(row.config)}
 
 {published(row)}

@@ -49,11 +49,15 @@ class AdamConfig:
         ),
     )
 
-    lr: float = 3e-4  # of the policy; OmniSafe, safety-starter-agents
-    lr_decay: bool = False  # of lr, linearly to 0 at total_iterations; OmniSafe: True
-    epochs: int = 10  # passes over each batch; with 8 minibatches the 80 steps of safety-starter-agents
-    target_kl: float = 0.02  # nats, checked after each pass; OmniSafe
-    critics_stop: bool = False  # the critics have no more passes than the policy had; OmniSafe
+    lr: float = 3e-4  # Adam's step of the policy, as in OmniSafe and safety-starter-agents.
+    # Whether lr falls on a line to 0 at `total_iterations`. OmniSafe's does.
+    lr_decay: bool = False
+    # Passes of the policy over a batch. With 8 minibatches they are the 80 steps of
+    # safety-starter-agents.
+    epochs: int = 10
+    target_kl: float = 0.02  # Passes stop when KL(old || new) is above this (nats), as in OmniSafe.
+    # Whether the critics stop when the policy does. OmniSafe's do.
+    critics_stop: bool = False
 
 
 class AdamState(NamedTuple):

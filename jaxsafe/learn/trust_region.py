@@ -34,18 +34,23 @@ class NaturalConfig:
         ),
     )
 
-    target_kl: float = 0.02  # delta, nats; OmniSafe's 0.01 is of a mean over (2) action dimensions
-    kl_per_action: bool = False  # the KL is a mean over action dimensions; OmniSafe
-    damping: float = 0.1  # added to the Fisher matrix; OmniSafe, safety-starter-agents
-    cg_iterations: int = 15  # OmniSafe
+    # delta, the KL of a step (nats). OmniSafe's 0.01 is a mean over the action's dimensions, of which
+    # Point and Car have 2.
+    target_kl: float = 0.02
+    # Whether the KL is a mean over the action's dimensions, not their sum. OmniSafe's is.
+    kl_per_action: bool = False
+    # Added to the diagonal of the Fisher matrix, as in OmniSafe and safety-starter-agents.
+    damping: float = 0.1
+    cg_iterations: int = 15  # Iterations of conjugate gradients, as in OmniSafe.
 
 
 @config
 class TrustRegionConfig(NaturalConfig):
     """For those that search the largest safe step along them."""
 
-    line_search_tries: int = 15  # OmniSafe
-    line_search_shrink: float = 0.8  # OmniSafe, safety-starter-agents
+    line_search_tries: int = 15  # Steps that the line search tries at most, as in OmniSafe.
+    # Each step tried is this much of the one before, as in OmniSafe and safety-starter-agents.
+    line_search_shrink: float = 0.8
 
 
 def fisher_product(

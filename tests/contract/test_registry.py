@@ -132,6 +132,14 @@ def test_a_name_that_is_not_registered_is_refused_and_never_imported(name, messa
 
 
 @pytest.mark.parametrize("name", sorted(algos.ALGOS))
+def test_every_default_is_explained_in_a_sentence(name):
+    for line in importlib.import_module("pages").settings(algos.ALGOS[name].config).splitlines()[2:]:
+        note = line.rstrip(" |").rpartition("` | ")[2]
+        assert note[:1].isupper() or note[:1].islower() or note[:1] == "_", line
+        assert note.endswith(".") and " " in note, line
+
+
+@pytest.mark.parametrize("name", sorted(algos.ALGOS))
 def test_every_page_begins_with_a_title_an_equation_and_a_source(name):
     text = algos.ALGOS[name].config.__doc__ or ""
     title, equation = text.partition("\n\n")[::2]
