@@ -4,7 +4,7 @@
 import importlib
 import pkgutil
 
-from jaxsafe.config import ConfigError, named_object, nearest
+from jaxsafe.config import ConfigError, named_object
 from jaxsafe.learn.row import Row
 
 
@@ -48,20 +48,4 @@ def load(address: str) -> None:
     register(address, named_object("algo", address))
 
 
-def find(name: str) -> Row:
-    """The row of an algorithm.
-
-    Raises:
-        ConfigError: there is no such algorithm; the message has the nearest name.
-    """
-    if name in ALGOS:
-        return ALGOS[name]
-    if ":" in name:
-        raise ConfigError(
-            f"{name} is code, which is not imported because a file names it; if you trust it, add "
-            f"algo={name}"
-        )
-    raise ConfigError(f"unknown algo {name!r}{nearest(name, ALGOS)}")
-
-
-__all__ = ["ALGOS", "Row", "find", "load", "register"]
+__all__ = ["ALGOS", "Row", "load", "register"]

@@ -39,7 +39,7 @@ def algorithms() -> str:
 
 def omnisafe_algorithms() -> str:
     lines = ["| OmniSafe | here |", "|---|---|"]
-    names = migrate.algorithms(algos).items()
+    names = migrate.algorithms().items()
     return "\n".join(lines + [f"| `{theirs}` | `{ours}` |" for theirs, ours in names])
 
 

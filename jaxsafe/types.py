@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 PyTree = Any
+Count = jax.Array | np.int32 | int  # a whole number, traced or not
 Metrics = dict[str, jax.Array]
 
 
@@ -84,8 +85,8 @@ class Shared(NamedTuple):
     data: pytree, a data set.
     """
 
-    iteration: jax.Array | np.int32
-    since: jax.Array | np.int32 = np.int32(0)
+    iteration: Count
+    since: Count = np.int32(0)
     data: PyTree = ()
 
 

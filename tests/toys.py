@@ -2,11 +2,13 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsafe.learn.steps import Context
 from jaxsafe.types import Algorithm, Shared, State
 
 FIRST = Shared(np.int32(0))
@@ -15,6 +17,20 @@ FIRST = Shared(np.int32(0))
 def updated(algo: Algorithm) -> Callable:
     """ts -> (ts, metrics), for what does not depend on the iteration."""
     return lambda ts: algo.update(ts, FIRST)
+
+
+def context(
+    cfg: Any,
+    key: jax.Array | None = None,
+    iteration: int = 0,
+    axis_name: str | None = None,
+    excess: Any = 0.0,
+    length: float = 1.0,
+) -> Context:
+    """What a step is told, for tests that take one outside a loop."""
+    key = jax.random.key(1) if key is None else key
+    excess = jnp.asarray(excess, jnp.float32)
+    return Context(iteration, cfg, key, axis_name, excess, excess, jnp.float32(length))
 
 
 @dataclass(frozen=True)
@@ -76,6 +92,32 @@ class Clock:
         return State(
             state.physics, obs, one, 2 * one, jnp.array([0.5, 1.5]), obs[1] >= obs[2], {"ticks": one}
         )
+
+
+@dataclass(frozen=True)
+class Recall:
+    """A sign is shown at the first observation only, and is to be pulled towards at every step.
+
+    Observation [2]: the sign (0 but at the first), and 1. Reward: 1 - |a - sign|, a in [-1, 1]. The
+    best return of an episode of T steps is T. It is 1 for a policy without memory, which earns nothing
+    from the second step on. Cost: 1 where a > 0.
+    """
+
+    obs_size: int = 2
+    action_size: int = 1
+    episode_length: int = 6
+    cost_names: tuple[str, ...] = ("right",)
+
+    def reset(self, key: jax.Array) -> State:
+        sign = jax.random.rademacher(key, (), jnp.float32)
+        obs, zero = jnp.stack([sign, jnp.ones(())]), jnp.zeros(())
+        return State(sign, obs, zero, zero, zero[None], jnp.bool_(False), {})
+
+    def step(self, state: State, action: jax.Array) -> State:
+        sign, a = state.physics, jnp.clip(action[0], -1.0, 1.0)
+        cost = (a > 0).astype(jnp.float32)
+        obs = jnp.array([0.0, 1.0])
+        return State(sign, obs, 1 - jnp.abs(a - sign), cost, cost[None], jnp.bool_(False), {})
 
 
 @dataclass(frozen=True)

@@ -6,11 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from jaxsafe import algos, envs
+from jaxsafe import algos
 from jaxsafe.config import ConfigError
 from jaxsafe.interop import migrate
 from jaxsafe.learn.on_policy import OnPolicyConfig
-from jaxsafe.run import command
+from jaxsafe.run.arguments import compose
+from jaxsafe.run.settings import find_algo
 
 ROOT = Path(__file__).parent.parent.parent
 sys.path.insert(0, str(ROOT / "docs"))
@@ -65,7 +66,7 @@ def halved(tmp_path, monkeypatch):
 
 def test_a_file_with_a_row_is_known_to_whatever_is_made_from_rows(halved):
     texts = [f"algo={halved}", "preset=published", "compat=omnisafe", "algo.clip=0.1"]
-    cfg = command.compose(texts, envs, algos).algo
+    cfg = compose(texts).algo
     assert (cfg.price, cfg.clip, cfg.cost_window, cfg.num_envs) == (0.25, 0.1, 5, 512)
 
     from learners import on_policy_names
@@ -80,7 +81,7 @@ def test_a_file_with_a_row_is_known_to_whatever_is_made_from_rows(halved):
     price = "The price of a unit of cost, in standard deviations of A_r."
     assert f"| `algo.price` | `0.5` | {price} |" in page and "[algos/halved.py]" in page
     assert f"[`{halved}`]({halved}.md)" in pages.algorithms()
-    found = migrate.omnisafe({"algo": "PPOHalved", "env_id": "point_goal1"}, envs, algos)
+    found = migrate.omnisafe({"algo": "PPOHalved", "env_id": "point_goal1"})
     assert f"algo={halved}" in found.argv
 
 
@@ -98,8 +99,8 @@ def test_a_row_of_your_own_is_loaded_by_its_address(tmp_path, monkeypatch):
     monkeypatch.setattr(algos, "ALGOS", {**algos.ALGOS})
     (tmp_path / "mine.py").write_text(f"{HALVED}\nrow, number = ROWS['ppo_halved'], 7\n")
     algos.load("mine:row")
-    assert algos.find("mine:row").summary == "PPO that pays half"
-    assert issubclass(algos.find("mine:row").config, OnPolicyConfig)
+    assert find_algo("mine:row").summary == "PPO that pays half"
+    assert issubclass(find_algo("mine:row").config, OnPolicyConfig)
     sys.modules.pop("mine")
 
 
@@ -128,7 +129,7 @@ def test_an_address_that_names_no_row_is_one_line(address, message, monkeypatch)
 )
 def test_a_name_that_is_not_registered_is_refused_and_never_imported(name, message):
     with pytest.raises(ConfigError, match=message):
-        algos.find(name)
+        find_algo(name)
 
 
 @pytest.mark.parametrize("name", sorted(algos.ALGOS))

@@ -7,10 +7,11 @@ import pytest
 from jax.flatten_util import ravel_pytree
 from scipy.optimize import minimize
 from tasks import FAST
+from toys import context
 
 from jaxsafe.algos.cpo import BOUNDED, FREE, RECOVER, RETURN, CPOConfig, Margin, cpo_step, dual
 from jaxsafe.learn.on_policy import Batch
-from jaxsafe.learn.steps import mean_kl
+from jaxsafe.learn.steps import Pair, mean_kl
 from jaxsafe.learn.surrogates import plain
 from jaxsafe.nn.gaussian import log_prob, sample
 from jaxsafe.nn.networks import init_params, policy
@@ -182,10 +183,9 @@ def moved(cfg, actor, violation, margin, batch, axis_name=None):
     def objective(adv):
         return lambda actor, batch: plain(policy(actor, batch.obs, cfg), batch, adv(batch), cfg)
 
-    pair = objective(lambda batch: batch.adv_r), objective(lambda batch: batch.adv_c)
-    excess, length = LENGTH * violation, jnp.float32(LENGTH)
-    key = jax.random.key(1)
-    return cpo_step.update(actor, margin, *pair, excess, length, batch, key, cfg, axis_name)
+    pair = Pair(objective(lambda batch: batch.adv_r), objective(lambda batch: batch.adv_c))
+    told = context(cfg, axis_name=axis_name, excess=LENGTH * violation, length=LENGTH)
+    return cpo_step.update(actor, margin, pair, batch, told)
 
 
 one_step = jax.jit(moved, compiler_options=FAST)

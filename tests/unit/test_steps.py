@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from tasks import FAST
+from toys import context
 
 from jaxsafe.algos.ppo import PPOConfig
 from jaxsafe.learn.on_policy import Batch
@@ -36,10 +37,9 @@ def earn(actor, batch, cfg):
     return clipped(policy(actor, batch.obs, cfg), batch, batch.adv_r, cfg)
 
 
-def moved(actor, state, batch, cfg, objective=earn, axis_name=None):
-    key = jax.random.key(1)
-    earned = partial(objective, cfg=cfg)
-    return adam_epochs.update(actor, state, earned, batch, key, cfg, axis_name)
+def moved(actor, state, batch, cfg, objective=earn, iteration=0, axis_name=None):
+    told = context(cfg, iteration=iteration, axis_name=axis_name)
+    return adam_epochs.update(actor, state, partial(objective, cfg=cfg), batch, told)
 
 
 step = jax.jit(moved, static_argnames=("objective", "axis_name"), compiler_options=FAST)
@@ -47,8 +47,8 @@ step = jax.jit(moved, static_argnames=("objective", "axis_name"), compiler_optio
 
 def improve(cfg, objective=earn, iteration=0):
     params, batch = problem()
-    state = adam_epochs.init(params["actor"], cfg)._replace(iteration=jnp.int32(iteration))
-    actor, _, metrics = step(params["actor"], state, batch, cfg, objective)
+    state = adam_epochs.init(params["actor"], cfg)
+    actor, _, metrics = step(params["actor"], state, batch, cfg, objective, iteration)
     return params["actor"], actor, metrics
 
 
