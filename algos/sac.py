@@ -1,19 +1,4 @@
-"""SAC: soft actor-critic, blind to cost.
-
-    y = r + discount (1 - terminated) (min_i Q'_i(s', a') - alpha log pi(a' | s')),   a' ~ pi(s')
-    minimise_Q      E[sum_i (Q_i(s, a) - y)^2]
-    maximise_pi     E[min_i Q_i(s, a) - alpha log pi(a | s)],                         a ~ pi(s)
-    minimise_alpha  -log alpha E[log pi(a | s) + H],        H = target_entropy * action size
-    Q' <- Q' + tau (Q - Q')
-
-in this order at each gradient step; i = 1, 2. With `n_step` n, r is the discounted sum of up to n
-rewards and s' the state after them.
-
-Source: Haarnoja et al. (2018), "Soft Actor-Critic Algorithms and Applications", arXiv:1812.05905,
-algorithm 1; the loss of the temperature is that of the authors' code.
-Differs from it: the defaults are for a thousand environments (few, large gradient steps; targets that
-follow faster; layer norm in the critics; normalised observations).
-"""
+"""Soft actor-critics."""
 
 from typing import Any
 
@@ -25,6 +10,7 @@ from jaxsafe.config import ConfigError, config
 from jaxsafe.learn.batch import pmean, select
 from jaxsafe.learn.off_policy import Fit, Learner, OffPolicyConfig, Turn, off_policy
 from jaxsafe.learn.replay import Transitions
+from jaxsafe.learn.row import Row
 from jaxsafe.learn.steps import adam
 from jaxsafe.nn.critics import init_critics, init_squashed, q_values, squashed_policy
 from jaxsafe.nn.distributions import squashed_mean, squashed_sample
@@ -33,6 +19,23 @@ from jaxsafe.types import Algorithm, Env, Metrics, PyTree
 
 @config
 class SACConfig(OffPolicyConfig):
+    """SAC: soft actor-critic, blind to cost.
+
+        y = r + discount (1 - terminated) (min_i Q'_i(s', a') - alpha log pi(a' | s')),   a' ~ pi(s')
+        minimise_Q      E[sum_i (Q_i(s, a) - y)^2]
+        maximise_pi     E[min_i Q_i(s, a) - alpha log pi(a | s)],                         a ~ pi(s)
+        minimise_alpha  -log alpha E[log pi(a | s) + H],        H = target_entropy * action size
+        Q' <- Q' + tau (Q - Q')
+
+    in this order at each gradient step; i = 1, 2. With `n_step` n, r is the discounted sum of up to n
+    rewards and s' the state after them.
+
+    Source: Haarnoja et al. (2018), "Soft Actor-Critic Algorithms and Applications", arXiv:1812.05905,
+    algorithm 1; the loss of the temperature is that of the authors' code.
+    Differs from it: the defaults are for a thousand environments. They take few, large gradient steps,
+    the targets follow faster, the critics have layer norm, and observations are normalised.
+    """
+
     alpha_init: float = 1.0  # the temperature at first; the paper's code
     alpha_lr: float = 3e-4  # of log alpha, by Adam; 0 keeps alpha as it is
     target_entropy: float = -1.0  # nats for each dimension of the action; the paper
@@ -146,3 +149,14 @@ def learner(action_size: int) -> Learner:
 
 def make(env: Env, axis_name: str | None = None) -> Algorithm:
     return off_policy(env, learner(env.action_size), axis_name)
+
+
+ROWS = {
+    "sac": Row(
+        SACConfig,
+        make,
+        "soft actor-critic: off-policy, no constraint",
+        PUBLISHED,
+        holds="nothing",
+    ),
+}
