@@ -51,9 +51,7 @@ class OffPolicyConfig:
     obs_normalize: bool = True  # by running mean and variance; [O] False
     discount: float = 0.99  # [O]
     cost_discount: float = 0.99  # [O]
-    cost_limit: float = (
-        25.0  # undiscounted cost of an episode [O]; unconstrained algorithms only draw it
-    )
+    cost_limit: float = 25.0  # undiscounted cost per episode [O]; without constraint only drawn
     tau: float = 0.05  # share of the critics that their targets take on at a step; [O] 0.005
     lr: float = 3e-4  # of the policy, by Adam [O]
     critic_lr: float = 3e-4  # of the critics, by Adam [O]
