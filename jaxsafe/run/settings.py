@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from jaxsafe import algos, envs
-from jaxsafe.algos import Entry as Row
+from jaxsafe.algos import Row
 from jaxsafe.config import ConfigError, flat, from_dict, is_float, nearest
 from jaxsafe.learn.constraints import check_names, own_limits
 from jaxsafe.run import distributed, run_folder
