@@ -1,4 +1,4 @@
-"""Soft actor-critics."""
+"""Soft actor-critic, for a thousand environments or for one."""
 
 from typing import Any
 
@@ -32,37 +32,17 @@ class SACConfig(OffPolicyConfig):
 
     Source: Haarnoja et al. (2018), "Soft Actor-Critic Algorithms and Applications", arXiv:1812.05905,
     algorithm 1; the loss of the temperature is that of the authors' code.
-    Differs from it: the defaults are for a thousand environments. They take few, large gradient steps,
-    the targets follow faster, the critics have layer norm, and observations are normalised.
+    Differs from it: the defaults are for a thousand environments. Gradient steps are few and large, the
+    targets follow faster, the critics have layer norm, and observations are normalised.
     """
 
-    alpha_init: float = 1.0  # the temperature at first; the paper's code
-    alpha_lr: float = 3e-4  # of log alpha, by Adam; 0 keeps alpha as it is
-    target_entropy: float = -1.0  # nats for each dimension of the action; the paper
-    policy_delay: int = 1  # gradient steps of the critics for each of policy, alpha and targets
-
-
-# OmniSafe @15603dd, configs/off-policy/SAC.yaml: of the velocity tasks first. Its gradient step comes
-# after every environment step, as here; an update of 50 of them is ours and changes no result.
-OMNISAFE: dict[str, Any] = {
-    "num_envs": 1,
-    "horizon": 50,
-    "stagger": False,
-    "replay_ratio": 256,
-    "batch_size": 256,
-    "tau": 0.005,
-    "layer_norm": False,
-    "obs_normalize": False,
-    "alpha_init": 0.2,
-    "alpha_lr": 0.0,
-    "policy_delay": 2,
-}
-PUBLISHED: dict[str, dict[str, Any]] = {
-    "omnisafe": OMNISAFE,
-    "omnisafe_navigation": OMNISAFE | {"alpha_init": 1e-5, "lr": 5e-6, "critic_lr": 1e-3},
-    # the published replay ratio with 64 environments: 4 gradient steps for each of their steps
-    "parallel": {"num_envs": 64, "replay_ratio": 256, "batch_size": 4096, "tau": 0.005},
-}
+    alpha_init: float = 1.0  # The temperature at first, as in the authors' code.
+    # The learning rate of log alpha, by Adam, as in the authors' code. With 0, alpha stays as it is.
+    alpha_lr: float = 3e-4
+    # The entropy that alpha aims at, in nats for each dimension of the action, as in the paper.
+    target_entropy: float = -1.0
+    # Gradient steps of the critics for each one of policy, alpha and targets. The paper has 1.
+    policy_delay: int = 1
 
 
 def init(key: jax.Array, obs_size: int, action_size: int, cfg: Any) -> Fit:
@@ -151,12 +131,41 @@ def make(env: Env, axis_name: str | None = None) -> Algorithm:
     return off_policy(env, learner(env.action_size), axis_name)
 
 
+# OmniSafe @15603dd, configs/off-policy/SAC.yaml: of the velocity tasks first. Its gradient step comes
+# after every environment step, as here; an update of 50 of them is ours and changes no result.
+OMNISAFE: dict[str, Any] = {
+    "num_envs": 1,
+    "horizon": 50,
+    "stagger": False,
+    "replay_ratio": 256,
+    "batch_size": 256,
+    "tau": 0.005,
+    "layer_norm": False,
+    "obs_normalize": False,
+    "alpha_init": 0.2,
+    "alpha_lr": 0.0,
+    "policy_delay": 2,
+}
+PUBLISHED: dict[str, dict[str, Any]] = {
+    "omnisafe": OMNISAFE,
+    "omnisafe_navigation": OMNISAFE | {"alpha_init": 1e-5, "lr": 5e-6, "critic_lr": 1e-3},
+    # the published replay ratio with 64 environments: 4 gradient steps for each of their steps
+    "parallel": {"num_envs": 64, "replay_ratio": 256, "batch_size": 4096, "tau": 0.005},
+}
+# for a problem of two levers
+LEVER: dict[str, Any] = {
+    "num_envs": 32, "horizon": 8, "learn_every": 2, "batch_size": 256, "replay_size": 20_000,
+    "learning_starts": 256, "hidden": (32,), "discount": 0.9, "lr": 3e-3, "critic_lr": 3e-3,
+    "alpha_init": 0.1, "alpha_lr": 3e-3, "target_entropy": -2.0,
+}  # fmt: skip
+
 ROWS = {
     "sac": Row(
         SACConfig,
         make,
-        "soft actor-critic: off-policy, no constraint",
+        "soft actor-critic, no constraint",
         PUBLISHED,
         holds="nothing",
-    ),
+        lever=LEVER,
+    )
 }

@@ -97,12 +97,13 @@ def settings(config: type) -> str:
 def published(row: Row) -> str:
     """What `preset=published` and `compat=omnisafe` change."""
     lines = []
-    for origin, options in row.published.items():
+    for i, (origin, options) in enumerate(row.published.items()):
         changed = ", ".join(f"`{name}={value}`" for name, value in options.items())
-        lines.append(f"`preset=published` ({origin}): {changed}.")
-    conventions = compat.overrides("omnisafe", row.config)
-    changed = ", ".join(f"`{name}={value}`" for name, value in conventions.items())
-    lines.append(f"`compat=omnisafe` ([why](../howto/migrate.md#conventions)): {changed}.")
+        preset = f"`preset={origin}`" if i else f"`preset=published` ({origin})"
+        lines.append(f"{preset}: {changed}.")
+    if conventions := compat.overrides("omnisafe", row.config):
+        changed = ", ".join(f"`{name}={value}`" for name, value in conventions.items())
+        lines.append(f"`compat=omnisafe` ([why](../howto/migrate.md#conventions)): {changed}.")
     return "\n\n".join(lines)
 
 

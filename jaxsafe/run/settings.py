@@ -281,7 +281,8 @@ def algo_options(row: Row, preset: str = "fast", compat: str = "none") -> dict[s
 def presets(row: Row) -> dict[str, Mapping[str, Any]]:
     """Overrides by name: 'fast' has none, 'published' is the first of the published settings."""
     first = next(iter(row.published.values()), None)
-    return {"fast": {}, **({} if first is None else {"published": first}), **row.published}
+    named = {} if first is None else {"published": first}
+    return {name: dict(options) for name, options in ({"fast": {}} | named | {**row.published}).items()}
 
 
 def make_env(settings: Settings) -> Env:
