@@ -4,12 +4,12 @@ Each table stands between <!-- table: NAME --> and <!-- end -->; a test holds th
 """
 
 import functools
-from collections.abc import Mapping
 from pathlib import Path
 
 from jaxsafe.algos import ALGOS
 from jaxsafe.envs import ENVS, SafetyGym, make
 from jaxsafe.interop.migrate import ALGORITHMS, OMNISAFE
+from jaxsafe.report.tables import between_marks
 from jaxsafe.run import compat
 
 HERE = Path(__file__).parent
@@ -72,21 +72,9 @@ TABLES = {
 }
 
 
-def replaced(text: str, written: Mapping[str, str], mark: str = "table") -> str:
-    """`text` with what stands between the marks of these tables."""
-    for name, table in written.items():
-        begin, end = f"<!-- {mark}: {name} -->\n", "<!-- end -->"
-        before, begun, rest = text.partition(begin)
-        _, ended, after = rest.partition(end)
-        if not (begun and ended):
-            raise ValueError(f"no {begin.strip()} with {end} after it")
-        text = before + begin + table + "\n" + end + after
-    return text
-
-
 def filled(path: Path) -> str:
     """The file's text with its tables made anew."""
-    return replaced(path.read_text(), {name: table() for name, table in TABLES[path].items()})
+    return between_marks(path.read_text(), {name: table() for name, table in TABLES[path].items()})
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ ROOMS = (
     {"jaxsafe.envs", "jaxsafe.algos"},
     {"jaxsafe.run", "jaxsafe.report"},
     {"jaxsafe.interop"},
+    {"jaxsafe.commands"},
     {"jaxsafe.api"},
 )
 LEVEL = {room: level for level, rooms in enumerate(ROOMS) for room in rooms}
