@@ -271,6 +271,18 @@ def attempts() -> str:
     return "\n".join(lines)
 
 
+def devices() -> str:
+    """The same training on one, two and four GPUs."""
+    lines = ["| GPUs | environments of a seed | estimated return | estimated cost | seconds |"]
+    lines.append("|---:|---:|---:|---:|---:|")
+    for run in compare.read([RESULTS / "devices"], envs, algos):
+        found = (stats.estimate(run.values[f"{k} estimate"]) for k in ("return", "cost"))
+        shape = f"{run.config['devices']} | {run.config['algo.num_envs']:,}"
+        seconds = 60 * run.values["minutes"].max()
+        lines.append(f"| {shape} | {' | '.join(cell(x, '.1f') for x in found)} | {seconds:.1f} |")
+    return "\n".join(lines)
+
+
 def pages() -> dict[Path, str]:
     """The text of every page with tables of measurements, by its path."""
     runs = compare.read([RESULTS / name for name in TABLE], envs, algos)
@@ -291,6 +303,7 @@ def pages() -> dict[Path, str]:
             "slow gains": gains(["pcpo"], ["car_button2", "point_goal2"], (9e6, 1.01e7)),
         },
         RESULTS / "first_attempts" / "README.md": {"attempts": attempts()},
+        RESULTS / "devices" / "README.md": {"devices": devices()},
         HERE / "benchmark.md": {"speeds": algorithm_speeds()},
         HERE / "performance.md": {"throughput": throughput_table(), "engine jax": engine_jax()},
         HERE.parent / "README.md": {"results": studies.matrix(groups, PUBLISHED)},

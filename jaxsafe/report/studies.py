@@ -41,6 +41,7 @@ from jaxsafe.run import run_folder
 
 SPAN = 20  # iterations over which costs are averaged before their swing is taken
 CHUNK = 8  # settings in one figure of curves
+MOST = 24  # settings whose points can be told apart in one figure
 PAGE = """# {title}
 
 {about}
@@ -182,11 +183,14 @@ def more_figures(
 ) -> dict[str, np.ndarray]:
     """What final.csv has of each seed beside `compare.measured`, [S] by name.
 
+    - Return and cost as the learner estimates them, which needs no whole episode, over the last 10%.
     - Of each window (begin, end]: means of return and cost, and how far the cost swings.
     - Of algorithms that linearise the cost: what a step promises to take off it, a step, and which
       share of that comes true: the slope of the change of the violation on the sum of the promises,
       from one span of `SPAN` iterations to the next.
     """
+    estimates = [k for k in ("return_estimate", "cost_estimate") if f"train/{k}" in table]
+    late = {k.replace("_", " "): run_folder.last_tenth(dict(table), f"train/{k}") for k in estimates}
     found: dict[str, list[float]] = {}
     for seed in np.unique(table["seed"]):
         own = {name: x[table["seed"] == seed] for name, x in table.items()}
@@ -203,7 +207,7 @@ def more_figures(
             slope = np.polyfit(promise.sum(1)[:-1], np.diff(violation.mean(1)), 1)[0]
             found.setdefault("promised", []).append(-own["train/objective_c"].mean())
             found.setdefault("kept", []).append(slope)
-    return {name: np.array(values) for name, values in found.items()}
+    return late | {name: np.array(values) for name, values in found.items()}
 
 
 def spans(values: np.ndarray) -> np.ndarray:
@@ -283,7 +287,7 @@ def page(study: Study) -> tuple[str, list[Picture]]:
     runs = compare.read([study.folder], envs, algos)
     groups = in_order(runs)
     known = compare.read_published(study.published) if study.published else {}
-    pictures = pictures_of(study, groups, known)
+    pictures = pictures_of(study, groups, known) if "<!-- measured: figures -->" in text else []
     shown = [
         f"![{x.caption}]({Path('..') / x.path.relative_to(study.folder.parent)})" for x in pictures
     ]
@@ -299,7 +303,9 @@ def page(study: Study) -> tuple[str, list[Picture]]:
 def in_order(runs: Sequence[Run]) -> list[Group]:
     """The groups of each setting and task, in the order of the runs, the order of their worth."""
     by = [name for name in compare.telling(runs) if name != "total_steps"]
-    by += ["devices"] * (len({run.config["devices"] for run in runs}) > 1)
+    for name in ("compat", "devices"):
+        if name not in by and len({run.config[name] for run in runs}) > 1:
+            by.append(name)
     return compare.group(runs, by)
 
 
@@ -310,7 +316,7 @@ def pictures_of(
     images, name = study.folder.parent / "images", study.folder.name
     settings = list(dict.fromkeys(g.name for g in groups))
     found = []
-    if len(settings) > 1:
+    if 1 < len(settings) <= MOST:
         beside = {(g.env, g.name): compare.beside(g, known) for g in groups}
         hollow = "; hollow diamonds are published means" if any(beside.values()) else ""
         title = "last 10 % of training"
@@ -326,7 +332,7 @@ def pictures_of(
 
 
 def save_small(figure: Figure, path: Path) -> None:
-    """Write a PNG of 256 colours, which is less than half as large."""
+    """Write a PNG of 256 colours, which is a third as large."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=80)
     picture = Image.open(buffer).convert("RGB")
