@@ -12,9 +12,10 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from jaxsafe import algos, envs
-from jaxsafe.report import compare, plots, stats, studies
-from jaxsafe.report.compare import Run
+from jaxsafe.report import plots, stats, studies
+from jaxsafe.report.group import Group, group, ordered
+from jaxsafe.report.published import beside, read_published
+from jaxsafe.report.read import Run, read
 from jaxsafe.report.tables import between_marks, cell
 
 HERE = Path(__file__).parent
@@ -23,7 +24,7 @@ STUDIES = sorted(RESULTS.glob("*/study.yaml"))
 TABLE = ("goal", "button", "push")  # the studies that together are the table of results
 EXTRA = ("crpo", "ipo", "pdo", "ppo_penalty")  # trained on two tasks alone, so in no table of ten
 # OmniSafe: evaluated policies. We know of no constrained table of Push.
-PUBLISHED = compare.read_published(RESULTS / "published.csv")
+PUBLISHED = read_published(RESULTS / "published.csv")
 SWEEP = "jaxsafe, and dynamics"  # `solver` of the rows that are compared with each other
 # Why cells lie outside the published spread, by algorithm, or of one task alone.
 FIRST = "first-order learners earn less there (see below)"
@@ -79,14 +80,14 @@ def beyond(value: float, spread: tuple[float, float]) -> float:
     return float(np.sign(value - mean) * max(0.0, abs(value - mean) - width))
 
 
-def outside(groups: Sequence[compare.Group]) -> str:
+def outside(groups: Sequence[Group]) -> str:
     """The cells whose mean lies outside the published spread, the published training curve, and why."""
     with (RESULTS / "published_curves.csv").open() as file:
         curves = {(r["env"], r["algo"]): (r["return"], r["cost"]) for r in csv.DictReader(file)}
     lines, within, count = ["| run | return | cost | ours | their curve | why |"], 0, 0
     lines.append("|---|---:|---:|---:|---:|---|")
     for g in sorted(groups, key=lambda g: (g.name, g.env)):
-        if theirs := compare.beside(g, PUBLISHED):
+        if theirs := beside(g, PUBLISHED):
             off = beyond(g.ret.mean, theirs.ret), beyond(g.cost.mean, theirs.cost)
             count, within = count + 1, within + (not any(off))
             if any(off):
@@ -101,10 +102,10 @@ def outside(groups: Sequence[compare.Group]) -> str:
     return "\n".join([summary, "", *lines])
 
 
-def held(groups: Sequence[compare.Group]) -> str:
+def held(groups: Sequence[Group]) -> str:
     """How many constrained cells cost at most 1.2 times the limit, ours in training and published."""
     free = {"pg", "npg", "trpo", "ppo"}
-    cells = [(g, compare.beside(g, PUBLISHED)) for g in groups if g.name not in free]
+    cells = [(g, beside(g, PUBLISHED)) for g in groups if g.name not in free]
     kept = [theirs for g, theirs in cells if g.cost.mean <= 30]
     costs = [theirs.cost[0] for _, theirs in cells if theirs]
     return (
@@ -114,7 +115,7 @@ def held(groups: Sequence[compare.Group]) -> str:
     )
 
 
-def conventions(ours: Sequence[compare.Group], theirs: Sequence[compare.Group]) -> str:
+def conventions(ours: Sequence[Group], theirs: Sequence[Group]) -> str:
     """Return and cost of the same runs without and with `compat=omnisafe`, and OmniSafe's."""
     usual = {(g.env, g.name): g for g in ours}
     lines = ["| | `compat=none` | `compat=omnisafe` | OmniSafe |", "|---|---:|---:|---:|"]
@@ -224,7 +225,7 @@ def gains(algorithms: Sequence[str], tasks: Sequence[str], window: tuple[float, 
     """
     names = [f"algo.{name}" for name in ("violation_gain", "margin_lr", "margin_max")]
     settings: dict[tuple, dict[str, Run]] = {}
-    for run in compare.read([RESULTS / "margin"], envs, algos):
+    for run in read([RESULTS / "margin"]):
         algo = run.config["algo.name"]
         known = np.isfinite(run.values.get(f"return {studies.window_name(*window)}", np.nan)).all()
         if algo in algorithms and run.env in tasks and known:
@@ -259,7 +260,7 @@ def kept(runs: Sequence[Run]) -> str:
 def attempts() -> str:
     """What was tried on point_goal1 before the defaults of today, over whole trainings."""
     lines = ["| run | environments x steps | seeds | return | cost |", "|---|---|---:|---:|---:|"]
-    for run in compare.read([RESULTS / "first_attempts"], envs, algos):
+    for run in read([RESULTS / "first_attempts"]):
         whole = run.steps >= run.config["total_steps"] and run.env == "point_goal1"
         if whole and run.config["algo.name"] != "trpo_pid":
             names = {"cpo": ("margin_lr", "target_kl"), "ppo_lag": ("dual_lr",)}
@@ -275,7 +276,7 @@ def devices() -> str:
     """The same training on one, two and four GPUs."""
     lines = ["| GPUs | environments of a seed | estimated return | estimated cost | seconds |"]
     lines.append("|---:|---:|---:|---:|---:|")
-    for run in compare.read([RESULTS / "devices"], envs, algos):
+    for run in read([RESULTS / "devices"]):
         found = (stats.estimate(run.values[f"{k} estimate"]) for k in ("return", "cost"))
         shape = f"{run.config['devices']} | {run.config['algo.num_envs']:,}"
         seconds = 60 * run.values["minutes"].max()
@@ -285,17 +286,17 @@ def devices() -> str:
 
 def pages() -> dict[Path, str]:
     """The text of every page with tables of measurements, by its path."""
-    runs = compare.read([RESULTS / name for name in TABLE], envs, algos)
+    runs = read([RESULTS / name for name in TABLE])
     runs = [run for run in runs if run.config["algo.name"] not in EXTRA]
-    groups = compare.ordered(compare.group(runs, ["algo.name"]))
-    theirs = compare.read([RESULTS / "omnisafe"], envs, algos)
+    groups = ordered(group(runs, ["algo.name"]))
+    theirs = read([RESULTS / "omnisafe"])
     theirs = [run for run in theirs if run.config["compat"] == "omnisafe"]
     margin = ["car_goal2", "point_button1", "point_goal2"]
     written = {
         RESULTS / "README.md": {"matrix": studies.matrix(groups, {})},
         RESULTS / "published.md": {"outside": outside(groups), "held": held(groups)},
         RESULTS / "omnisafe" / "README.md": {
-            "conventions": conventions(groups, compare.group(theirs, ["algo.name"]))
+            "conventions": conventions(groups, group(theirs, ["algo.name"]))
         },
         RESULTS / "margin" / "README.md": {
             "kept": kept(runs),
@@ -318,11 +319,11 @@ def main() -> None:
     throughput(HERE / "images" / "throughput.png")
     for path in STUDIES:
         studies.write_page(studies.read(path.parent))
-    runs = compare.read([RESULTS / name for name in TABLE], envs, algos)
-    groups = compare.ordered(compare.group(runs, ["algo.name"]))
+    runs = read([RESULTS / name for name in TABLE])
+    groups = ordered(group(runs, ["algo.name"]))
     groups = [g for g in groups if g.name not in EXTRA]
-    beside = {(g.env, g.name): compare.beside(g, PUBLISHED) for g in groups}
-    picture = plots.trade_off(groups, "last 10 % of training", beside)
+    published = {(g.env, g.name): beside(g, PUBLISHED) for g in groups}
+    picture = plots.trade_off(groups, "last 10 % of training", published)
     studies.save_small(picture, RESULTS / "images" / "trade_off.png")
     for path, text in pages().items():
         path.write_text(text)

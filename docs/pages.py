@@ -16,12 +16,12 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from jaxsafe import algos, envs
 from jaxsafe.algos import ALGOS, Entry
 from jaxsafe.envs import ENVS
-from jaxsafe.report import compare, stats, studies
+from jaxsafe.report import stats, studies
 from jaxsafe.report import tables as report
-from jaxsafe.report.compare import Run
+from jaxsafe.report.published import read_published
+from jaxsafe.report.read import Run, read
 from jaxsafe.run import compat
 
 HERE = Path(__file__).parent
@@ -64,12 +64,21 @@ def prose(docstring: str) -> tuple[str, str]:
     return title, "\n\n".join(blocks)
 
 
+# A field of a config, with its comment above, beside or within the parentheses of its default.
+FIELD = re.compile(
+    r"^(?:    # (?P<above>.*)\n)?"
+    r"    (?P<name>\w+): (?:.*?  # (?P<beside>.*)|.* = \(\n        .*  # (?P<within>.*)\n    \)|.*)$",
+    re.M,
+)
+
+
 def settings(config: type) -> str:
-    """A row a field: its default, and the comment beside it in the class that defines it."""
-    comments = {}
+    """A row a field: its default, and its comment in the class that defines it."""
+    comments: dict[str, str] = {}
     for cls in reversed(config.__mro__[:-1]):
-        for name, comment in re.findall(r"^    (\w+): .*?(?:  # (.*))?$", inspect.getsource(cls), re.M):
-            comments[name] = comment or comments.get(name, "")
+        for found in FIELD.finditer(inspect.getsource(cls)):
+            comment = found["beside"] or found["within"] or found["above"] or ""
+            comments[found["name"]] = comment or comments.get(found["name"], "")
     rows = ["| setting | default | |", "|---|---|---|"]
     for field in dataclasses.fields(config):
         note = comments[field.name].replace("|", "\\|")
@@ -98,13 +107,13 @@ def trained() -> list[Run]:
         return run.env, compat if compat != "none" else preset if preset != "fast" else ""
 
     folders = [HERE / "results" / name for name in ("goal", "button", "push", "omnisafe")]
-    return sorted(compare.read(folders, envs, algos), key=place)
+    return sorted(read(folders), key=place)
 
 
 def measured(name: str) -> str:
     """The runs of this algorithm in docs/results."""
     rows = []
-    known = compare.read_published(HERE / "results" / "published.csv")
+    known = read_published(HERE / "results" / "published.csv")
     for run in trained():
         if run.config["algo.name"] != name:
             continue

@@ -1,1 +1,1 @@
-"""What is typed in a shell: a module a command."""
+"""The commands: a module each. scripts/ calls them."""

@@ -25,11 +25,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 import jaxsafe
-from jaxsafe import algos, envs
+from jaxsafe.commands.guard import guarded
 from jaxsafe.config import ConfigError, nearest
-from jaxsafe.report import compare, condensed, studies
+from jaxsafe.report import condensed, studies
+from jaxsafe.report.read import read_one
 from jaxsafe.report.studies import Study
-from jaxsafe.run import command, run_folder
+from jaxsafe.run import run_folder
+from jaxsafe.run.arguments import fail
+from jaxsafe.run.settings import load
 
 ROOT = Path(jaxsafe.__file__).parent.parent
 STOPPED = (130, -signal.SIGINT)
@@ -132,8 +135,9 @@ def work(study: Study, args: argparse.Namespace, train: Callable[[list[str], Pla
     for run in asked:
         todo.put(run)
     for word in " ".join([*study.options, *study.runs]).split():
-        if word.startswith("env="):  # the user's own are imported here, too, to read what came out
-            command.load_own(word.removeprefix("env="), envs)
+        kind, _, name = word.partition("=")
+        if kind in ("env", "algo"):  # the user's own are imported here, too, to read what came out
+            load(kind, name)
     end = time.monotonic() + 60 * args.minutes
     failed: list[str] = []
     unfinished: list[str] = []
@@ -155,7 +159,7 @@ def work(study: Study, args: argparse.Namespace, train: Callable[[list[str], Pla
             return
         with one_at_a_time:
             began = (folder / "metrics.csv").exists()
-            for trained in compare.read_one(folder, envs, algos) if began else []:
+            for trained in read_one(folder) if began else []:
                 studies.add(study, run, trained, studies.origin_of(folder), failed=status != 0)
         failed.extend([name] * (status != 0))
         result = f"failed, see {log_of(folder)}" if status else "done"
@@ -192,7 +196,7 @@ def main(train: Callable[[list[str], Place], int] = train) -> int:
         parser = argparse.ArgumentParser(
             description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
         )
-        parser.error = command.fail  # type: ignore[method-assign]
+        parser.error = fail  # type: ignore[method-assign]
         parser.add_argument("study", metavar="NAME", help="in docs/results, or a folder")
         parser.add_argument("--list", action="store_true", help="say what is done, and train nothing")
         parser.add_argument("--page", action="store_true", help="draw the page, and train nothing")
@@ -215,4 +219,4 @@ def main(train: Callable[[list[str], Place], int] = train) -> int:
             return 0
         return work(study, args, train)
 
-    return command.guarded(study_command)
+    return guarded(study_command)

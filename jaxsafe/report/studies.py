@@ -6,7 +6,7 @@
     STUDY/README.md     a page made from the other three
 
 A run of a study is one training command with all its seeds. `add` condenses its run folder, and
-`write_page` draws the page. `jaxsafe.report.compare` reads a study wherever it reads a run folder.
+`write_page` draws the page. `jaxsafe.report.read` reads a study wherever it reads a run folder.
 
 study.yaml has these keys; the first four are needed:
 
@@ -32,11 +32,13 @@ import yaml
 from matplotlib.figure import Figure
 from PIL import Image
 
-from jaxsafe import algos, envs
 from jaxsafe.config import ConfigError
-from jaxsafe.report import compare, condensed, plots, scores, stats, tables
-from jaxsafe.report.compare import Group, Published, Run
+from jaxsafe.report import condensed, plots, scores, stats, tables
 from jaxsafe.report.condensed import CURVES, POINTS, Origin
+from jaxsafe.report.group import Group, group, tasks_of, telling
+from jaxsafe.report.published import Published, beside, read_published
+from jaxsafe.report.read import Run, defaults
+from jaxsafe.report.read import read as read_runs
 from jaxsafe.run import run_folder
 
 SPAN = 20  # iterations over which costs are averaged before their swing is taken
@@ -181,7 +183,7 @@ def points(trained: Run) -> list[np.ndarray]:
 def more_figures(
     table: Mapping[str, np.ndarray], windows: Iterable[tuple[float, float]]
 ) -> dict[str, np.ndarray]:
-    """What final.csv has of each seed beside `compare.measured`, [S] by name.
+    """What final.csv has of each seed beside `measured`, [S] by name.
 
     - Return and cost as the learner estimates them, which needs no whole episode, over the last 10%.
     - Of each window (begin, end]: means of return and cost, and how far the cost swings.
@@ -223,7 +225,7 @@ def unusual(config: Mapping[str, Any]) -> dict[str, Any]:
     """The options of a flat config that differ from today's defaults of its preset and conventions."""
     preset, compat = config["preset"], config.get("compat", "none")
     chosen = {k: v for k, v in (("preset", preset), ("compat", compat)) if v not in ("fast", "none")}
-    usual = compare.defaults(config["env.name"], config["algo.name"], envs, algos, preset, compat)
+    usual = defaults(config["env.name"], config["algo.name"], preset, compat)
     chosen |= {"devices": config["devices"]} if config.get("devices", 1) != 1 else {}
     return chosen | {
         name: value
@@ -284,9 +286,9 @@ def page(study: Study) -> tuple[str, list[Picture]]:
     """
     path = study.folder / "README.md"
     text = path.read_text() if path.exists() else PAGE.format(title=study.title, about=study.about)
-    runs = compare.read([study.folder], envs, algos)
+    runs = read_runs([study.folder])
     groups = in_order(runs)
-    known = compare.read_published(study.published) if study.published else {}
+    known = read_published(study.published) if study.published else {}
     pictures = pictures_of(study, groups, known) if "<!-- measured: figures -->" in text else []
     shown = [
         f"![{x.caption}]({Path('..') / x.path.relative_to(study.folder.parent)})" for x in pictures
@@ -302,11 +304,11 @@ def page(study: Study) -> tuple[str, list[Picture]]:
 
 def in_order(runs: Sequence[Run]) -> list[Group]:
     """The groups of each setting and task, in the order of the runs, the order of their worth."""
-    by = [name for name in compare.telling(runs) if name != "total_steps"]
+    by = [name for name in telling(runs) if name != "total_steps"]
     for name in ("compat", "devices"):
         if name not in by and len({run.config[name] for run in runs}) > 1:
             by.append(name)
-    return compare.group(runs, by)
+    return group(runs, by)
 
 
 def pictures_of(
@@ -317,10 +319,10 @@ def pictures_of(
     settings = list(dict.fromkeys(g.name for g in groups))
     found = []
     if 1 < len(settings) <= MOST:
-        beside = {(g.env, g.name): compare.beside(g, known) for g in groups}
-        hollow = "; hollow diamonds are published means" if any(beside.values()) else ""
+        theirs = {(g.env, g.name): beside(g, known) for g in groups}
+        hollow = "; hollow diamonds are published means" if any(theirs.values()) else ""
         title = "last 10 % of training"
-        draw = functools.partial(plots.trade_off, groups, title, beside)
+        draw = functools.partial(plots.trade_off, groups, title, theirs)
         caption = f"Return against cost, a point a setting{hollow}"
         found.append(Picture(images / f"{name}-trade_off.png", caption, draw))
     for i, first in enumerate(range(0, len(settings), CHUNK), 1):
@@ -343,7 +345,7 @@ def save_small(figure: Figure, path: Path) -> None:
 
 def matrix(groups: Sequence[Group], known: Mapping[tuple[str, str], Published]) -> str:
     """Return and cost of each setting on each task, and below them what is published."""
-    tasks = compare.tasks_of(groups)
+    tasks = tasks_of(groups)
     found = {(g.env, g.name): g for g in groups}
     lines = [f"| | {' | '.join(f'`{env}`' for env in tasks)} |", "|---|" + "---:|" * len(tasks)]
     for name in sorted({g.name for g in groups}):
@@ -352,7 +354,7 @@ def matrix(groups: Sequence[Group], known: Mapping[tuple[str, str], Published]) 
             cell = []
             if g := found.get((env, name)):
                 cell.append(f"{g.ret.mean:.1f}, {g.cost.mean:.1f}")
-                if theirs := compare.beside(g, known):
+                if theirs := beside(g, known):
                     cell.append(f"*{theirs.ret[0]:.1f}, {theirs.cost[0]:.1f}*")
             cells.append("<br>".join(cell))
         lines.append(f"| `{name}` | {' | '.join(cells)} |")

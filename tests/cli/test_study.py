@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jaxsafe import algos, envs
 from jaxsafe.commands import study as command
 from jaxsafe.config import ConfigError
-from jaxsafe.report import compare, condensed, plots, studies
+from jaxsafe.report import condensed, plots, studies
+from jaxsafe.report.read import read, read_one
 from jaxsafe.run import run_folder
 
 ROOT = Path(__file__).parent.parent.parent
@@ -69,9 +69,9 @@ def call(monkeypatch, *arguments: Any, train: Any = command.train) -> int:
 
 def test_figures_and_curves_of_a_study_are_those_of_its_runs(toy, tmp_path):
     trained(tmp_path / "run", toy.command(toy.runs[1]))
-    (run,) = compare.read_one(tmp_path / "run", envs, algos)
+    (run,) = read_one(tmp_path / "run")
     studies.add(toy, toy.runs[1], run, studies.origin_of(tmp_path / "run"))
-    (same,) = compare.read([toy.folder], envs, algos)
+    (same,) = read([toy.folder])
     assert same.setting == run.setting and same.limits == run.limits and same.steps == run.steps
     for name, values in run.values.items():
         np.testing.assert_allclose(same.values[name], values, rtol=1e-8, err_msg=name)
@@ -86,7 +86,7 @@ def test_figures_and_curves_of_a_study_are_those_of_its_runs(toy, tmp_path):
 
 def test_a_window_has_means_and_the_swing_of_the_cost_by_hand(toy, tmp_path):
     trained(tmp_path / "run", toy.command(toy.runs[0]))
-    (run,) = compare.read_one(tmp_path / "run", envs, algos)
+    (run,) = read_one(tmp_path / "run")
     found = studies.more_figures(run.table, toy.windows)  # iterations 101 .. 200, five spans of 20
     np.testing.assert_allclose(found["return 1000-2000"], [150.5, 301])
     # costs are 21 .. 39, 0, then 1 .. 20, and so on: means of spans are 28.5 and 10.5 in turn
@@ -112,7 +112,7 @@ def test_what_a_step_promises_and_keeps_is_a_slope_by_hand():
 def test_rows_say_what_a_run_was_made_with_and_how_it_ended(toy, tmp_path):
     for i, (steps, nonfinite) in enumerate([(4000, (0, 1)), (2000, (0, 0))]):
         trained(tmp_path / str(i), toy.command(toy.runs[i]), steps, nonfinite)
-        (run,) = compare.read_one(tmp_path / str(i), envs, algos)
+        (run,) = read_one(tmp_path / str(i))
         studies.add(toy, toy.runs[i], run, studies.origin_of(tmp_path / str(i)))
     rows = condensed.read(toy.folder).rows
     assert [row["state"] for row in rows] == ["done", "diverged", "unfinished", "unfinished"]
@@ -131,7 +131,7 @@ def test_rows_say_what_a_run_was_made_with_and_how_it_ended(toy, tmp_path):
 
 def test_a_study_whose_files_do_not_belong_together_is_refused(toy, tmp_path):
     trained(tmp_path / "run", toy.command(toy.runs[0]))
-    (run,) = compare.read_one(tmp_path / "run", envs, algos)
+    (run,) = read_one(tmp_path / "run")
     studies.add(toy, toy.runs[0], run, condensed.Origin())
     table = toy.folder / "final.csv"
     table.write_text(table.read_text().replace("algo=cpo", "algo=pcpo"))
@@ -186,7 +186,7 @@ def test_an_interrupted_study_continues_with_what_is_left(toy, tmp_path, monkeyp
 
 def test_a_page_keeps_the_words_around_its_tables(toy, tmp_path):
     trained(tmp_path / "run", toy.command(toy.runs[0]))
-    (run,) = compare.read_one(tmp_path / "run", envs, algos)
+    (run,) = read_one(tmp_path / "run")
     studies.add(toy, toy.runs[0], run, condensed.Origin())
     page = toy.folder / "README.md"
     page.write_text("# Mine\n\nbefore\n\n<!-- measured: matrix -->\nold\n<!-- end -->\n\nafter\n")
