@@ -8,6 +8,8 @@ from jaxsafe.config import ConfigError, one_line
 from jaxsafe.envs.view import render
 from jaxsafe.run.policies import Actor
 
+OF_PHYSICS = ("engine", "awake")  # options that leave a task what it is
+
 
 class NoVideo(RuntimeError):
     """Nothing to render with. The message is one line for the user."""
@@ -33,9 +35,6 @@ def film(actors: list[Actor], path: Path, seed: int, labels: list[str] | None = 
     except render.NoDisplay as error:
         raise NoVideo(one_line(error)) from error
     render.write_video(render.side_by_side(films), path, fps=30)
-
-
-OF_PHYSICS = ("engine", "awake")  # options that leave a task what it is
 
 
 def check_one_task(folders: list[Path], actors: list[Actor]) -> None:
