@@ -8,6 +8,7 @@ original is the tables of docs/fidelity.md. A test holds the pages to the code.
 
 import ast
 import dataclasses
+import functools
 import importlib
 import inspect
 import io
@@ -20,14 +21,16 @@ from pathlib import Path
 from typing import Any
 
 from jaxsafe.algos import ALGOS, Row
-from jaxsafe.config import from_dict
 from jaxsafe.envs import ENVS
-from jaxsafe.run import compat, run_folder
-from jaxsafe.run.settings import algo_options
+from jaxsafe.report import stats, studies
+from jaxsafe.report import tables as report
+from jaxsafe.report.published import read_published
+from jaxsafe.report.read import Run, read
+from jaxsafe.run import compat
 
 HERE = Path(__file__).parent
-sys.path[:0] = [str(HERE), str(HERE / "results")]
-results, tables = importlib.import_module("make"), importlib.import_module("tables")
+sys.path.insert(0, str(HERE))
+tables = importlib.import_module("tables")
 TASKS = {  # what a robot is paid for
     "goal": "Reach the goal (green), again and again: after each success it is elsewhere.",
     "button": "Press the marked button (orange cylinder), again and again: each success draws another.",
@@ -107,26 +110,33 @@ def published(row: Row) -> str:
     return "\n\n".join(lines)
 
 
+@functools.cache
+def trained() -> list[Run]:
+    """The runs of the tables of results, by task and then by whose settings they have."""
+
+    def place(run: Run) -> tuple[str, str]:
+        preset, compat = run.config["preset"], run.config["compat"]
+        return run.env, compat if compat != "none" else preset if preset != "fast" else ""
+
+    folders = [HERE / "results" / name for name in ("goal", "button", "push", "omnisafe")]
+    return sorted(read(folders), key=place)
+
+
 def measured(name: str) -> str:
     """The runs of this algorithm in docs/results."""
     rows = []
-    for folder in sorted((HERE / "results").glob(f"*-{name}*/")):
-        env, algo, *_ = folder.name.split("-")
-        if algo != name:
+    known = read_published(HERE / "results" / "published.csv")
+    for run in trained():
+        if run.config["algo.name"] != name:
             continue
-        metrics = run_folder.read_metrics(folder)
-        ret, cost = (results.last_tenth(metrics, f"train/{k}") for k in ("return", "cost"))
-        config = run_folder.read_config(folder)
-        rules = config["env"].get("rules", "safety_gym")
-        which, seeds = config["preset"], len(set(metrics["seed"]))
-        how = f"`{env}`, preset {which}, {seeds} seeds"
-        how += f", `compat={config['compat']}`" if config.get("compat", "none") != "none" else ""
+        ret, cost = (report.cell(stats.estimate(run.values[k]), ".2f") for k in ("return", "cost"))
+        rules, compat = run.config["env.rules"], run.config["compat"]
+        how = f"`{run.env}`, preset {run.config['preset']}, {len(run.seeds)} seeds"
+        how += f", `compat={compat}`" if compat != "none" else ""
         how += f", `env.rules={rules}`" if rules != "safety_gym" else ""
-        options = {k: x for k, x in config["algo"].items() if k != "name"}
-        given = dataclasses.asdict(from_dict(ALGOS[name].config, options, "algo."))
-        usual = algo_options(ALGOS[name], config["preset"], config.get("compat", "none"))
-        how += "".join(f", `algo.{k}={given[k]}`" for k in options if given[k] != usual[k])
-        rows.append(f"| {how} | {ret} | {cost} | {results.published(config)} |")
+        unusual = {k: v for k, v in studies.unusual(run.config).items() if k.startswith("algo.")}
+        how += "".join(f", `{k}={v}`" for k, v in unusual.items())
+        rows.append(f"| {how} | {ret} | {cost} | {studies.published_cell(run.config, known)} |")
     if not rows:
         return "Not run at length yet; it learns the small exact problem of tests/toys.py, Lever."
     head = "| 1e7 steps a seed, limit 25 | return, last 10% | cost | published |\n|---|---|---|---|\n"

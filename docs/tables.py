@@ -4,13 +4,13 @@ Each table stands between <!-- table: NAME --> and <!-- end -->; a test holds th
 """
 
 import functools
-from collections.abc import Mapping
 from pathlib import Path
 
 from jaxsafe import algos
 from jaxsafe.envs import ENVS, SafetyGym, make
 from jaxsafe.interop import migrate
 from jaxsafe.learn.conventions import Convention, conventions
+from jaxsafe.report.tables import between_marks
 
 HERE = Path(__file__).parent
 ROBOTS = ("point", "car", "doggo")
@@ -79,21 +79,9 @@ TABLES = {
 }
 
 
-def replaced(text: str, written: Mapping[str, str], mark: str = "table") -> str:
-    """`text` with what stands between the marks of these tables."""
-    for name, table in written.items():
-        begin, end = f"<!-- {mark}: {name} -->\n", "<!-- end -->"
-        before, begun, rest = text.partition(begin)
-        _, ended, after = rest.partition(end)
-        if not (begun and ended):
-            raise ValueError(f"no {begin.strip()} with {end} after it")
-        text = before + begin + table + "\n" + end + after
-    return text
-
-
 def filled(path: Path) -> str:
     """The file's text with its tables made anew."""
-    return replaced(path.read_text(), {name: table() for name, table in TABLES[path].items()})
+    return between_marks(path.read_text(), {name: table() for name, table in TABLES[path].items()})
 
 
 if __name__ == "__main__":

@@ -4,12 +4,9 @@ A new process is there where one is killed, interrupted or has other devices, an
 real environment.
 """
 
-import os
 import resource
 import shutil
 import signal
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +17,6 @@ import pytest
 import yaml
 from shell import (
     FAST_XLA,
-    SCRIPTS,
     SMALL,
     STEPS,
     TOY,
@@ -412,24 +408,3 @@ def test_a_resumed_run_does_not_start_from_the_other_policy_again(
     assert "starting from" not in capsys.readouterr().out
     assert run_folder.read_config(tmp_path / "run")["init_from"] == "source"
     assert run_folder.progress(tmp_path / "run") == (4, 4 * STEPS)
-
-
-@pytest.mark.slow
-def test_the_command_of_the_results_trains_what_is_asked_for(tmp_path):
-    """With options it is a trial: nothing comes into docs/results."""
-    results = SCRIPTS.parent / "docs" / "results"
-    before = sorted(results.iterdir())
-    options = [o for o in SMALL if not o.startswith(("env=", "algo=", "video", "num_envs"))]
-    options += ["total_steps=640", "env.num_steps=40"]
-    done = subprocess.run(
-        [sys.executable, results / "run.py", *options, "num_envs=4", "num_seeds=1",
-         "--tasks", "point_goal0", "--algos", "ppo_lag", "ppo", "--at-once", "2", "--runs", tmp_path],
-        env={**os.environ, "JAX_PLATFORMS": "cpu"}, text=True, capture_output=True,
-    )  # fmt: skip
-    logs = "".join(log.read_text() for log in tmp_path.glob("*.log"))
-    assert done.returncode == 0, done.stdout + done.stderr + logs
-    assert "2 of 2 runs to do" in done.stdout and "left to do: nothing" in done.stdout
-    for algo in ("ppo_lag", "ppo"):
-        assert f"point_goal0-{algo}: done" in done.stdout
-        assert rows(tmp_path / f"point_goal0-{algo}")[-1][1] == "640"
-    assert sorted(results.iterdir()) == before
