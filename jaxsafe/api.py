@@ -27,7 +27,7 @@ from jaxsafe import algos, envs
 from jaxsafe.config import ConfigError, flat, nearest
 from jaxsafe.envs import SafetyGym, SafetyGymConfig
 from jaxsafe.envs.check import check_env
-from jaxsafe.envs.engines.physics import default_engine
+from jaxsafe.envs.engines import default_engine
 from jaxsafe.learn.on_policy import Algorithm
 from jaxsafe.report import compare
 from jaxsafe.run import command, distributed, run_folder, runner, sweeps

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsafe.config import ConfigError
-from jaxsafe.envs.engines.physics import Physics
+from jaxsafe.envs.engines import Physics
 from jaxsafe.envs.safety_gym import scene as scenes
 from jaxsafe.envs.safety_gym.config import read
 from jaxsafe.envs.safety_gym.task import SafetyGym, World

@@ -20,8 +20,8 @@ import mujoco
 import numpy as np
 
 from jaxsafe.config import ConfigError
-from jaxsafe.envs.engines import physics as engines
-from jaxsafe.envs.engines.physics import Physics, Readings
+from jaxsafe.envs import engines
+from jaxsafe.envs.engines import Physics, Readings
 from jaxsafe.envs.safety_gym import layout as layouts
 from jaxsafe.envs.safety_gym import scene as scenes
 from jaxsafe.envs.safety_gym import sensing, sleeping
@@ -90,13 +90,10 @@ class SafetyGym:
         self.place = layouts.placement(cfg)
         natural = ("geom_xpos", "geom_xmat") if cfg.lidar_type == "natural" else ()
         turned = ("xquat",) if cfg.reward_orientation else ()
-        alike = cfg.frameskip_binom_p >= 1
         small = sleeping.small_config(cfg, sleeping.awake(cfg, engine))
         as_built = small == cfg and engine != "jax"
         scene = self.scene if as_built else scenes.build(small, mjx=engine == "jax")
-        self._engine = engines.make_engine(
-            engine, scene, cfg.frameskip_binom_n, natural + turned, alike, cfg.contact_room
-        )
+        self._engine = engines.make_engine(engine, scene.simulation(cfg, natural + turned))
         if small != cfg:
             self._engine = sleeping.with_sleepers(self._engine, scene, self.scene, cfg)
         self.engine = self._engine.name
@@ -342,7 +339,7 @@ class SafetyGym:
                 reward = self._circle_reward(world, com)
         if cfg.reward_orientation:
             body = self.scene.model.body(cfg.reward_orientation_body).id
-            a, b, c, d = readings.xquat[body]
+            a, b, c, d = readings.fields["xquat"][body]
             reward += cfg.reward_orientation_scale * (a**2 - b**2 - c**2 + d**2)
         if cfg.reward_clip:
             reward = jnp.clip(reward, -cfg.reward_clip, cfg.reward_clip)
@@ -545,7 +542,7 @@ class SafetyGym:
             model.geom_size[others],
             model.geom_group[others],
         )
-        position, rotation = readings.geom_xpos[others], readings.geom_xmat[others].reshape(-1, 3, 3)
+        position, rotation = (readings.fields[name][others] for name in ("geom_xpos", "geom_xmat"))
         cylinder, box = int(mujoco.mjtGeom.mjGEOM_CYLINDER), int(mujoco.mjtGeom.mjGEOM_BOX)
         extra: list[tuple] = []  # type, size, group, position, rotation
         if self._goal_kind == "goal":

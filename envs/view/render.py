@@ -24,7 +24,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from jaxsafe.config import ConfigError, nearest
-from jaxsafe.envs.engines import physics as engines
+from jaxsafe.envs import engines
 from jaxsafe.envs.safety_gym import scene as scenes
 from jaxsafe.envs.safety_gym.config import SafetyGymConfig
 from jaxsafe.envs.safety_gym.task import SafetyGym, World
