@@ -245,7 +245,8 @@ def check_key(
     else:
         option = NAMED.partition(".")[2] if key.rpartition(".")[0] == NAMED else option
         for name in chosen[head]:
-            options = [o for o in groups[head][name] if o != "name"]
+            known = groups[head][name]
+            options = [o for o in {**known, **flat(known)} if o != "name"]  # 'wrap', 'wrap.time_limit'
             if option not in options:
                 if f"{head}.{option}" == NAMED and (
                     takers := [n for n, o in groups[head].items() if option in o]
