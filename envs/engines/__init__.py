@@ -1,7 +1,7 @@
 """Physics engines: a MuJoCo model in, batched physics steps out.
 
     engine = make_engine("auto", Simulation(mujoco.MjSpec.from_string(xml), substeps=4))
-    physics, readings = engine.run(engine.start(), ctrl, 4)
+    physics, readings = engine.run(engine.start(), ctrl)
 
 Engine `c` is MuJoCo itself, a thread pool behind a callback: it is exact, and the default on a CPU.
 Engine `warp` is MuJoCo Warp with kernels of our own, the default on an NVIDIA GPU. Engine `jax` is MJX

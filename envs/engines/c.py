@@ -78,4 +78,4 @@ def make(simulation: Simulation) -> Engine:
         row = jax.pure_callback(host, shape, pack(physics, ctrl, substeps), vmap_method="broadcast_all")
         return unpack(row, results, simulation, physics, substeps)
 
-    return Engine("c", model, run, run)
+    return Engine("c", model, simulation.substeps, run, run)

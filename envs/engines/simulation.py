@@ -60,7 +60,8 @@ class Simulation:
         """The model; if `count`, with a sensor for each pair of `contacts`, after all others.
 
         Raises:
-            ConfigError: MuJoCo cannot compile it, or a body or field has an unknown name.
+            ConfigError: MuJoCo cannot compile it, a body or field has an unknown name, or an actuator
+                has a state, which `Physics` does not hold.
         """
         bodies = {body.name for body in self.spec.bodies}
         for name in (name for pair in self.contacts for name in pair):
@@ -81,11 +82,13 @@ class Simulation:
                 intprm=[1 << mujoco.mjtConDataField.mjCONDATA_FOUND.value, 0, 1],
             )
         try:
-            return spec.compile()
+            model = spec.compile()
         except ValueError as error:
-            raise ConfigError(
-                f"MuJoCo cannot compile the model: {str(error).splitlines()[0]}"
-            ) from error
+            reason = str(error).splitlines()[0]
+            raise ConfigError(f"MuJoCo cannot compile the model: {reason}") from error
+        if model.na:
+            raise ConfigError("expected actuators without a state (no muscles, no filters)")
+        return model
 
     def orbits_of(self, model: mujoco.MjModel) -> np.ndarray:
         """`orbits`, float [nmocap]; zeros where none are given."""
@@ -119,17 +122,30 @@ Run = Callable[[Physics, jax.Array, jax.Array], tuple[Physics, Readings]]
 
 
 class Engine(NamedTuple):
-    """Functions of one world; callers `vmap`, over environments and again over seeds.
+    """Physics of one world as pure functions; callers `vmap`, over environments and again over seeds.
 
-    run: (physics, ctrl [nu], substeps int32 []) -> (physics, readings): so many physics steps, then a
-        forward pass at the new state. Controls are held for all of them.
-    forward: the same with 0 substeps: the forward pass alone.
+    advance, show: what `run` and `forward` call.
     """
 
     name: str
-    model: mujoco.MjModel
-    run: Run
-    forward: Run
+    model: mujoco.MjModel  # compiled
+    substeps: int  # of `Simulation`
+    advance: Run
+    show: Run
+
+    def run(
+        self, physics: Physics, ctrl: jax.Array, substeps: jax.Array | int | None = None
+    ) -> tuple[Physics, Readings]:
+        """Physics steps with controls held, float [nu], then a forward pass at the new state.
+
+        substeps: how many, where calls are `varied`; None: all that the simulation names.
+        """
+        count = self.substeps if substeps is None else substeps
+        return self.advance(physics, ctrl, jnp.asarray(count, jnp.int32))
+
+    def forward(self, physics: Physics, ctrl: jax.Array) -> tuple[Physics, Readings]:
+        """The forward pass alone."""
+        return self.show(physics, ctrl, jnp.int32(0))
 
     def start(self, qpos: Any = None, qvel: Any = None) -> Physics:
         """A state at rest in the model's reference pose, but for the `qpos` [nq] and `qvel` [nv] given.

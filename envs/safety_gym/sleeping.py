@@ -82,7 +82,8 @@ def with_sleepers(engine: Engine, small: Scene, scene: Scene, cfg: SafetyGymConf
 
         return woken
 
-    return Engine(engine.name, scene.model, wake(engine.run), wake(engine.forward))
+    advance, show = wake(engine.advance), wake(engine.show)
+    return Engine(engine.name, scene.model, engine.substeps, advance, show)
 
 
 class Places(NamedTuple):

@@ -218,7 +218,7 @@ class SafetyGym:
             delay = cfg.buttons_resampling_delay if theirs else 0
             world = world.replace(buttons_timer=jnp.int32(delay))
         ctrl = jnp.zeros(self.action_size)
-        physics, readings = self._engine.forward(world.physics, ctrl, jnp.int32(0))
+        physics, readings = self._engine.forward(world.physics, ctrl)
         world = world.replace(physics=physics)
         if "subtreecom" in self._sensors:
             world = world.replace(last_com=self._sensor(readings, "subtreecom"))

@@ -139,7 +139,7 @@ def test_a_member_that_is_missing_or_odd_is_one_line():
 MINE = """
 from pathlib import Path
 from toys import Corridor
-from jaxsafe.envs.suite import ROBOTS, TASKS
+from jaxsafe.envs.safety_gym.suite import ROBOTS, TASKS
 
 Path("imported").touch()
 maze1 = TASKS["goal1"] | ROBOTS["point"]

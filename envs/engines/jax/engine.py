@@ -45,8 +45,8 @@ def make(simulation: Simulation) -> Engine:
             template = mjx.make_data(compiled, impl="jax")
     except NotImplementedError as error:
         raise ConfigError(f"env.engine='jax': MJX cannot run the model: {error}") from error
-    runs = (runner(simulation, compiled, model, template, n) for n in (simulation.substeps, 0))
-    return Engine("jax", compiled, *runs)
+    several, none = (runner(simulation, compiled, model, template, n) for n in (simulation.substeps, 0))
+    return Engine("jax", compiled, simulation.substeps, several, none)
 
 
 def runner(

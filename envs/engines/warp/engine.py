@@ -172,7 +172,8 @@ def make(simulation: Simulation) -> Engine:
 
         return batched(run_batch)
 
-    return Engine("warp", model, runner(simulation.substeps), runner(0))
+    several, none = runner(simulation.substeps), runner(0)
+    return Engine("warp", model, simulation.substeps, several, none)
 
 
 class Kernels:
