@@ -30,7 +30,7 @@ from jaxsafe.algos import (
     trpo_saute,
     trpo_simmer_pid,
 )
-from jaxsafe.learn.on_policy import Algorithm
+from jaxsafe.types import Algorithm
 
 
 class Entry(NamedTuple):

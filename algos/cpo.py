@@ -45,12 +45,12 @@ from jaxsafe.config import config
 from jaxsafe.learn.batch import all_finite, pmean
 from jaxsafe.learn.constraints import LimitsConfig, limit, named
 from jaxsafe.learn.halfspaces import dot, furthest_point
-from jaxsafe.learn.on_policy import Algorithm, on_policy_pair
-from jaxsafe.learn.steps import Objective, Step, own_trunk
+from jaxsafe.learn.on_policy import on_policy_pair
+from jaxsafe.learn.steps import Context, Pair, Step, own_trunk
 from jaxsafe.learn.surrogates import plain
 from jaxsafe.learn.trust_region import conjugate_gradient, distance, fisher_product, line_search
 from jaxsafe.nn.networks import policy
-from jaxsafe.types import Env, Metrics, PyTree
+from jaxsafe.types import Algorithm, Env, Metrics, PyTree
 
 
 @config
@@ -195,27 +195,24 @@ def update(
     rule: Rule,
     actor: PyTree,
     opt_state: Margin,
-    objective_r: Objective,
-    objective_c: Objective,
-    excess: jax.Array,
-    length: jax.Array,
+    objectives: Pair,
     batch: Any,
-    key: jax.Array,
-    cfg: Any,
-    axis_name: str | None,
+    context: Context,
 ) -> tuple[PyTree, Margin, Metrics]:
+    cfg, axis_name, excess = context.cfg, context.axis_name, context.excess
     start, unravel = ravel_pytree(actor)
-    violation = excess / length if cfg.per_step else excess
+    violation = excess / context.length if cfg.per_step else excess
     delta = cfg.target_kl
 
     def evaluate(params: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         actor = unravel(params)
-        reward, cost = pmean((objective_r(actor, batch)[0], objective_c(actor, batch)[0]), axis_name)
+        both = objectives.reward(actor, batch)[0], objectives.cost(actor, batch)[0]
+        reward, cost = pmean(both, axis_name)
         return reward, cost, distance(batch.old, policy(actor, batch.obs, cfg), cfg, axis_name)
 
-    g = pmean(jax.grad(lambda params: objective_r(unravel(params), batch)[0])(start), axis_name)
+    g = pmean(jax.grad(lambda params: objectives.reward(unravel(params), batch)[0])(start), axis_name)
     gradient = jax.jacrev if excess.ndim else jax.grad  # [K, P], or [P]
-    b = pmean(gradient(lambda params: objective_c(unravel(params), batch)[0])(start), axis_name)
+    b = pmean(gradient(lambda params: objectives.cost(unravel(params), batch)[0])(start), axis_name)
     product = fisher_product(
         lambda params: policy(unravel(params), batch.obs, cfg), start, batch.old, cfg, axis_name
     )

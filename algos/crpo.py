@@ -12,11 +12,11 @@ from typing import Any
 
 from jaxsafe.algos import trpo
 from jaxsafe.config import config
-from jaxsafe.learn.on_policy import Algorithm, on_policy
+from jaxsafe.learn.on_policy import on_policy
 from jaxsafe.learn.surrogates import plain
 from jaxsafe.learn.treatments import switch
 from jaxsafe.learn.trust_region import trust_region
-from jaxsafe.types import Env
+from jaxsafe.types import Algorithm, Env
 
 
 @config

@@ -22,13 +22,13 @@ import jax.numpy as jnp
 from jaxsafe.algos import ppo
 from jaxsafe.config import config
 from jaxsafe.learn.constraints import each, named
-from jaxsafe.learn.on_policy import Algorithm, Batch, TrainState, loop
-from jaxsafe.learn.steps import AdamState, adam_epochs
+from jaxsafe.learn.on_policy import Batch, TrainState, loop
+from jaxsafe.learn.steps import Context, adam_epochs
 from jaxsafe.learn.surrogates import clipped, plain, with_entropy
 from jaxsafe.learn.treatments import LagrangianConfig, lagrangian
 from jaxsafe.nn.gaussian import kl
 from jaxsafe.nn.networks import policy
-from jaxsafe.types import Env, Metrics, PyTree
+from jaxsafe.types import Algorithm, Env, Metrics, PyTree
 
 
 @config
@@ -53,27 +53,24 @@ def projection(
 
 
 def make(env: Env, axis_name: str | None = None) -> Algorithm:
-    def improve(ts: TrainState, batch: Batch, cost: jax.Array, length: jax.Array, key: jax.Array):
-        cfg = ts.config
-        dual = lagrangian.update(ts.dual, cost, cfg)
-        keys = jax.random.split(key)
+    def improve(ts: TrainState, batch: Batch, context: Context):
+        cfg = context.cfg
+        dual = lagrangian.update(ts.dual, context.cost, cfg)
+        contexts = [context._replace(key=key) for key in jax.random.split(context.key)]
 
         def earn(actor: PyTree, batch: Batch) -> tuple[jax.Array, Metrics]:
-            earned = with_entropy(clipped, ts.iteration)
+            earned = with_entropy(clipped, context.iteration)
             return earned(policy(actor, batch.obs, cfg), batch, batch.adv_r, cfg)
 
         actor, opt_state, metrics = adam_epochs.update(
-            ts.params["actor"], ts.opt_state["actor"], earn, batch, keys[0], cfg, axis_name
+            ts.params["actor"], ts.opt_state["actor"], earn, batch, contexts[0]
         )
         better = dataclasses.replace(batch, old=policy(actor, batch.obs, cfg))
 
         def project(actor: PyTree, batch: Batch) -> tuple[jax.Array, Metrics]:
             return projection(actor, batch, dual.lam, cfg)
 
-        again = AdamState(opt_state.adam, ts.opt_state["actor"].iteration)  # the same learning rate
-        actor, opt_state, second = adam_epochs.update(
-            actor, again, project, better, keys[1], cfg, axis_name
-        )
+        actor, opt_state, second = adam_epochs.update(actor, opt_state, project, better, contexts[1])
         metrics |= {f"{name}_projection": x for name, x in second.items()}
         metrics["train/nonfinite"] += metrics.pop("train/nonfinite_projection")
         return actor, opt_state, dual, metrics | lagrangian.metrics(dual)

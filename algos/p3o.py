@@ -19,11 +19,11 @@ import jax.numpy as jnp
 from jaxsafe.algos import ppo
 from jaxsafe.config import config
 from jaxsafe.learn.batch import pmean
-from jaxsafe.learn.on_policy import Algorithm, on_policy_pair
-from jaxsafe.learn.steps import Objective, Step, adam_epochs
+from jaxsafe.learn.on_policy import on_policy_pair
+from jaxsafe.learn.steps import Context, Pair, Step, adam_epochs
 from jaxsafe.learn.surrogates import clipped, pessimistic, plain
 from jaxsafe.nn.gaussian import Gaussian
-from jaxsafe.types import Env, Metrics, PyTree
+from jaxsafe.types import Algorithm, Env, Metrics, PyTree
 
 
 @config
@@ -41,26 +41,22 @@ PUBLISHED: dict[str, dict[str, Any]] = {
 def update(
     actor: PyTree,
     opt_state: PyTree,
-    objective_r: Objective,
-    objective_c: Objective,
-    excess: jax.Array,
-    length: jax.Array,
+    objectives: Pair,
     batch: Any,
-    key: jax.Array,
-    cfg: Any,
-    axis_name: str | None,
+    context: Context,
 ) -> tuple[PyTree, PyTree, Metrics]:
-    violation = excess / length if cfg.per_step else excess
+    cfg = context.cfg
+    violation = context.excess / context.length if cfg.per_step else context.excess
 
     def objective(actor: PyTree, batch: Any) -> tuple[jax.Array, Metrics]:
-        reward, metrics = objective_r(actor, batch)
-        cost, _ = objective_c(actor, batch)
+        reward, metrics = objectives.reward(actor, batch)
+        cost, _ = objectives.cost(actor, batch)
         # max(0, x) of the mean over all devices, as a factor: its gradient is this device's share
-        beyond = jax.lax.stop_gradient(pmean(cost, axis_name) + violation)
+        beyond = jax.lax.stop_gradient(pmean(cost, context.axis_name) + violation)
         penalty = cfg.kappa * jnp.where(beyond > 0, cost + violation, 0.0)
         return reward - penalty, metrics | {"train/penalty": penalty}
 
-    return adam_epochs.update(actor, opt_state, objective, batch, key, cfg, axis_name)
+    return adam_epochs.update(actor, opt_state, objective, batch, context)
 
 
 def surrogate_c(

@@ -20,9 +20,9 @@ from jaxsafe.algos import cpo
 from jaxsafe.config import config
 from jaxsafe.learn.constraints import named
 from jaxsafe.learn.halfspaces import dot, nearest_point
-from jaxsafe.learn.on_policy import Algorithm, on_policy_pair
+from jaxsafe.learn.on_policy import on_policy_pair
 from jaxsafe.learn.surrogates import plain
-from jaxsafe.types import Env
+from jaxsafe.types import Algorithm, Env
 
 
 @config

@@ -11,11 +11,11 @@ KL(old || new) > target_kl.
 from typing import Any
 
 from jaxsafe.config import config
-from jaxsafe.learn.on_policy import OMNISAFE, Algorithm, OnPolicyConfig, on_policy
+from jaxsafe.learn.on_policy import OMNISAFE, OnPolicyConfig, on_policy
 from jaxsafe.learn.steps import adam_epochs
 from jaxsafe.learn.surrogates import plain
 from jaxsafe.learn.treatments import none
-from jaxsafe.types import Env
+from jaxsafe.types import Algorithm, Env
 
 
 @config

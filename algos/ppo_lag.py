@@ -14,11 +14,11 @@ from typing import Any
 
 from jaxsafe.algos import ppo
 from jaxsafe.config import config
-from jaxsafe.learn.on_policy import Algorithm, on_policy
+from jaxsafe.learn.on_policy import on_policy
 from jaxsafe.learn.steps import adam_epochs
 from jaxsafe.learn.surrogates import clipped
 from jaxsafe.learn.treatments import LagrangianConfig, lagrangian
-from jaxsafe.types import Env
+from jaxsafe.types import Algorithm, Env
 
 
 @config

@@ -20,10 +20,10 @@ from typing import Any
 from jaxsafe.algos import ppo
 from jaxsafe.config import config
 from jaxsafe.learn.augment import OMNISAFE_SIMMER, SimmerConfig, schedule, simmer
-from jaxsafe.learn.on_policy import Algorithm, on_policy
+from jaxsafe.learn.on_policy import on_policy
 from jaxsafe.learn.steps import adam_epochs
 from jaxsafe.learn.surrogates import clipped
-from jaxsafe.types import Env
+from jaxsafe.types import Algorithm, Env
 
 
 @config

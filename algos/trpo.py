@@ -8,11 +8,11 @@ Source: Schulman et al. (2015), "Trust Region Policy Optimization", arXiv:1502.0
 from typing import Any
 
 from jaxsafe.config import config
-from jaxsafe.learn.on_policy import OMNISAFE, Algorithm, OnPolicyConfig, on_policy
+from jaxsafe.learn.on_policy import OMNISAFE, OnPolicyConfig, on_policy
 from jaxsafe.learn.surrogates import plain
 from jaxsafe.learn.treatments import none
 from jaxsafe.learn.trust_region import trust_region
-from jaxsafe.types import Env
+from jaxsafe.types import Algorithm, Env
 
 
 @config

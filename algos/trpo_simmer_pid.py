@@ -14,10 +14,10 @@ from jaxsafe.algos import trpo
 from jaxsafe.algos.ppo_simmer_pid import SIMMER
 from jaxsafe.config import config
 from jaxsafe.learn.augment import SimmerConfig, schedule, simmer
-from jaxsafe.learn.on_policy import Algorithm, on_policy
+from jaxsafe.learn.on_policy import on_policy
 from jaxsafe.learn.surrogates import plain
 from jaxsafe.learn.trust_region import trust_region
-from jaxsafe.types import Env
+from jaxsafe.types import Algorithm, Env
 
 
 @config

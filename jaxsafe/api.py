@@ -28,11 +28,11 @@ from jaxsafe.config import ConfigError, flat, nearest
 from jaxsafe.envs import SafetyGym, SafetyGymConfig
 from jaxsafe.envs.check import check_env
 from jaxsafe.envs.engines import default_engine
-from jaxsafe.learn.on_policy import Algorithm
+from jaxsafe.learn.acting import Player
 from jaxsafe.report import compare
 from jaxsafe.run import command, distributed, run_folder, runner, sweeps
 from jaxsafe.run.progress import Report
-from jaxsafe.types import Env, PyTree
+from jaxsafe.types import Algorithm, Env, PyTree
 
 __all__ = ["ConfigError", "Run", "SweepResult", "evaluate", "make", "render", "sweep", "train"]
 
@@ -134,6 +134,8 @@ class Run:
     def policy(self, obs: jax.Array, key: jax.Array | None = None, index: int = 0) -> jax.Array:
         """The action of a trained policy, compiled; it may be used inside `jit`, `vmap` and `scan`.
 
+        It is that of the first step of an episode where the policy has a memory; see `player`.
+
         Args:
             obs: float [..., obs_size] of `run.env(index)`, as the environment gives it.
             key: a random key to sample with; None is the mean, which `evaluate` uses too.
@@ -146,6 +148,19 @@ class Run:
             ConfigError: no such policy, or no checkpoint yet.
         """
         return self._act(self._opened[3], self._checked(index), obs, key)
+
+    def player(self, index: int = 0) -> Player:
+        """A trained policy with its memory: `carry = player.begin()`, then at each step
+        `action, carry = player.act(carry, state)` with the `state` of `player.task`.
+
+        Args:
+            index: which policy.
+
+        Raises:
+            ConfigError: no such policy, or no checkpoint yet.
+        """
+        params, algo = self._params(index), self._opened[2]
+        return Player(algo.policy, params, algo.task(params))
 
     def env(self, index: int = 0) -> Env:
         """The environment as a policy meets it: with what an algorithm adds to the observation, as
@@ -160,7 +175,7 @@ class Run:
         Raises:
             ConfigError: no such policy, or no checkpoint yet.
         """
-        return self._opened[2].task(self._state(index))
+        return self.player(index).task
 
     def _checked(self, index: int) -> int:
         count = len(self.settings.configs) * self.settings.train.num_seeds
@@ -168,8 +183,8 @@ class Run:
             raise ConfigError(f"index {index}: the run has {count} policies, from 0")
         return index
 
-    def _state(self, index: int) -> PyTree:
-        """The train state of one policy."""
+    def _params(self, index: int) -> PyTree:
+        """What acts of one policy."""
         self._checked(index)
         return jax.tree.map(lambda x: x[index], self._opened[3])
 
@@ -182,8 +197,9 @@ class Run:
     def _act(self) -> Any:
         algo = self._opened[2]
 
-        def act(states: PyTree, index: Any, obs: jax.Array, key: jax.Array | None) -> jax.Array:
-            return algo.act(jax.tree.map(lambda x: x[index], states), obs, key)
+        def act(every: PyTree, index: Any, obs: jax.Array, key: jax.Array | None) -> jax.Array:
+            params = jax.tree.map(lambda x: x[index], every)
+            return algo.policy.act(params, algo.policy.init(params), obs, key)[0]
 
         return jax.jit(act)
 
@@ -331,8 +347,8 @@ def evaluate(
         )
     if not 0 <= setting < (count := len(run.settings.configs)):
         raise ConfigError(f"setting {setting}: the run has {count}, from 0")
-    settings, _, algo, states = run._opened
-    return command.evaluate(settings, algo, states, episodes, seed, run.folder)[setting]
+    settings, _, algo, params = run._opened
+    return command.evaluate(settings, algo, params, episodes, seed, run.folder)[setting]
 
 
 def render(
@@ -358,7 +374,7 @@ def render(
     out = Path(path or run.folder / "video.mp4").expanduser()
     command.check_video(out)
     settings, env, algo, _ = run._opened
-    actor = command.Actor(settings, env, algo, run._state(index))
+    actor = command.Actor(settings, env, algo, run._params(index))
     command.film(run._known.envs, [actor], out, seed)
     return out
 

@@ -1,11 +1,14 @@
 """What every environment and every learner agrees on."""
 
-from typing import Any, Protocol
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
 
 import flax.struct
 import jax
+import numpy as np
 
 PyTree = Any
+Count = jax.Array | np.int32 | int  # a whole number, traced or not
 Metrics = dict[str, jax.Array]
 
 
@@ -55,3 +58,60 @@ class Env(Protocol):
     def reset(self, key: jax.Array) -> State: ...
 
     def step(self, state: State, action: jax.Array) -> State: ...
+
+
+class Policy(NamedTuple):
+    """All that evaluation, films, the live view, adapters and `init_from` know of an algorithm.
+
+    init(params) -> carry, what the policy remembers at the start of an episode: () for a policy
+        that only sees the present observation.
+    act(params, carry, obs, key) -> (action [A], carry, extras): one step in one environment, without a
+        batch axis. `key` None asks for the mean action. extras is a dict, for whoever knows the policy.
+    privileged: `act` takes the environment's `State` for `obs`: the policy looks into the simulator.
+    """
+
+    init: Callable[[PyTree], PyTree]
+    act: Callable[[PyTree, PyTree, Any, jax.Array | None], tuple[jax.Array, PyTree, dict[str, Any]]]
+    privileged: bool = False
+
+
+class Shared(NamedTuple):
+    """What all members of a run share. It has no member axis: `jax.vmap(update, in_axes=(0, None))`.
+
+    iteration: int32 [], updates before this one. The loop owns it; cursors, warm-up and schedules are
+        functions of it.
+    since: int32 [], the iteration from which on a replay holds everything: 0, or where a run was
+        resumed without its replay.
+    data: pytree, a data set.
+    """
+
+    iteration: Count
+    since: Count = np.int32(0)
+    data: PyTree = ()
+
+
+class Clocks(NamedTuple):
+    """What one update takes: environment steps of one seed, and at most so many gradient steps."""
+
+    steps: int
+    updates: int
+
+
+class Algorithm(NamedTuple):
+    """A learner of one member, pure; `jax.vmap` makes several of it.
+
+    init(key, cfg, shared) -> ts, a train state.
+    update(ts, shared) -> (ts, metrics).
+    policy: see `Policy`; its `params` are those of the next line.
+    params(ts) -> pytree, what acts and what another run can start from: networks, normaliser, config.
+        No optimiser and no replay.
+    task(params) -> the Env whose observations the policy takes.
+    clocks(cfg) -> Clocks.
+    """
+
+    init: Callable[[jax.Array, Any, Shared], PyTree]
+    update: Callable[[PyTree, Shared], tuple[PyTree, Metrics]]
+    policy: Policy
+    params: Callable[[PyTree], PyTree]
+    task: Callable[[PyTree], Env]
+    clocks: Callable[[Any], Clocks]

@@ -20,12 +20,14 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxsafe import algos, envs
 from jaxsafe.config import ConfigError
 from jaxsafe.learn.rollout import collect, init_rollout
 from jaxsafe.run import run_folder, runner
 from jaxsafe.run.runner import device_name, use_compilation_cache
+from jaxsafe.types import Shared
 
 
 def timed(fn, *args, before: int, repeats: int) -> tuple[float, list[float]]:
@@ -66,8 +68,9 @@ def training(env, algo: str, cfg, seeds: int, devices: int):
     settings = runner.TrainConfig(num_seeds=seeds, devices=devices)
     runner.check_devices(settings)
     program = runner.build(env, algos.ALGOS[algo].make, [cfg], settings)
-    state = jax.jit(program.init)(jax.device_put(program.start, program.sharding))
-    return state, lambda ts: program.update(ts)[0]
+    shared = Shared(np.int32(0))
+    state = jax.jit(program.init)(jax.device_put(program.start, program.sharding), shared)
+    return state, lambda ts: program.update(ts, shared)[0]
 
 
 def per_seed(init, seeds: int):

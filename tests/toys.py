@@ -1,11 +1,36 @@
-"""Environments small enough to know the answers of."""
+"""Environments small enough to know the answers of, and updates outside a training loop."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from jaxsafe.types import State
+from jaxsafe.learn.steps import Context
+from jaxsafe.types import Algorithm, Shared, State
+
+FIRST = Shared(np.int32(0))
+
+
+def updated(algo: Algorithm) -> Callable:
+    """ts -> (ts, metrics), for what does not depend on the iteration."""
+    return lambda ts: algo.update(ts, FIRST)
+
+
+def context(
+    cfg: Any,
+    key: jax.Array | None = None,
+    iteration: int = 0,
+    axis_name: str | None = None,
+    excess: Any = 0.0,
+    length: float = 1.0,
+) -> Context:
+    """What a step is told, for tests that take one outside a loop."""
+    key = jax.random.key(1) if key is None else key
+    excess = jnp.asarray(excess, jnp.float32)
+    return Context(iteration, cfg, key, axis_name, excess, excess, jnp.float32(length))
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import os
 import platform
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,8 @@ from jaxsafe.envs.safety_gym import scene as scenes
 from jaxsafe.envs.safety_gym.config import SafetyGymConfig
 from jaxsafe.envs.safety_gym.task import SafetyGym, World
 from jaxsafe.envs.wrap import innermost, raw_steps
-from jaxsafe.types import Env, State
+from jaxsafe.learn.acting import Player
+from jaxsafe.types import PyTree, State
 
 FPS = 30
 BACKENDS = {"Linux": ("egl", "osmesa", "glfw"), "Darwin": ("cgl", "glfw")}
@@ -178,29 +179,27 @@ class Renderer:
 
 def render_episode(
     env: SafetyGym,
-    policy: Callable[[jax.Array, jax.Array], jax.Array],
+    player: Player,
     key: jax.Array,
     length: int | None = None,
     every: int | None = None,
-    task: Env | None = None,
     label: str | None = None,
     **renderer: Any,
 ) -> list[np.ndarray]:
     """One episode as frames, uint8 [H, W, 3], up to its termination.
 
     Args:
-        policy: (obs [O], key) -> action [A].
+        player: what acts in `env`, or in `env` with what an algorithm appends to its observation.
         length: most steps; None is the time limit.
         every: steps from a frame to the next; None is as near to real time at 30 frames a second as
             whole steps allow, and never less than one step.
-        task: `env` as the policy meets it, where an algorithm appends to its observation.
         label: written above each frame, with the return and the cost so far.
         renderer: arguments of `Renderer`.
     Raises:
         NoDisplay: this machine has neither EGL nor OSMesa nor a display.
     """
     draw = Renderer(env, **renderer)  # first: an episode is not worth simulating if it cannot be drawn
-    states = run_episode(task or env, policy, key, length or env.episode_length)
+    states = run_episode(player, key, length or env.episode_length)
     steps = len(states.terminated)
     ends = np.flatnonzero(states.terminated)
     last = int(ends[0]) if len(ends) else steps - 1
@@ -236,17 +235,19 @@ def side_by_side(films: Sequence[Sequence[np.ndarray]]) -> list[np.ndarray]:
     return [at(t) for t in range(max(map(len, films)))]
 
 
-def run_episode(env: Env, policy: Callable, key: jax.Array, length: int) -> State:
-    """The states of an episode on the host, [length + 1, ...]; the first is that of the reset."""
-    reset_key, act_key = jax.random.split(key)
+def run_episode(player: Player, key: jax.Array, length: int) -> State:
+    """The states of an episode of mean actions on the host, [length + 1, ...], from the reset on."""
+    reset_key, _ = jax.random.split(key)
 
-    def step(state: State, t: jax.Array) -> tuple[State, State]:
-        state = env.step(state, policy(state.obs, jax.random.fold_in(act_key, t)))
-        return state, state
+    def step(now: tuple[State, PyTree], _: None) -> tuple[tuple[State, PyTree], State]:
+        state, carry = now
+        action, carry = player.act(carry, state)
+        state = player.task.step(state, action)
+        return (state, carry), state
 
     def episode() -> State:
-        first = env.reset(reset_key)
-        _, rest = jax.lax.scan(step, first, jnp.arange(length))
+        first = player.task.reset(reset_key)
+        _, rest = jax.lax.scan(step, (first, player.begin()), None, length)
         return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, rest)
 
     return jax.device_get(jax.jit(episode)())

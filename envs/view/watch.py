@@ -22,7 +22,8 @@ from jaxsafe.envs.safety_gym.task import SafetyGym
 from jaxsafe.envs.view import render
 from jaxsafe.envs.view.driving import FRONT, drive, robot_of
 from jaxsafe.envs.wrap import raw_steps
-from jaxsafe.types import Env, State
+from jaxsafe.learn.acting import Player
+from jaxsafe.types import PyTree, State
 
 FPS = 30
 KEYS = {  # a browser's names: (forward, turn)
@@ -54,8 +55,8 @@ class Session:
 
     Args:
         env: the task.
-        policy: obs [O] -> action [A]; None leaves the robot to the keys. Held keys take over from it.
-        task: `env` as the policy meets it, where an algorithm appends to its observation.
+        player: a policy in `env`, or in `env` with what an algorithm appends to its observation. None
+            leaves the robot to the keys. Held keys take over from a policy.
         seed: of the first episode.
     Raises:
         ConfigError: no environment of Safety Gym, or a robot that no keys are known for.
@@ -64,8 +65,7 @@ class Session:
     def __init__(
         self,
         env: SafetyGym,
-        policy: Callable[[jax.Array], jax.Array] | None = None,
-        task: Env | None = None,
+        player: Player | None = None,
         seed: int = 0,
     ):
         self.env, self.playing, self.held = render.drawable(env), True, set[str]()
@@ -73,16 +73,23 @@ class Session:
         self.limit, self.seconds = env.episode_length, self.env.step_seconds * raw_steps(env)
         self.ended: list[Ended] = []  # the last `LAST`, newest first
         self._lock = threading.Lock()
-        world = task or env
+        world = player.task if player else env
 
-        def step(state: State, action: jax.Array, driven: jax.Array) -> State:
-            if policy is not None:
-                action = jnp.where(driven, action, policy(state.obs))
-            return world.step(state, action)
+        def reset(key: jax.Array) -> tuple[State, PyTree]:
+            return world.reset(key), player.begin() if player else ()
 
-        self._reset, self._step = jax.jit(world.reset), jax.jit(step)
+        def step(
+            state: State, carry: PyTree, action: jax.Array, driven: jax.Array
+        ) -> tuple[State, PyTree]:
+            if player:
+                own, carry = player.act(carry, state)
+                action = jnp.where(driven, action, own)
+            return world.step(state, action), carry
+
+        self._reset, self._step = jax.jit(reset), jax.jit(step)
         self.reset(seed)
-        self._step(self.state, np.zeros(env.action_size, np.float32), np.bool_(False))  # compiles it
+        still = np.zeros(env.action_size, np.float32)
+        self._step(self.state, self._carry, still, np.bool_(False))  # compiles it
 
     def reset(self, seed: int) -> None:
         """Begin the episode of this seed."""
@@ -94,7 +101,10 @@ class Session:
         with self._lock:
             forward, turn = pushed(self.held)
             action = np.float32(drive(self.env, forward, turn, self.steps))
-            self.state = jax.device_get(self._step(self.state, action, np.bool_(forward or turn)))
+            driven = np.bool_(forward or turn)
+            self.state, self._carry = jax.device_get(
+                self._step(self.state, self._carry, action, driven)
+            )
             self.steps += 1
             self.ret += float(self.state.reward)
             self.cost += float(self.state.cost)
@@ -107,7 +117,8 @@ class Session:
     def _begin(self, seed: int) -> None:
         self.seed, self.steps, self.ret, self.cost = seed, 0, 0.0, 0.0
         self.costs = np.zeros(len(self.env.cost_names))
-        self.state: State = jax.device_get(self._reset(jax.random.key(seed)))
+        self.state: State
+        self.state, self._carry = jax.device_get(self._reset(jax.random.key(seed)))
 
     def play(self, show: Callable[[], None], stop: Callable[[], bool]) -> None:
         """Step in real time, or as fast as it goes here, and `show` at most `FPS` times a second."""

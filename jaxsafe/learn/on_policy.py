@@ -10,7 +10,7 @@ import dataclasses
 import operator
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import flax.struct
 import jax
@@ -23,12 +23,12 @@ from jaxsafe.learn.constraints import Names, check_names, each, limit, signal, s
 from jaxsafe.learn.normalise import init_normaliser, merge, normalise
 from jaxsafe.learn.returns import Estimator, Window, advantages, empty_window, mean_length, window_mean
 from jaxsafe.learn.rollout import RolloutState, Trajectory, collect, init_rollout
-from jaxsafe.learn.steps import Step, adam, fit_critic, stops_critics
+from jaxsafe.learn.steps import Context, Pair, Step, adam, fit_critic, stops_critics
 from jaxsafe.learn.surrogates import Surrogate, with_entropy
 from jaxsafe.learn.treatments import Treatment
 from jaxsafe.nn.gaussian import Gaussian, entropy, log_prob, sample
 from jaxsafe.nn.networks import init_params, policy, share_trunk, stack, stack_critics, values
-from jaxsafe.types import Env, Metrics, PyTree
+from jaxsafe.types import Algorithm, Clocks, Env, Metrics, Policy, PyTree, Shared
 
 
 @config
@@ -80,7 +80,7 @@ OMNISAFE: dict[str, Any] = {
 
 @flax.struct.dataclass
 class TrainState:
-    """All that an update needs. Environment steps so far: iteration * num_envs * horizon.
+    """All that an update needs besides `Shared`. Environment steps: iteration * num_envs * horizon.
 
     config: the algorithm's, with its floats as arrays.
     params: {'actor', 'critic_r', 'critic_c'}; of several constraints critic_c is stacked, [K, ...].
@@ -104,7 +104,16 @@ class TrainState:
     episode_length: jax.Array
     past_costs: Window
     key: jax.Array
-    iteration: jax.Array
+
+
+@flax.struct.dataclass
+class Learned:
+    """What acts: `config`, `params`, `dual` and `normaliser` of a train state."""
+
+    config: Any
+    params: dict[str, PyTree]
+    dual: PyTree
+    normaliser: PyTree
 
 
 @flax.struct.dataclass
@@ -127,16 +136,6 @@ class Batch:
     ret_c: jax.Array
 
 
-class Algorithm(NamedTuple):
-    """init(key, cfg) -> ts; update(ts) -> (ts, metrics); act(ts, obs [..., O], key) -> action,
-    sampled, or the mean where key is None; task(ts) -> the Env whose observations `act` takes."""
-
-    init: Callable[[jax.Array, Any], TrainState]
-    update: Callable[[TrainState], tuple[TrainState, Metrics]]
-    act: Callable[[TrainState, jax.Array, jax.Array | None], jax.Array]
-    task: Callable[[TrainState], Env]
-
-
 def on_policy(
     env: Env,
     treatment: Treatment,
@@ -147,17 +146,17 @@ def on_policy(
 ) -> Algorithm:
     """Algorithms with one objective: the surrogate of the advantage that the treatment mixes."""
 
-    def improve(ts: TrainState, batch: Batch, cost: jax.Array, length: jax.Array, key: jax.Array):
-        cfg = ts.config
-        dual = treatment.update(ts.dual, cost, cfg)
+    def improve(ts: TrainState, batch: Batch, context: Context):
+        cfg = context.cfg
+        dual = treatment.update(ts.dual, context.cost, cfg)
 
         def objective(actor: PyTree, batch: Batch) -> tuple[jax.Array, Metrics]:
             advantage = treatment.advantage(dual, batch.adv_r, batch.adv_c)
-            earned = with_entropy(surrogate, ts.iteration)
+            earned = with_entropy(surrogate, context.iteration)
             return earned(policy(actor, batch.obs, cfg), batch, advantage, cfg)
 
         actor, opt_state, metrics = step.update(
-            ts.params["actor"], ts.opt_state["actor"], objective, batch, key, cfg, axis_name
+            ts.params["actor"], ts.opt_state["actor"], objective, batch, context
         )
         return actor, opt_state, dual, metrics | treatment.metrics(dual)
 
@@ -172,19 +171,18 @@ def on_policy_pair(
     surrogate_c: Surrogate | None = None,
     named: Callable[[Any], Names] = unnamed,
 ) -> Algorithm:
-    """Algorithms whose step weighs reward against cost itself, so that it takes two objectives:
+    """Algorithms whose step weighs reward against cost itself, so that it takes a `Pair` of objectives:
     `surrogate` of the reward's advantage, and `surrogate_c` (or the same) of the cost's.
 
-    update(actor, opt_state, objective_r, objective_c, excess, length, batch, key, cfg, axis_name),
-    where excess = J_c - cost_limit, in cost per episode, and length is the mean episode's in steps:
-    objective_c is in cost per step, the unit of excess / length. For K costs `named(cfg)` both are [K].
+    The cost's objective is in cost per step, the unit of `context.excess / context.length`. For K costs
+    `named(cfg)` it is [K].
     """
 
-    def improve(ts: TrainState, batch: Batch, cost: jax.Array, length: jax.Array, key: jax.Array):
-        cfg = ts.config
+    def improve(ts: TrainState, batch: Batch, context: Context):
+        cfg = context.cfg
 
         def objective_r(actor: PyTree, batch: Batch) -> tuple[jax.Array, Metrics]:
-            earned = with_entropy(surrogate, ts.iteration)
+            earned = with_entropy(surrogate, context.iteration)
             return earned(policy(actor, batch.obs, cfg), batch, batch.adv_r, cfg)
 
         def objective_c(actor: PyTree, batch: Batch) -> tuple[jax.Array, Metrics]:
@@ -198,14 +196,9 @@ def on_policy_pair(
         actor, opt_state, metrics = step.update(
             ts.params["actor"],
             ts.opt_state["actor"],
-            objective_r,
-            objective_c,
-            cost - limit(cfg, named(cfg)),
-            length,
+            Pair(objective_r, objective_c),
             batch,
-            key,
-            cfg,
-            axis_name,
+            context,
         )
         return actor, opt_state, (), metrics
 
@@ -229,10 +222,9 @@ def loop(
     augmentation: Augmentation = nothing,
     named: Callable[[Any], Names] = unnamed,
 ) -> Algorithm:
-    """The loop around `improve(ts, batch, episode_cost, episode_length, key)`, which returns
-    (actor, opt_state, dual, metrics). episode_cost is of `cost` or, [K], of the costs `named(cfg)`."""
+    """The loop around `improve(ts, batch, context)` -> (actor, opt_state, dual, metrics)."""
 
-    def init(key: jax.Array, cfg: Any) -> TrainState:
+    def init(key: jax.Array, cfg: Any, shared: Shared) -> TrainState:
         check(cfg)
         cfg = jax.tree.map(jnp.float32, cfg)
         params_key, rollout_key, key = jax.random.split(key, 3)
@@ -259,13 +251,12 @@ def loop(
             episode_length=jnp.float32(env.episode_length),
             past_costs=empty_window(cfg.cost_window, jnp.shape(limit(cfg, named(cfg)))),
             key=key,
-            iteration=jnp.int32(0),
         )
 
-    def task(ts: TrainState) -> Env:
-        return augmentation.wrap(env, ts.config, ts.dual)
+    def task(learned: Learned | TrainState) -> Env:
+        return augmentation.wrap(env, learned.config, learned.dual)
 
-    def update(ts: TrainState) -> tuple[TrainState, Metrics]:
+    def update(ts: TrainState, shared: Shared) -> tuple[TrainState, Metrics]:
         cfg = ts.config
         key, rollout_key, step_key, critic_key = jax.random.split(ts.key, 4)
 
@@ -293,7 +284,9 @@ def loop(
         episode_cost = batch_mean(charged, axis_name, (0, 1)) * length
         recent, past_costs = window_mean(ts.past_costs, episode_cost)
 
-        actor, opt_actor, dual, metrics = improve(ts, batch, recent, length, step_key)
+        excess = recent - limit(cfg, names)
+        context = Context(shared.iteration, cfg, step_key, axis_name, recent, excess, length)
+        actor, opt_actor, dual, metrics = improve(ts, batch, context)
         critics, opt_critics, skipped = {}, (), 0
         if cfg.trunk == "separate":
             passes = metrics["train/passes"] if stops_critics(cfg) else cfg.critic_epochs
@@ -330,15 +323,25 @@ def loop(
             episode_length=length,
             past_costs=past_costs,
             key=key,
-            iteration=ts.iteration + 1,
         )
         return ts, jax.tree.map(jnp.float32, metrics)
 
-    def act(ts: TrainState, obs: jax.Array, key: jax.Array | None) -> jax.Array:
-        dist = policy(ts.params["actor"], see(ts, obs), ts.config)
-        return dist.mean if key is None else sample(dist, key)
+    def act(
+        learned: Learned, carry: PyTree, obs: jax.Array, key: jax.Array | None
+    ) -> tuple[jax.Array, PyTree, dict[str, Any]]:
+        dist = policy(learned.params["actor"], see(learned, obs), learned.config)
+        return (dist.mean if key is None else sample(dist, key)), carry, {}
 
-    return Algorithm(init, update, act, task)
+    acting = Policy(init=lambda learned: (), act=act)
+    return Algorithm(init, update, acting, learned_of, task, clocks)
+
+
+def learned_of(ts: TrainState) -> Learned:
+    return Learned(ts.config, ts.params, ts.dual, ts.normaliser)
+
+
+def clocks(cfg: Any) -> Clocks:
+    return Clocks(cfg.num_envs * cfg.horizon, cfg.critic_epochs * cfg.minibatches)
 
 
 def fit_critics(
@@ -366,7 +369,7 @@ def own(key: jax.Array, axis_name: str | None) -> jax.Array:
     return key if axis_name is None else jax.random.fold_in(key, jax.lax.axis_index(axis_name))
 
 
-def see(ts: TrainState, obs: jax.Array) -> jax.Array:
+def see(ts: TrainState | Learned, obs: jax.Array) -> jax.Array:
     """`obs` [..., O] as the networks see it: what an augmentation appended is left as it is."""
     if not ts.config.obs_normalize:
         return obs

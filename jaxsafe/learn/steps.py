@@ -16,17 +16,46 @@ from jaxsafe.config import ConfigError
 from jaxsafe.learn.batch import batch_mean, pmean, select
 from jaxsafe.nn.gaussian import Gaussian, kl
 from jaxsafe.nn.networks import outputs, policy, stack, value
-from jaxsafe.types import Metrics, PyTree
+from jaxsafe.types import Count, Metrics, PyTree
 
 # (actor, batch) -> (this device's mean of what to maximise, metrics)
 Objective = Callable[[PyTree, Any], tuple[jax.Array, Metrics]]
 
 
+class Pair(NamedTuple):
+    """Two objectives, for steps that weigh reward against cost themselves."""
+
+    reward: Objective
+    cost: Objective  # cost per step, to be kept low; [K] of several constraints
+
+
+class Context(NamedTuple):
+    """What a step knows of the iteration in which it is taken.
+
+    iteration: int32 [], updates before this one.
+    cfg: the algorithm's config.
+    key: a random key, for the step alone.
+    axis_name: of the devices that share the batch; None means one device.
+    cost: float [] or [K], J_c, the undiscounted cost of an episode.
+    excess: float [] or [K], J_c - cost_limit.
+    length: float [], mean length of an episode in steps; excess / length is the excess per step.
+    """
+
+    iteration: Count
+    cfg: Any
+    key: jax.Array
+    axis_name: str | None
+    cost: jax.Array
+    excess: jax.Array
+    length: jax.Array
+
+
 class Step(NamedTuple):
-    """A rule that moves the policy; one objective or two, as its `update` says.
+    """A rule that moves the policy.
 
     init(actor, cfg) -> opt_state
-    update(actor, opt_state, objective, batch, key, cfg, axis_name) -> (actor, opt_state, metrics)
+    update(actor, opt_state, objective, batch, context) -> (actor, opt_state, metrics), with an
+        `Objective` or, for steps that weigh reward against cost themselves, a `Pair` of them.
 
     On a shared trunk `update` trains the critics too (`with_values`), or else `init` refuses it
     (`own_trunk`).
@@ -36,16 +65,11 @@ class Step(NamedTuple):
     update: Callable[..., tuple[PyTree, PyTree, Metrics]]
 
 
-class AdamState(NamedTuple):
-    adam: PyTree
-    iteration: jax.Array  # int32 [], updates so far
-
-
 def adam(lr: jax.Array | float, cfg: Any) -> optax.GradientTransformation:
     return optax.chain(optax.clip_by_global_norm(cfg.max_grad_norm), optax.adam(lr))
 
 
-def remaining(iteration: jax.Array, cfg: Any) -> jax.Array:
+def remaining(iteration: Count, cfg: Any) -> jax.Array:
     """The share of training that is left: 1 at first, 0 from `cfg.total_iterations` on."""
     total = jnp.where(cfg.total_iterations > 0, cfg.total_iterations, jnp.inf)
     return jnp.maximum(0.0, 1.0 - iteration / total)
@@ -82,54 +106,63 @@ def mean_kl(old: Gaussian, new: Gaussian, axis_name: str | None) -> jax.Array:
     return batch_mean(kl(old, new), axis_name)
 
 
-def init_adam(actor: PyTree, cfg: Any) -> AdamState:
-    return AdamState(adam(cfg.lr, cfg).init(actor), jnp.int32(0))
+class Trained(NamedTuple):
+    params: PyTree
+    opt_state: PyTree
+
+
+class Passes(NamedTuple):
+    """Passes over a batch so far."""
+
+    trained: Trained
+    key: jax.Array
+    count: jax.Array  # int32 []
+    divergence: jax.Array  # float [], KL(old || new) after the last one
+    skipped: jax.Array  # int32 [], steps whose gradient was not finite
+
+
+def init_adam(actor: PyTree, cfg: Any) -> PyTree:
+    return adam(cfg.lr, cfg).init(actor)
 
 
 def update_adam(
-    actor: PyTree,
-    opt_state: AdamState,
-    objective: Objective,
-    batch: Any,
-    key: jax.Array,
-    cfg: Any,
-    axis_name: str | None,
-) -> tuple[PyTree, AdamState, Metrics]:
+    actor: PyTree, opt_state: PyTree, objective: Objective, batch: Any, context: Context
+) -> tuple[PyTree, PyTree, Metrics]:
     """Up to `cfg.epochs` passes over the batch, until KL(old || new) > `cfg.target_kl`.
 
     The KL is the mean over the whole batch, taken after each pass; there is no way back. The
     learning rate falls linearly to 0 at `cfg.total_iterations`, if `cfg.lr_decay`.
     """
+    cfg, axis_name = context.cfg, context.axis_name
     objective = with_values(objective, cfg) if cfg.trunk == "shared" else objective
-    left = remaining(opt_state.iteration, cfg) if cfg.lr_decay else 1.0
+    left = remaining(context.iteration, cfg) if cfg.lr_decay else 1.0
     optimiser = adam(cfg.lr * left, cfg)
 
-    def minibatch_step(carry: PyTree, batch: Any) -> tuple[PyTree, jax.Array]:
-        grads = jax.grad(lambda actor: -objective(actor, batch)[0])(carry[0])
-        actor, state, skipped = descend(optimiser, carry[0], carry[1], pmean(grads, axis_name))
-        return (actor, state), skipped
+    def minibatch_step(trained: Trained, batch: Any) -> tuple[Trained, jax.Array]:
+        grads = jax.grad(lambda actor: -objective(actor, batch)[0])(trained.params)
+        params, state, skipped = descend(optimiser, *trained, pmean(grads, axis_name))
+        return Trained(params, state), skipped
 
-    def next_pass(carry: PyTree) -> PyTree:
-        params, key, passes, _, skipped = carry
-        key, shuffle_key = jax.random.split(key)
-        params, skips = one_pass(minibatch_step, params, batch, shuffle_key, cfg.minibatches)
-        divergence = mean_kl(batch.old, policy(params[0], batch.obs, cfg), axis_name)
-        return params, key, passes + 1, divergence, skipped + skips.sum()
+    def next_pass(now: Passes) -> Passes:
+        key, shuffle_key = jax.random.split(now.key)
+        trained, skips = one_pass(minibatch_step, now.trained, batch, shuffle_key, cfg.minibatches)
+        divergence = mean_kl(batch.old, policy(trained.params, batch.obs, cfg), axis_name)
+        return Passes(trained, key, now.count + 1, divergence, now.skipped + skips.sum())
 
-    (actor, state), _, passes, divergence, skipped = jax.lax.while_loop(
-        lambda carry: (carry[2] < cfg.epochs) & ~(carry[3] > cfg.target_kl),
-        next_pass,
-        ((actor, opt_state.adam), key, jnp.int32(0), jnp.zeros(()), jnp.int32(0)),
+    start = Passes(Trained(actor, opt_state), context.key, jnp.int32(0), jnp.zeros(()), jnp.int32(0))
+    end = jax.lax.while_loop(
+        lambda now: (now.count < cfg.epochs) & ~(now.divergence > cfg.target_kl), next_pass, start
     )
+    actor, state = end.trained
     final, metrics = pmean(objective(actor, batch), axis_name)
     return (
         actor,
-        AdamState(state, opt_state.iteration + 1),
+        state,
         {
-            "train/kl": divergence,
-            "train/passes": passes,
+            "train/kl": end.divergence,
+            "train/passes": end.count,
             "train/objective": final,
-            "train/nonfinite": skipped,
+            "train/nonfinite": end.skipped,
             **metrics,
         },
     )
@@ -195,10 +228,10 @@ def fit_critic(
         error = jnp.mean((value(critic, obs, cfg) - target) ** 2)
         return error + cfg.critic_norm_coef * sum(jnp.sum(x**2) for x in jax.tree.leaves(critic)), error
 
-    def minibatch_step(carry: PyTree, data: PyTree) -> tuple[PyTree, PyTree]:
-        grads, error = jax.grad(loss, has_aux=True)(carry[0], *data)
-        critic, state, skipped = descend(optimiser, carry[0], carry[1], pmean(grads, axis_name))
-        return (critic, state), (error, skipped)
+    def minibatch_step(trained: Trained, data: PyTree) -> tuple[Trained, PyTree]:
+        grads, error = jax.grad(loss, has_aux=True)(trained.params, *data)
+        critic, state, skipped = descend(optimiser, *trained, pmean(grads, axis_name))
+        return Trained(critic, state), (error, skipped)
 
     def next_pass(carry: PyTree, key: jax.Array) -> tuple[PyTree, PyTree]:
         before, done = carry
@@ -206,7 +239,7 @@ def fit_critic(
         return (select(done < passes, after, before), done + 1), metrics
 
     ((critic, opt_state), _), (errors, skipped) = jax.lax.scan(
-        next_pass, ((critic, opt_state), 0), jax.random.split(key, cfg.critic_epochs)
+        next_pass, (Trained(critic, opt_state), 0), jax.random.split(key, cfg.critic_epochs)
     )
     counted = jnp.arange(cfg.critic_epochs) < passes
     error = errors[jnp.maximum(counted.sum(), 1) - 1]

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 from jaxsafe.learn.steps import remaining
 from jaxsafe.nn.gaussian import Gaussian, entropy, kl, log_prob
-from jaxsafe.types import Metrics
+from jaxsafe.types import Count, Metrics
 
 Surrogate = Callable[[Gaussian, Any, jax.Array, Any], tuple[jax.Array, Metrics]]
 
@@ -64,7 +64,7 @@ def near_old(dist: Gaussian, batch: Any, advantage: jax.Array, cfg: Any) -> tupl
     return jnp.mean(jnp.where(inside, gain, 0.0)), metrics
 
 
-def with_entropy(surrogate: Surrogate, iteration: jax.Array) -> Surrogate:
+def with_entropy(surrogate: Surrogate, iteration: Count) -> Surrogate:
     """`surrogate` + entropy_coef E[H(pi)], whose coefficient falls linearly to 0 at
     `cfg.total_iterations`, if `cfg.entropy_decay`.
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from jaxsafe.learn.batch import all_finite, pmean
-from jaxsafe.learn.steps import Objective, Step, mean_kl, own_trunk
+from jaxsafe.learn.steps import Context, Objective, Step, mean_kl, own_trunk
 from jaxsafe.nn.gaussian import Gaussian, kl
 from jaxsafe.nn.networks import policy
 from jaxsafe.types import Metrics, PyTree
@@ -109,9 +109,7 @@ def update_natural(
     opt_state: PyTree,
     objective: Objective,
     batch: Any,
-    key: jax.Array,
-    cfg: Any,
-    axis_name: str | None,
+    context: Context,
     search: bool,
 ) -> tuple[PyTree, PyTree, Metrics]:
     """theta + sqrt(2 delta / g'H^-1 g) H^-1 g, to where the quadratic model's KL is target_kl.
@@ -119,6 +117,7 @@ def update_natural(
     With `search` the step is shortened until the objective does not fall and the KL itself is at
     most target_kl; else it is taken as it is.
     """
+    cfg, axis_name = context.cfg, context.axis_name
     start, unravel = ravel_pytree(actor)
 
     def evaluate(params: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -37,14 +37,14 @@ from rich.console import Console
 
 import jaxsafe
 from jaxsafe.config import ConfigError, flat, from_dict, is_float, nearest
+from jaxsafe.learn.acting import Player
 from jaxsafe.learn.constraints import check_names, in_words, limits_of, own_limits
-from jaxsafe.learn.on_policy import Algorithm
 from jaxsafe.report import plots, stats
 from jaxsafe.run import checkpoint, distributed, evaluation, run_folder, runner
 from jaxsafe.run.compat import COMPAT, overrides
 from jaxsafe.run.interrupts import Interrupts
 from jaxsafe.run.progress import Report
-from jaxsafe.types import Env, PyTree
+from jaxsafe.types import Algorithm, Env, PyTree, Shared
 
 ON_RESUME = (
     "total_steps",
@@ -573,7 +573,7 @@ def warm_start(
     """
     source = Path(settings.train.init_from or "").expanduser()
     saved = settle(run_folder.read_config(source), envs, algos)
-    if not checkpoint.checkpoints(source / "checkpoints"):
+    if not checkpoint.checkpoints(runner.policy_folder(source)):
         raise ConfigError(f"init_from={source} holds no checkpoint")
     first, count = saved.train.seed, saved.train.num_seeds
     policy = runner.read_policy(source, count, say)
@@ -591,7 +591,7 @@ def warm_start(
         )
         if there.get(name) != here[name]
     ]
-    like = jax.eval_shape(program.init, program.start)
+    like = jax.eval_shape(program.init, program.start, Shared(np.int32(0)))
     runner.check_policy(like, policy, source, why="; ".join(["", *differ[:3]]))
     units = [plain.get("algo.activation") for plain in (there, here)]  # no shape tells them apart
     if units[0] != units[1]:
@@ -624,12 +624,12 @@ class Scores(NamedTuple):
 
 
 def evaluate(
-    settings: Settings, algo: Algorithm, ts: PyTree, num: int, seed: int, folder: Path
+    settings: Settings, algo: Algorithm, params: PyTree, num: int, seed: int, folder: Path
 ) -> list[Scores]:
     """`num` fresh episodes of each seed in each setting."""
-    episodes = evaluation.run_episodes(algo, ts, num, seed)
+    episodes = evaluation.run_episodes(algo, params, num, seed)
     tables = list(run_folder.by_setting(run_folder.read_metrics(folder)).values())
-    cost_names = algo.task(jax.tree.map(lambda x: x[0], ts)).cost_names
+    cost_names = algo.task(jax.tree.map(lambda x: x[0], params)).cost_names
     seeds, scores = settings.train.num_seeds, []
     for i, member in enumerate(runner.members(settings.configs, settings.train)[::seeds]):
         own = evaluation.Episodes(*(x[i * seeds : (i + 1) * seeds] for x in episodes))
@@ -679,8 +679,8 @@ def finish(
             )
 
     def video() -> None:
-        algo, ts = policy()
-        first = jax.tree.map(lambda x: x[0], ts)
+        algo, params = policy()
+        first = jax.tree.map(lambda x: x[0], params)
         film(envs, [Actor(settings, env, algo, first)], folder / "video.mp4", train.seed)
 
     wanted = {
@@ -699,16 +699,16 @@ def finish(
 
 
 class Actor(NamedTuple):
-    """One policy of a run, ready to act. `ts` is the train state of that member alone."""
+    """One policy of a run, ready to act. `params` is what acts of that member alone."""
 
     settings: Settings
     env: Env
     algo: Algorithm
-    ts: PyTree
+    params: PyTree
 
-    def act(self, obs: jax.Array, key: jax.Array | None = None) -> jax.Array:
-        """The deterministic action [A]; what a film calls."""
-        return self.algo.act(self.ts, obs, None)
+    @property
+    def player(self) -> Player:
+        return Player(self.algo.policy, self.params, self.algo.task(self.params))
 
 
 def check_video(path: Path) -> None:
@@ -730,7 +730,7 @@ def film(
     key = jax.random.fold_in(jax.random.key(seed), 0x66696C6D)
     try:
         films = [
-            render.render_episode(a.env, a.act, key, task=a.algo.task(a.ts), label=label)
+            render.render_episode(a.env, a.player, key, label=label)
             for a, label in zip(actors, labels or [None] * len(actors), strict=True)
         ]
     except render.NoDisplay as error:
@@ -739,20 +739,20 @@ def film(
 
 
 def policy_of(settings: Settings, env: Env, algos: Any, folder: Path) -> tuple[Algorithm, PyTree]:
-    """The algorithm, and the newest policy of each seed in a train state."""
+    """The algorithm, and what acts of the newest policy of each member, [S, ...]."""
     algo = algos.ALGOS[settings.algo_name].make(env, None)
 
     def one_step(cfg: Any) -> Any:
         return dataclasses.replace(cfg, num_envs=1, horizon=1, minibatches=1)
 
-    state = jax.eval_shape(
-        lambda: algo.init(jax.random.key(0), jax.tree.map(np.float32, one_step(settings.algo)))
-    )
+    def first(cfg: Any) -> PyTree:
+        return algo.params(algo.init(jax.random.key(0), cfg, Shared(np.int32(0))))
+
     members = runner.members(settings.configs, settings.train)
-    arrays = runner.read_policy(folder, len(members), fields=runner.ACTING)
-    ts = runner.policy_state(state, arrays, len(members), folder)
     floats = jax.tree.map(lambda *x: np.array(x, np.float32), *[one_step(m.algo) for m in members])
-    return algo, dataclasses.replace(ts, config=floats)
+    like = jax.eval_shape(first, jax.tree.map(lambda x: x[0], floats))
+    arrays = runner.read_policy(folder, len(members))
+    return algo, runner.acting(like, arrays, floats, folder)
 
 
 def compose(texts: list[str], envs: Any, algos: Any) -> Settings:
@@ -856,7 +856,7 @@ def run_parser(description: str) -> argparse.ArgumentParser:
 def open_run(
     folder: Path, again: str | None, envs: Any, algos: Any
 ) -> tuple[Settings, Env, Algorithm, PyTree]:
-    """Settings, environment, algorithm and train states of a run folder. Executes nothing from it.
+    """Settings, environment, algorithm and what acts, [S, ...], of a run. Nothing in it is executed.
 
     Args:
         again: None, or 'env=module:name', the run's environment, which is then imported.
@@ -868,7 +868,7 @@ def open_run(
             raise ConfigError(f"{again}: {folder} was trained with env={saved['env']['name']}")
         load_own(name, envs)
     settings = settle(saved, envs, algos)
-    if not checkpoint.checkpoints(folder / "checkpoints"):
+    if not checkpoint.checkpoints(runner.policy_folder(folder)):
         raise ConfigError(f"{folder} holds no checkpoint")
     env = make_env(settings, envs)
     return settings, env, *policy_of(settings, env, algos, folder)
@@ -884,7 +884,7 @@ def evaluate_main(envs: Any, algos: Any) -> int:
         if args.episodes < 1 or args.seed < 0:
             raise ConfigError("--episodes must be at least 1 and --seed at least 0")
         runner.use_compilation_cache()
-        settings, _, algo, ts = open_run(args.run, args.env, envs, algos)
+        settings, _, algo, params = open_run(args.run, args.env, envs, algos)
         alone = len(settings.configs) == 1
         print(
             f"{settings.env_name} | {settings.algo_name} | "
@@ -895,7 +895,7 @@ def evaluate_main(envs: Any, algos: Any) -> int:
         )
         with Interrupts(functools.partial(print, flush=True)) as stop:
             stop.nothing_to_save = "stopped"
-            scores = evaluate(settings, algo, ts, args.episodes, args.seed, args.run)
+            scores = evaluate(settings, algo, params, args.episodes, args.seed, args.run)
         for s in scores:
             if not alone:
                 print(f"\n{s.name} | cost limit {in_words(s.limits)}")

@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsafe.learn.on_policy import Algorithm
+from jaxsafe.learn.acting import Player
 from jaxsafe.report import scores, stats
 from jaxsafe.report.stats import Estimate
-from jaxsafe.types import Env, PyTree
+from jaxsafe.types import Algorithm, PyTree
 
 
 class Episodes(NamedTuple):
@@ -26,45 +26,46 @@ class Episodes(NamedTuple):
 
 
 def episode(
-    env: Env,
-    act: Callable[[jax.Array, jax.Array], jax.Array],
+    player: Player,
     key: jax.Array,
     discount: jax.Array | float = 1.0,
     cost_discount: jax.Array | float = 1.0,
 ) -> Episodes:
-    """One whole episode, pure: rewards and costs count until termination or the time limit.
+    """One whole episode of mean actions, pure: rewards and costs count until termination or the limit.
 
     The discounted sums, sum_t discount^t r_t and likewise of costs, begin with the first step.
     """
-    reset_key, act_key = jax.random.split(key)
+    reset_key, _ = jax.random.split(key)
+    env = player.task
 
-    def step(carry, t):
-        state, alive = carry
-        state = env.step(state, act(state.obs, jax.random.fold_in(act_key, t)))
+    def step(now, t):
+        state, carry, alive = now
+        action, carry = player.act(carry, state)
+        state = env.step(state, action)
         reward, cost = alive * state.reward, alive * state.cost
         later = discount**t * reward, cost_discount**t * cost
         sums = Episodes(reward, cost, alive * state.costs, alive, *later)
-        return (state, alive * (1.0 - state.terminated)), sums
+        return (state, carry, alive * (1.0 - state.terminated)), sums
 
-    _, sums = jax.lax.scan(step, (env.reset(reset_key), jnp.float32(1)), jnp.arange(env.episode_length))
+    start = env.reset(reset_key), player.begin(), jnp.float32(1)
+    _, sums = jax.lax.scan(step, start, jnp.arange(env.episode_length))
     return jax.tree.map(lambda x: x.sum(0), sums)
 
 
-def run_episodes(algo: Algorithm, ts: PyTree, num_episodes: int, seed: int) -> Episodes:
-    """`num_episodes` fresh episodes for each of the S train states in `ts` (leading axis), compiled.
+def run_episodes(algo: Algorithm, params: PyTree, num_episodes: int, seed: int) -> Episodes:
+    """`num_episodes` fresh episodes for each of the S policies in `params` (leading axis), compiled.
 
-    The policy is the deterministic one. Every train state meets the same episodes, so that seeds
-    differ by their policy alone.
+    Actions are the mean ones. Every policy meets the same episodes, so that seeds differ by their
+    policy alone.
     """
     keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), 0x6576616C), num_episodes)
 
-    def one_seed(ts: PyTree) -> Episodes:
-        task, discounts = algo.task(ts), (ts.config.discount, ts.config.cost_discount)
-        return jax.vmap(
-            lambda key: episode(task, lambda obs, _: algo.act(ts, obs, None), key, *discounts)
-        )(keys)
+    def one_seed(params: PyTree) -> Episodes:
+        player = Player(algo.policy, params, algo.task(params))
+        discounts = params.config.discount, params.config.cost_discount
+        return jax.vmap(lambda key: episode(player, key, *discounts))(keys)
 
-    return jax.tree.map(np.asarray, jax.jit(jax.vmap(one_seed))(ts))
+    return jax.tree.map(np.asarray, jax.jit(jax.vmap(one_seed))(params))
 
 
 def estimate(values: np.ndarray) -> Estimate:

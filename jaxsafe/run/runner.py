@@ -25,13 +25,12 @@ from jaxsafe.learn.constraints import own_limits
 from jaxsafe.run import checkpoint, distributed, run_folder
 from jaxsafe.run.interrupts import Interrupts
 from jaxsafe.run.progress import Report
-from jaxsafe.types import Env, PyTree
+from jaxsafe.types import Algorithm, Clocks, Env, PyTree, Shared
 
 AXIS = "devices"
 OVERFLOW = "train/overflow"  # steps of an episode in which engine warp ran out of room
 ROOM = 0.8  # of the memory that a program may take by `capacity`
-POLICY = ("params", "normaliser")  # the fields of a train state that another run can start from
-ACTING = (*POLICY, "dual")  # what an algorithm's `act` and `task` read, beside its config
+POLICY = ("params", "normaliser")  # the parts of what acts that another run can start from
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -95,10 +94,13 @@ def members(configs: Sequence[Any], settings: TrainConfig) -> list[Member]:
 
 
 class Program(NamedTuple):
-    """`init(start) -> ts` and `update(ts) -> (ts, metrics)` over the leading axis, not yet compiled."""
+    """`init(start, shared) -> ts` and `update(ts, shared) -> (ts, metrics)` over the leading axis, not
+    yet compiled. `params(ts)` is what acts, on the same axis; `clocks` are those of one seed."""
 
-    init: Callable[[PyTree], PyTree]
-    update: Callable[[PyTree], tuple[PyTree, dict[str, jax.Array]]]
+    init: Callable[[PyTree, Shared], PyTree]
+    update: Callable[[PyTree, Shared], tuple[PyTree, dict[str, jax.Array]]]
+    params: Callable[[PyTree], PyTree]
+    clocks: Clocks
     start: PyTree  # (keys, config): [M], or [devices] for one split member
     members: list[Member]
     sharding: jax.sharding.Sharding
@@ -142,57 +144,66 @@ def build(env: Env, make: Callable, configs: Sequence[Any], settings: TrainConfi
     if configs[0].num_envs % share:
         raise ConfigError(f"num_envs={configs[0].num_envs} does not split over devices={devices}")
 
+    algo: Algorithm = make(env, AXIS if share > 1 else None)
+    clocks = algo.clocks(configs[0])
+
     def settled(cfg: Any) -> Any:
         ends = cfg.total_iterations
         if math.isinf(ends):
-            ends = float(-(-settings.total_steps // (cfg.num_envs * cfg.horizon)))
+            ends = float(-(-settings.total_steps // clocks.steps))
         return dataclasses.replace(cfg, num_envs=cfg.num_envs // share, total_iterations=ends)
 
     # A split seed has one key for all its devices: the algorithm folds the device's index in.
     keys = jax.vmap(jax.random.key)(np.array([m.seed for m in run] * share, np.uint32))
     floats = jax.tree.map(lambda *x: np.array(x, np.float32), *[settled(m.algo) for m in run * share])
-    algo = make(env, AXIS if share > 1 else None)
     rows = max(1, len(run) // devices)  # on each device
-    init = over_rows(lambda start: algo.init(*start), rows)
+    init = over_rows(lambda start, shared: algo.init(start[0], start[1], shared), rows)
     update = over_rows(algo.update, rows)
     if devices == 1:
         one = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
-        return Program(init, update, (keys, floats), run, one)
+        return Program(init, update, algo.params, clocks, (keys, floats), run, one)
     mesh = jax.make_mesh(
         (devices,), (AXIS,), devices=jax.devices()[:devices], axis_types=(AxisType.Auto,)
     )
     spec = PartitionSpec(AXIS)
 
     def split(fn: Callable) -> Callable:
-        def parted(tree: PyTree) -> PyTree:
+        def parted(tree: PyTree, shared: Shared) -> PyTree:
             leaves, treedef = jax.tree.flatten(tree)
 
-            def own_part(full: list[jax.Array]) -> PyTree:
+            def own_part(full: list[jax.Array], shared: Shared) -> PyTree:
                 given = iter(full)
-                return fn(treedef.unflatten([next(given) if x.size else empty(x) for x in leaves]))
+                tree = treedef.unflatten([next(given) if x.size else empty(x) for x in leaves])
+                return fn(tree, shared)
 
             # arrays without elements stay outside: jax 0.11 crashes on them as inputs
             full = [x for x in leaves if x.size]
-            fields = {"mesh": mesh, "in_specs": spec, "out_specs": spec, "check_vma": False}
-            return jax.shard_map(own_part, **fields)(full)
+            specs = {"in_specs": (spec, PartitionSpec()), "out_specs": spec}
+            return jax.shard_map(own_part, mesh=mesh, **specs, check_vma=False)(full, shared)
 
         return parted
 
     def empty(x: jax.Array) -> jax.Array:
         return jnp.zeros((x.shape[0] // devices, *x.shape[1:]), x.dtype)
 
-    return Program(split(init), split(update), (keys, floats), run, NamedSharding(mesh, spec))
+    sharding = NamedSharding(mesh, spec)
+    return Program(split(init), split(update), algo.params, clocks, (keys, floats), run, sharding)
 
 
-def over_rows(fn: Callable[[PyTree], PyTree], rows: int) -> Callable[[PyTree], PyTree]:
+def over_rows(fn: Callable[[PyTree, Shared], PyTree], rows: int) -> Callable[[PyTree, Shared], PyTree]:
     """`fn` over a leading axis of `rows`. One row is no vmap, which would run both sides of a cond."""
 
     def strong(tree: PyTree) -> PyTree:  # no weak types, so that a restored state is the same program
         return jax.tree.map(lambda x: x if checkpoint.is_key(x) else jnp.asarray(x, x.dtype), tree)
 
-    if rows > 1:
-        return lambda xs: strong(jax.vmap(fn)(xs))
-    return lambda xs: strong(jax.tree.map(lambda y: y[None], fn(jax.tree.map(lambda x: x[0], xs))))
+    def alone(tree: PyTree, shared: Shared) -> PyTree:
+        out = fn(jax.tree.map(lambda x: x[0], tree), shared)
+        return strong(jax.tree.map(lambda x: x[None], out))
+
+    def together(tree: PyTree, shared: Shared) -> PyTree:
+        return strong(jax.vmap(fn, in_axes=(0, None))(tree, shared))
+
+    return together if rows > 1 else alone
 
 
 def check_devices(settings: TrainConfig) -> None:
@@ -227,7 +238,7 @@ def check_memory(env: Env, algo_config: Any, num_members: int, devices: int) -> 
 def check_state_memory(program: Program, settings: TrainConfig) -> None:
     """Like `check_memory`, for the train state itself (old and new), known once it is traced."""
     limit, what = device_memory()
-    leaves = jax.tree.leaves(jax.eval_shape(program.init, program.start))
+    leaves = jax.tree.leaves(jax.eval_shape(program.init, program.start, Shared(np.int32(0))))
     need = (
         2
         * sum(x.size * (8 if checkpoint.is_key(x) else x.dtype.itemsize) for x in leaves)
@@ -244,7 +255,7 @@ def capacity(program: Program) -> int:
     """How many of its members fit the memory at once, by the compiled update's own account."""
     like = jax.tree.map(
         lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=program.sharding),
-        jax.eval_shape(program.init, program.start),
+        jax.eval_shape(program.init, program.start, Shared(np.int32(0))),
     )
     used: Any = compiled(program, like).memory_analysis()
     need = used.temp_size_in_bytes + used.argument_size_in_bytes + used.output_size_in_bytes
@@ -254,7 +265,7 @@ def capacity(program: Program) -> int:
 
 def compiled(program: Program, ts: PyTree) -> Any:
     """The update for a train state of these shapes; JAX remembers it."""
-    return jax.jit(program.update, donate_argnums=0).lower(ts).compile()
+    return jax.jit(program.update, donate_argnums=0).lower(ts, Shared(np.int32(0))).compile()
 
 
 def device_memory() -> tuple[float, str]:
@@ -299,8 +310,7 @@ def train(
     Raises:
         checkpoint.CheckpointError, OSError: the disk failed; the last good checkpoint stays.
     """
-    cfg = program.members[0].algo
-    per_update = cfg.num_envs * cfg.horizon  # steps of one seed
+    per_update = program.clocks.steps
     iterations = -(-settings.total_steps // per_update)
     store = folder / "checkpoints"
     resuming = bool(distributed.first(np.array(bool(checkpoint.checkpoints(store)))))
@@ -308,22 +318,23 @@ def train(
         stop.nothing_to_save = (
             f"stopped before the first update; {resume_command if resuming else 'nothing to save'}"
         )
-        start = time.perf_counter()
+        begun = time.perf_counter()
         iteration = 0
         if resuming:
-            like = jax.eval_shape(program.init, program.start)
+            like = jax.eval_shape(program.init, program.start, Shared(np.int32(0)))
             ts, iteration = restored(store, like, report)
             ts = distributed.place(ts, program.sharding)
             report.line(f"resuming at {iteration * per_update:,} steps")
         else:
-            ts = jax.jit(program.init)(distributed.place(program.start, program.sharding))
+            start = distributed.place(program.start, program.sharding)
+            ts = jax.jit(program.init)(start, Shared(np.int32(0)))
             ts = distributed.place(adapt(ts), program.sharding) if adapt else ts
         if iteration >= iterations:
             report.line("nothing left to train")
             return Outcome(ts, iteration, iteration * per_update, False)
-        names = sorted(jax.eval_shape(program.update, ts)[1])
+        names = sorted(jax.eval_shape(program.update, ts, Shared(np.int32(0)))[1])
         update = compiled(program, ts)
-        report.line(f"compiled in {time.perf_counter() - start:.1f} s")
+        report.line(f"compiled in {time.perf_counter() - begun:.1f} s")
         stop.nothing_to_save = ""
 
         vote = distributed.Vote(program.sharding)
@@ -336,7 +347,7 @@ def train(
             report.start(iterations * per_update, iteration * per_update, limits)
             saved_at = time.perf_counter()
             while iteration < iterations:
-                ts, metrics = update(ts)
+                ts, metrics = update(ts, Shared(np.int32(iteration)))
                 metrics, iteration = distributed.whole(metrics), iteration + 1
                 if log:
                     log.append(iteration, metrics)
@@ -350,6 +361,10 @@ def train(
                     if log:
                         log.sync()
                         checkpoint.save(store, state, iteration, iteration * per_update)
+                        acting = jax.tree.map(
+                            lambda x: x[: len(program.members)], program.params(state)
+                        )
+                        checkpoint.save(folder / "policy", acting, iteration, iteration * per_update)
                     saved_at = time.perf_counter()
                 if stopping:
                     break
@@ -469,33 +484,36 @@ def mean(values: np.ndarray) -> float:
 # ---- the policy alone: other runs start from it, evaluation needs nothing else ----------------
 
 
+def policy_folder(folder: Path) -> Path:
+    """Where the policies of a run lie: beside its checkpoints or, in runs before 0.2, in them."""
+    alone = folder / "policy"
+    return alone if checkpoint.checkpoints(alone) else folder / "checkpoints"
+
+
 def read_policy(
     folder: Path,
     rows: int,
     warn: Callable[[str], None] | None = None,
-    fields: Sequence[str] = POLICY,
 ) -> dict[str, np.ndarray]:
-    """`fields` of the newest checkpoint of a run folder, by leaf name, [rows, ...].
+    """The newest policies of a run folder by leaf name, [rows, ...], with whatever else lies there.
 
     Rows beyond the run's members are the copies on the other devices of a split one.
     """
-    arrays, _ = checkpoint.load(folder / "checkpoints", warn)
-    policy = {name: x[:rows] for name, x in arrays.items() if name.split(".")[0] in fields}
+    arrays, _ = checkpoint.load(policy_folder(folder), warn)
+    policy = {name: x[:rows] for name, x in arrays.items()}
     if any(len(x) != rows for x in policy.values()):
         raise ConfigError(f"{folder} holds fewer than the {rows} policies of its config.yaml")
     return policy
 
 
-def check_policy(
-    like: PyTree,
-    policy: dict[str, np.ndarray],
-    source: Path,
-    fields: Sequence[str] = POLICY,
-    why: str = "",
-) -> None:
-    """Raise ConfigError unless `policy` fits `fields` of the train state `like`, whatever its rows."""
+def check_policy(like: PyTree, policy: dict[str, np.ndarray], source: Path, why: str = "") -> None:
+    """Raise ConfigError unless `policy` has the networks of `like`, whatever its rows."""
+
+    def networks(named: dict[str, Any]) -> dict[str, Any]:
+        return {k: v for k, v in named.items() if k.split(".")[0] in POLICY}
+
     expected = dict(zip(checkpoint.leaf_names(like), jax.tree.leaves(like), strict=True))
-    expected = {k: v for k, v in expected.items() if k.split(".")[0] in fields}
+    expected, policy = networks(expected), networks(policy)
     for name in sorted({*expected, *policy}):
         have, want = (
             str(list(x[name].shape[1:])) if name in x else "absent" for x in (policy, expected)
@@ -507,24 +525,37 @@ def check_policy(
 
 
 def with_policy(ts: PyTree, policy: dict[str, np.ndarray], rows: Sequence[int]) -> PyTree:
-    """`ts` with the parameters and normaliser of `policy`: row `rows[i]` of it for member i.
+    """`ts` with the networks and normaliser of `policy`: row `rows[i]` of it for member i.
 
     The copies of a member on several devices share its row.
     """
     leaves, treedef = jax.tree.flatten(ts)
     picks = np.resize(rows, len(leaves[0]))
+
+    def start(name: str, x: jax.Array) -> jax.Array:
+        taken = name in policy and name.split(".")[0] in POLICY
+        return jnp.asarray(policy[name][picks], x.dtype) if taken else x
+
     named = zip(checkpoint.leaf_names(ts), leaves, strict=True)
-    return treedef.unflatten(
-        [jnp.asarray(policy[name][picks], x.dtype) if name in policy else x for name, x in named]
-    )
+    return treedef.unflatten([start(name, x) for name, x in named])
 
 
-def policy_state(like: PyTree, policy: dict[str, np.ndarray], rows: int, source: Path) -> PyTree:
-    """A train state with `rows` policies and zeros elsewhere; `like` is one, without that axis."""
+def acting(like: PyTree, policy: dict[str, np.ndarray], configs: PyTree, source: Path) -> PyTree:
+    """What acts of each of S policies, [S, ...].
+
+    Args:
+        like: of one, without that axis.
+        policy: from `read_policy`.
+        configs: the algorithm's, floats [S], from config.yaml.
+        source: the run folder, for messages.
+    Raises:
+        ConfigError: the policies are of other networks.
+    """
+    rows = len(jax.tree.leaves(configs)[0])
     like = jax.tree.map(lambda x: jax.ShapeDtypeStruct((rows, *x.shape), x.dtype), like)
-    check_policy(like, policy, source, ACTING)
-    arrays = {
-        name: policy[name] if name in policy else np.zeros(x.shape, x.dtype)
-        for name, x in checkpoint.as_data(like).items()
-    }
+    check_policy(like, policy, source)
+    arrays = policy | checkpoint.to_arrays({"config": configs})
+    for name in checkpoint.leaf_names(like):
+        if name not in arrays:
+            raise ConfigError(f"the policy of {source} does not fit: {name} is absent")
     return checkpoint.from_arrays(like, arrays)

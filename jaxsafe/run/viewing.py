@@ -143,16 +143,16 @@ def watch_main(envs: Any, algos: Any) -> int:
         if folders:
             actor = open_actor(folders[0], next(iter(options), None), args.index, envs, algos)
             title = f"{actor.settings.env_name}, {actor.settings.algo_name}"
-            env, policy, task = actor.env, actor.act, actor.algo.task(actor.ts)
+            env, player = actor.env, actor.player
         else:
             settings = compose(options, envs, algos)
             if settings.env_options.get("engine") == "auto":  # one environment gains from no other
                 settings = settings._replace(env_options=settings.env_options | {"engine": "c"})
-            title, env, policy, task = settings.env_name, make_env(settings, envs), None, None
+            title, env, player = settings.env_name, make_env(settings, envs), None
         print(f"{title}: compiling a step ...", flush=True)
         try:
             with contextlib.suppress(KeyboardInterrupt):  # the page's server may have taken it
-                session = watch.Session(env, policy, task, args.seed)
+                session = watch.Session(env, player, args.seed)
                 if page:
                     watch.serve_page(session, title, args.port, args.open)
                 else:

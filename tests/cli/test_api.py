@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import rich.console
 from tasks import FAST
-from toys import Corridor
+from toys import FIRST, Corridor
 
 import jaxsafe
 from jaxsafe import algos, api, envs
@@ -45,7 +45,9 @@ PRICED = algos.Entry(
 @pytest.fixture(scope="module", autouse=True)
 def compiled_quickly():
     def quick(program: runner.Program, ts: Any) -> Any:
-        return jax.jit(program.update, donate_argnums=0, compiler_options=FAST).lower(ts).compile()
+        return (
+            jax.jit(program.update, donate_argnums=0, compiler_options=FAST).lower(ts, FIRST).compile()
+        )
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(runner, "compiled", quick)

@@ -21,6 +21,7 @@ from tasks import FAST
 from jaxsafe import algos, envs
 from jaxsafe.config import ConfigError
 from jaxsafe.run import checkpoint, command, compat, run_folder, runner, viewing
+from jaxsafe.types import Shared
 
 SCRIPTS = Path(__file__).parent.parent.parent / "scripts"
 SMALL = (
@@ -301,16 +302,16 @@ def test_the_policy_of_a_run_is_read_whatever_its_minibatches_divide(tmp_path, n
     program = runner.build(env, make, run.configs, run.train)
     ones = jax.tree.map(
         lambda x: np.ones(x.shape, x.dtype),
-        {k: getattr(jax.eval_shape(program.init, program.start), k) for k in runner.ACTING},
+        program.params(jax.eval_shape(program.init, program.start, Shared(np.int32(0)))),
     )
     run_folder.write_config(tmp_path, run.plain())
-    checkpoint.save(tmp_path / "checkpoints", ones, 1, 40)
-    algo, ts = command.policy_of(run, env, algos, tmp_path)
-    ts = jax.tree.map(lambda x: x[0], ts)
-    action = algo.act(ts, jnp.zeros((1, algo.task(ts).obs_size)), None)
-    assert action.shape == (1, env.action_size)
-    assert ts.config.cost_limit == 25.0  # `task` may need the settings, and the dual
-    assert all((x == 1).all() for x in jax.tree.leaves((ts.params, ts.normaliser, ts.dual)))
+    checkpoint.save(tmp_path / "policy", ones, 1, 40)
+    algo, params = command.policy_of(run, env, algos, tmp_path)
+    params = jax.tree.map(lambda x: x[0], params)
+    action, _, _ = algo.policy.act(params, (), jnp.zeros(algo.task(params).obs_size), None)
+    assert action.shape == (env.action_size,)
+    assert params.config.cost_limit == 25.0  # `task` may need the settings, and the dual
+    assert all((x == 1).all() for x in jax.tree.leaves((params.params, params.normaliser, params.dual)))
 
 
 def test_evaluate_render_and_watch_refuse_a_bad_folder_in_one_line(tmp_path, monkeypatch, capsys):

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 import pytest
 from tasks import FAST
-from toys import Corridor
+from toys import FIRST, Corridor
 
 from jaxsafe import algos, envs
 from jaxsafe.config import ConfigError, float_fields
@@ -76,7 +76,7 @@ def compiled_quickly():
         return jax.jit(update, donate_argnums=0, compiler_options=FAST)
 
     def quick(program: runner.Program, ts: Any) -> Any:
-        return compiled(program.update).lower(ts).compile()
+        return compiled(program.update).lower(ts, FIRST).compile()
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(runner, "compiled", quick)
@@ -208,7 +208,7 @@ def test_every_float_of_every_algorithm_may_differ_between_members(name):
     program = runner.build(
         Hall(), algos.ALGOS[name].make, (cfg, other), runner.TrainConfig(num_seeds=2)
     )
-    ts = jax.eval_shape(program.init, program.start)
+    ts = jax.eval_shape(program.init, program.start, FIRST)
     assert all(x.shape == (4,) for x in jax.tree.leaves(ts.config))
     assert jax.tree.leaves(program.start[1])[0].dtype == np.float32
 
@@ -275,7 +275,7 @@ def test_the_memory_decides_how_many_members_run_at_once(monkeypatch):
     (settings,) = asked.groups.values()
     parallel, program = sweeps.fitting(settings, None, TOYS, algos)
     assert parallel == len(program.members) == 8
-    like = jax.eval_shape(program.init, program.start)
+    like = jax.eval_shape(program.init, program.start, FIRST)
     used = runner.compiled(program, like).memory_analysis()
     need = used.temp_size_in_bytes + used.output_size_in_bytes  # arguments are reused for the output
     monkeypatch.setattr(runner, "device_memory", lambda: (need * 0.5 / runner.ROOM, "this machine"))

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 from scipy.optimize import minimize
+from toys import context
 
 from jaxsafe.algos import cpo, cup, focops, p3o, pcpo
 from jaxsafe.learn.on_policy import Batch
-from jaxsafe.learn.steps import adam_epochs
+from jaxsafe.learn.steps import Pair, adam_epochs
 from jaxsafe.learn.surrogates import clipped, near_old, pessimistic, plain
 from jaxsafe.nn.gaussian import Gaussian, kl, log_prob, sample
 from jaxsafe.nn.networks import init_params, policy
@@ -138,15 +139,14 @@ def test_the_penalty_is_felt_beyond_the_limit_alone(excess, price, omnisafe):
         reward, _ = clipped(dist, batch, batch.adv_r, cfg)
         return reward - price * of_cost(dist, batch, batch.adv_c, cfg)[0], {}
 
-    pair = objective(clipped, "adv_r"), objective(p3o.surrogate_c, "adv_c")
-    state, key = adam_epochs.init(actor, cfg), jax.random.key(0)
-    numbers = jnp.float32(excess), jnp.float32(10.0)
-    after, _, metrics = p3o.update(actor, state, *pair, *numbers, batch, key, cfg, None)
+    pair = Pair(objective(clipped, "adv_r"), objective(p3o.surrogate_c, "adv_c"))
+    state, told = adam_epochs.init(actor, cfg), context(cfg, excess=excess, length=10.0)
+    after, _, metrics = p3o.update(actor, state, pair, batch, told)
     cost = p3o.surrogate_c(policy(after, batch.obs, cfg), batch, batch.adv_c, cfg)[0]
     violation = 1.0 if omnisafe else 1.0 / 10  # per episode, or per step of an episode of 10
     paid = price * (cost + violation)
     np.testing.assert_allclose(metrics["train/penalty"], paid, rtol=1e-5)
-    same, _, _ = adam_epochs.update(actor, state, mixed, batch, key, cfg, None)
+    same, _, _ = adam_epochs.update(actor, state, mixed, batch, told)
     for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(same), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7)
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from tasks import FAST
-from toys import Clock, Corridor, Lever
+from toys import FIRST, Clock, Corridor, Lever, updated
 
 from jaxsafe.algos import ALGOS
 from jaxsafe.config import ConfigError
@@ -26,11 +26,11 @@ TINY: dict[str, Any] = {"num_envs": 8, "horizon": 25, "minibatches": 2, "hidden"
 @cache
 def build(name, env=Corridor()):  # noqa: B008
     algo = ALGOS[name].make(env)
-    return algo, jax.jit(algo.update, compiler_options=FAST)
+    return algo, jax.jit(updated(algo), compiler_options=FAST)
 
 
 def start(name, seed=0, **settings):
-    return build(name)[0].init(jax.random.key(seed), ALGOS[name].config(**TINY | settings))
+    return build(name)[0].init(jax.random.key(seed), ALGOS[name].config(**TINY | settings), FIRST)
 
 
 def row(tree, i):
@@ -89,8 +89,8 @@ def every_option(name):
 def test_an_update_with_every_option_at_once_keeps_the_structure(name):
     algo = ALGOS[name].make(Corridor())
     cfg = ALGOS[name].config(**TINY | every_option(name))
-    before = jax.eval_shape(lambda key: algo.init(key, cfg), jax.random.key(0))
-    after, _ = jax.eval_shape(algo.update, before)
+    before = jax.eval_shape(lambda key: algo.init(key, cfg, FIRST), jax.random.key(0))
+    after, _ = jax.eval_shape(algo.update, before, FIRST)
     assert jax.tree.structure(before) == jax.tree.structure(after)
     assert all(a.shape == b.shape for a, b in zip(*map(jax.tree.leaves, (before, after)), strict=True))
 
@@ -132,7 +132,7 @@ def test_the_constraint_and_the_metrics_see_rewards_and_costs_as_they_are():
     algo, update = build("pdo", Clock(episode_length=5))
     sizes = TINY | {"stagger": False, "horizon": 5, "cost_limit": 9.0}
     runs = [
-        update(algo.init(jax.random.key(0), ALGOS["pdo"].config(**sizes | normalised)))
+        update(algo.init(jax.random.key(0), ALGOS["pdo"].config(**sizes | normalised), FIRST))
         for normalised in ({}, {"reward_normalize": True, "cost_normalize": True})
     ]
     for ts, m in runs:
@@ -145,7 +145,9 @@ def test_the_constraint_and_the_metrics_see_rewards_and_costs_as_they_are():
 
 def test_the_constraint_sees_the_mean_cost_of_the_window():
     algo, update = build("crpo", Clock(episode_length=5))
-    ts = algo.init(jax.random.key(0), ALGOS["crpo"].config(**TINY, cost_window=3, cost_limit=6.0))
+    ts = algo.init(
+        jax.random.key(0), ALGOS["crpo"].config(**TINY, cost_window=3, cost_limit=6.0), FIRST
+    )
     seen = []
     for _ in range(4):  # an episode costs 10: above the limit of 6, and its tolerance of 2
         ts, metrics = update(ts)
@@ -201,12 +203,12 @@ def test_seeds_and_cost_limits_side_by_side_are_the_lone_ones(name):
     cfg = ALGOS[name].config(**TINY)
 
     def init(key, limit):
-        return algo.init(key, dataclasses.replace(cfg, cost_limit=limit))
+        return algo.init(key, dataclasses.replace(cfg, cost_limit=limit), FIRST)
 
     keys, limits = jnp.stack([jax.random.key(i) for i in range(3)]), jnp.array([25.0, 1.0, 5.0])
     together = jax.vmap(init)(keys, limits)
     lone = [init(*pair) for pair in zip(keys, limits, strict=True)]
-    vmapped = jax.jit(jax.vmap(algo.update), compiler_options=FAST)
+    vmapped = jax.jit(jax.vmap(updated(algo)), compiler_options=FAST)
     # sums are ordered differently, and unfinished conjugate gradients amplify that some hundredfold;
     # z has a scale of its own, so trpo_saute's are the worst conditioned
     for tolerance in (1e-6, 3e-4 if name == "trpo_saute" else 1e-4):
@@ -223,7 +225,7 @@ def test_published_settings_build(name):
     for settings in ALGOS[name].published.values():
         cfg = ALGOS[name].config(**settings)
         jax.eval_shape(
-            lambda key, cfg=cfg: ALGOS[name].make(Corridor()).init(key, cfg), jax.random.key(0)
+            lambda key, cfg=cfg: ALGOS[name].make(Corridor()).init(key, cfg, FIRST), jax.random.key(0)
         )
 
 
@@ -235,7 +237,9 @@ def test_sizes_that_do_not_fit_are_refused_with_the_nearest_that_do(name):
 
 def test_metrics_are_of_the_episodes_that_ended():
     algo, update = build("ppo", Clock(episode_length=5, lives=(3, 3)))
-    ts = algo.init(jax.random.key(0), ALGOS["ppo"].config(**TINY | {"stagger": False, "horizon": 6}))
+    ts = algo.init(
+        jax.random.key(0), ALGOS["ppo"].config(**TINY | {"stagger": False, "horizon": 6}), FIRST
+    )
     ts, m = update(ts)
     expected = {"episodes": 16, "return": 3, "cost": 6, "cost_a": 1.5, "cost_b": 4.5, "ticks": 3}
     expected |= {"episode_length": 3, "cost_rate": 2}
@@ -248,7 +252,7 @@ def test_metrics_are_of_the_episodes_that_ended():
 def test_no_episodes_have_no_mean():
     algo, update = build("ppo", Clock(episode_length=99, lives=(999, 999)))
     cfg = ALGOS["ppo"].config(**TINY | {"stagger": False, "horizon": 6})
-    _, m = update(algo.init(jax.random.key(0), cfg))
+    _, m = update(algo.init(jax.random.key(0), cfg, FIRST))
     assert m["train/episodes"] == 0 and jnp.isnan(m["train/return"]) and jnp.isnan(m["train/ticks"])
     assert m["train/cost_estimate"] == 2 * 99
 
@@ -273,16 +277,20 @@ def test_acting_normalises_and_is_the_mean_without_a_key(name):
     ts, _ = update(start(name))
     size = ts.rollout.state.obs.shape[-1]  # with what an augmentation appends
     obs = jax.random.normal(jax.random.key(1), (500, size))
-    mean = algo.act(ts, obs[0], None)
+
+    def act(ts, obs, key=None):
+        return algo.policy.act(algo.params(ts), (), obs, key)[0]
+
+    mean = act(ts, obs[0])
     assert mean.shape == (2,)
-    draws = jax.vmap(lambda key: algo.act(ts, obs[0], key))(jax.random.split(jax.random.key(0), 4000))
+    draws = jax.vmap(lambda key: act(ts, obs[0], key))(jax.random.split(jax.random.key(0), 4000))
     std = jnp.exp(ts.params["actor"]["log_std"])
     np.testing.assert_allclose(draws.mean(0), mean, atol=0.05)
     np.testing.assert_allclose(draws.std(0), std, rtol=0.05)
     normaliser = dataclasses.replace(ts.normaliser, mean=ts.normaliser.mean + 1)
     shifted = dataclasses.replace(ts, normaliser=normaliser)
     moved = obs.at[:, :4].add(1.0)
-    assert_close(algo.act(shifted, moved, None), algo.act(ts, obs, None), atol=1e-4)
+    assert_close(act(shifted, moved), act(ts, obs), atol=1e-4)
 
 
 def test_without_normalisation_nothing_is_kept():
@@ -295,7 +303,7 @@ import sys; sys.path.insert(0, sys.argv[1])
 import jax, jax.numpy as jnp, numpy as np
 from jax.sharding import AxisType, PartitionSpec as P
 from tasks import FAST
-from toys import Corridor
+from toys import FIRST, Corridor, updated
 from jaxsafe.algos import ALGOS
 from jaxsafe.on_policy import learned
 
@@ -313,8 +321,8 @@ for name in sys.argv[2:]:
     sizes = dict(num_envs=4, horizon=10, minibatches=2, hidden=(4,), critic_epochs=2)
     cfg = entry.config(**sizes, reward_normalize=True, trunk=trunk)
     keys = jnp.stack([jax.random.key(0)] * 2)
-    ts = split(lambda key: algo.init(key, cfg))(keys)
-    update = split(algo.update)
+    ts = split(lambda key: algo.init(key, cfg, FIRST))(keys)
+    update = split(updated(algo))
     for _ in range(2):
         ts, metrics = update(ts)
         statistics = (ts.normaliser, ts.signals, ts.episode_length)
@@ -400,8 +408,8 @@ def train_on_levers(name, settings, iterations=100, **swept):
     cfg = ALGOS[name].config(**sizes, hidden=(16,), cost_limit=2.5, **settings)
 
     def train(key, swept):
-        ts = algo.init(key, dataclasses.replace(cfg, **swept))
-        return jax.lax.scan(lambda ts, _: algo.update(ts), ts, None, iterations)
+        ts = algo.init(key, dataclasses.replace(cfg, **swept), FIRST)
+        return jax.lax.scan(lambda ts, _: algo.update(ts, FIRST), ts, None, iterations)
 
     keys = jax.random.split(jax.random.key(0), max(map(len, swept.values()), default=2))
     return algo, *jax.jit(jax.vmap(train), compiler_options=FAST)(keys, swept)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from tasks import FAST
-from toys import Clock, Lever
+from toys import FIRST, Clock, Lever
 
 from jaxsafe.algos import ALGOS
 from jaxsafe.config import ConfigError
@@ -115,14 +115,14 @@ def test_the_algorithms_by_adam_share_a_trunk_and_the_others_say_that_they_do_no
     cfg = ALGOS[name].config(num_envs=8, horizon=10, minibatches=2, hidden=(8,), trunk="shared")
 
     def init():
-        return jax.eval_shape(lambda: algo.init(jax.random.key(0), cfg))
+        return jax.eval_shape(lambda: algo.init(jax.random.key(0), cfg, FIRST))
 
     if name not in BY_ADAM:
         with pytest.raises(ConfigError, match="trunk=shared: expected separate"):
             init()
         return
     before = init()
-    after, metrics = jax.eval_shape(algo.update, before)
+    after, metrics = jax.eval_shape(algo.update, before, FIRST)
     assert jax.tree.structure(before) == jax.tree.structure(after)
     assert [*before.params] == ["actor"] and before.opt_state["critics"] == ()
     assert before.params["actor"]["mean"]["params"]["Dense_1"]["bias"].shape == (1 + 2,)
@@ -137,7 +137,7 @@ def test_each_value_on_a_shared_trunk_learns_its_own_cost():
     )  # fmt: skip
 
     def train(key):
-        return jax.lax.scan(lambda ts, _: algo.update(ts), algo.init(key, cfg), None, 20)
+        return jax.lax.scan(lambda ts, _: algo.update(ts, FIRST), algo.init(key, cfg, FIRST), None, 20)
 
     seeds = jax.random.split(jax.random.key(0), 2)
     ts, metrics = jax.jit(jax.vmap(train), compiler_options=FAST)(seeds)
@@ -159,7 +159,9 @@ def test_a_policy_on_a_shared_trunk_learns_what_the_limit_allows():
     )  # fmt: skip
 
     def train(key):
-        return jax.lax.scan(lambda ts, _: algo.update(ts), algo.init(key, cfg), None, 100)[1]
+        return jax.lax.scan(
+            lambda ts, _: algo.update(ts, FIRST), algo.init(key, cfg, FIRST), None, 100
+        )[1]
 
     metrics = jax.jit(jax.vmap(train), compiler_options=FAST)(jax.random.split(jax.random.key(0), 2))
     ret, cost = (np.asarray(metrics[f"train/{k}"])[:, -30:].mean(1) for k in ("return", "cost"))

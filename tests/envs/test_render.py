@@ -16,6 +16,7 @@ import pytest
 from jaxsafe import envs
 from jaxsafe.config import ConfigError
 from jaxsafe.envs.view import render
+from jaxsafe.learn.acting import reflex
 
 WIDTH, HEIGHT = 320, 240
 
@@ -161,10 +162,10 @@ def test_a_caption_says_what_an_episode_has_earned_and_cost(display, monkeypatch
     said = []
     monkeypatch.setattr(render, "captioned", lambda frame, text: said.append(text) or frame)
     env, _ = reset("point_goal0", num_steps=4)
-    act = lambda obs, key: jnp.array([1.0, 0.0])  # noqa: E731
-    states = render.run_episode(env, act, jax.random.key(3), 4)
+    player = reflex(lambda obs: jnp.array([1.0, 0.0]), env)
+    states = render.run_episode(player, jax.random.key(3), 4)
     monkeypatch.setattr(render, "run_episode", lambda *args: states)
-    render.render_episode(env, act, jax.random.key(3), every=2, label="cpo", width=64, height=48)
+    render.render_episode(env, player, jax.random.key(3), every=2, label="cpo", width=64, height=48)
     returns = np.cumsum(states.reward)
     assert said == [f"cpo   return {returns[t]:.1f}   cost 0" for t in (0, 2, 4)]
     frame = np.zeros((48, 200, 3), np.uint8)
@@ -190,13 +191,14 @@ def test_an_unknown_camera_is_named_with_the_nearest():
 
 
 def test_an_episode_is_drawn_at_most_at_30_frames_a_second_and_until_it_terminates(display):
-    zero = lambda obs, key: jnp.zeros(2)  # noqa: E731
     env, _ = reset("point_goal0", num_steps=12)
+    zero = reflex(lambda obs: jnp.zeros(2), env)
     assert env.step_seconds == pytest.approx(0.02)
     size: Any = {"width": 64, "height": 48}
     assert len(render.render_episode(env, zero, jax.random.key(0), **size)) == 7  # steps 0, 2, ..., 12
     assert len(render.render_episode(env, zero, jax.random.key(0), length=4, every=1, **size)) == 5
     at_goal, _ = reset("point_goal0", num_steps=12, continue_goal=False, goal_size=9.0)
+    zero = reflex(lambda obs: jnp.zeros(2), at_goal)
     assert len(render.render_episode(at_goal, zero, jax.random.key(0), every=1, **size)) == 2
 
 

@@ -23,6 +23,7 @@ from jaxsafe import algos, envs
 from jaxsafe.config import ConfigError
 from jaxsafe.envs.view import watch
 from jaxsafe.envs.view.driving import FRONT, drive, robot_of
+from jaxsafe.learn.acting import reflex
 from jaxsafe.run import viewing
 
 ROOT = Path(__file__).parent.parent.parent
@@ -32,7 +33,7 @@ ROOT = Path(__file__).parent.parent.parent
 def session() -> watch.Session:
     """Of a policy that always turns left at half speed."""
     env = envs.make("point_goal0", engine="c", num_steps=6)
-    return watch.Session(env, lambda obs: jnp.array([0.0, 0.5]), seed=3)
+    return watch.Session(env, reflex(lambda obs: jnp.array([0.0, 0.5]), env), seed=3)
 
 
 @pytest.mark.parametrize(

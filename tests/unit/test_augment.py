@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from tasks import FAST
-from toys import Clock, Lever
+from toys import FIRST, Clock, Lever, updated
 
 from jaxsafe.algos import ALGOS
 from jaxsafe.learn import augment
@@ -16,6 +16,7 @@ from jaxsafe.learn.normalise import normalise
 from jaxsafe.learn.on_policy import see
 from jaxsafe.learn.rollout import collect, init_rollout
 from jaxsafe.run import checkpoint, compat, evaluation
+from jaxsafe.types import Policy
 
 TINY: dict[str, Any] = {
     "num_envs": 4,
@@ -31,11 +32,11 @@ TINY: dict[str, Any] = {
 @cache
 def build(name, env):
     algo = ALGOS[name].make(env)
-    return algo, jax.jit(algo.update, compiler_options=FAST)
+    return algo, jax.jit(updated(algo), compiler_options=FAST)
 
 
 def start(name, env, **settings):
-    return build(name, env)[0].init(jax.random.key(0), ALGOS[name].config(**TINY | settings))
+    return build(name, env)[0].init(jax.random.key(0), ALGOS[name].config(**TINY | settings), FIRST)
 
 
 def run(env, num_envs, horizon, policy, **options):
@@ -242,12 +243,12 @@ def test_a_policy_acts_with_the_budget_that_training_left_it():
 
 
 def test_evaluation_shows_what_is_left_of_the_scheduled_budget():
-    def spend(ts, obs, key):  # an action of z: a step costs (1 +- z) / 2
-        return obs[..., -1:] * jnp.ones(2)
+    def spend(params, carry, obs, key):  # an action of z: a step costs (1 +- z) / 2
+        return obs[..., -1:] * jnp.ones(2), (), {}
 
-    algo = ALGOS["ppo_simmer_pid"].make(Lever())._replace(act=spend)
+    algo = ALGOS["ppo_simmer_pid"].make(Lever())._replace(policy=Policy(lambda params: (), spend))
     cfg = ALGOS["ppo_simmer_pid"].config(**TINY, cost_limit=1e6, budget_init=0.2)
-    ts = jax.tree.map(lambda x: x[None], algo.init(jax.random.key(0), cfg))
+    ts = jax.tree.map(lambda x: x[None], algo.init(jax.random.key(0), cfg, FIRST))
     cost = evaluation.run_episodes(algo, ts, 50, seed=0).cost  # 10 steps of 0.4 or 0.6
     assert cost.min() > 3.99 and cost.max() < 6.01 and cost.std() > 0.1
 
@@ -258,7 +259,8 @@ def test_a_schedule_comes_back_from_a_checkpoint(tmp_path):
     ts, _ = update(start("ppo_simmer_pid", env, **HAND))
     checkpoint.save(tmp_path, ts, iteration=1, steps=24)
     cfg = ALGOS["ppo_simmer_pid"].config(**TINY | HAND)
-    back, _ = checkpoint.restore(tmp_path, jax.eval_shape(lambda: algo.init(jax.random.key(0), cfg)))
+    like = jax.eval_shape(lambda: algo.init(jax.random.key(0), cfg, FIRST))
+    back, _ = checkpoint.restore(tmp_path, like)
     for x, y in zip(*(jax.tree.leaves(update(s)[0].dual) for s in (ts, back)), strict=True):
         np.testing.assert_array_equal(x, y)
 
@@ -320,9 +322,9 @@ def test_cost_limits_side_by_side_are_different_tasks(name):
     cfg = ALGOS[name].config(**TINY | {"horizon": 3})
 
     def init(limit):
-        return algo.init(jax.random.key(0), dataclasses.replace(cfg, cost_limit=limit))
+        return algo.init(jax.random.key(0), dataclasses.replace(cfg, cost_limit=limit), FIRST)
 
-    update = jax.jit(jax.vmap(algo.update), compiler_options=FAST)
+    update = jax.jit(jax.vmap(updated(algo)), compiler_options=FAST)
     ts, _ = update(jax.vmap(init)(limits))
     if name == "ppo_early_terminated":
         _, m = update(ts)

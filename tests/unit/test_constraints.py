@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog, minimize
 from tasks import FAST
-from toys import Clock, Corridor
+from toys import FIRST, Clock, Corridor, updated
 
 from jaxsafe import algos, envs
 from jaxsafe.algos import ALGOS, cpo, pcpo
@@ -285,7 +285,7 @@ def test_the_best_policy_within_both_limits_is_found(name):
     cfg = ALGOS[name].config(**sizes, cost_limits=LIMITS, **LEARN[name])
 
     def train(key):
-        return jax.lax.scan(lambda ts, _: algo.update(ts), algo.init(key, cfg), None, 300)
+        return jax.lax.scan(lambda ts, _: algo.update(ts, FIRST), algo.init(key, cfg, FIRST), None, 300)
 
     _, metrics = jax.jit(jax.vmap(train))(jax.random.split(jax.random.key(0), 2))
     late = {k: np.asarray(x)[:, -200:].mean(1) for k, x in metrics.items()}
@@ -302,8 +302,8 @@ TINY = {"num_envs": 8, "horizon": 25, "minibatches": 2, "hidden": (8,)}
 def test_an_update_has_a_critic_and_its_metrics_for_each_constraint(name):
     algo = ALGOS[name].make(Clock())
     cfg = ALGOS[name].config(**TINY, cost_limits={"b": 1.0, "a": 20.0})
-    ts = algo.init(jax.random.key(0), cfg)
-    after, metrics = jax.jit(algo.update, compiler_options=FAST)(ts)
+    ts = algo.init(jax.random.key(0), cfg, FIRST)
+    after, metrics = jax.jit(updated(algo), compiler_options=FAST)(ts)
     assert [x.aval for x in jax.tree.leaves(ts)] == [x.aval for x in jax.tree.leaves(after)]
     assert all(x.dtype == jnp.float32 and x.shape == () for x in metrics.values())
     assert all(jnp.isfinite(x).all() for x in jax.tree.leaves((after.params, metrics)))
@@ -322,8 +322,8 @@ def test_each_critic_learns_its_own_cost():
     cfg = ALGOS["ppo_lag"].config(
         **TINY, cost_limits={"b": 1.0, "a": 20.0}, cost_discount=0.0, critic_lr=1e-2
     )
-    ts, _ = jax.jit(lambda ts: jax.lax.scan(lambda ts, _: algo.update(ts), ts, None, 20))(
-        algo.init(jax.random.key(0), cfg)
+    ts, _ = jax.jit(lambda ts: jax.lax.scan(lambda ts, _: algo.update(ts, FIRST), ts, None, 20))(
+        algo.init(jax.random.key(0), cfg, FIRST)
     )
     obs = normalise(ts.normaliser, ts.rollout.state.obs)
     values = jax.vmap(lambda critic: value(critic, obs, cfg).mean())(ts.params["critic_c"])
@@ -337,8 +337,8 @@ def test_limits_are_leaves_and_train_side_by_side(name):
 
     def one(paint):
         limits = {"paint": paint, "noise": 4.0}
-        ts = algo.init(jax.random.key(0), dataclasses.replace(cfg, cost_limits=limits))
-        return jax.lax.scan(lambda ts, _: algo.update(ts), ts, None, 2)
+        ts = algo.init(jax.random.key(0), dataclasses.replace(cfg, cost_limits=limits), FIRST)
+        return jax.lax.scan(lambda ts, _: algo.update(ts, FIRST), ts, None, 2)
 
     values = jnp.array([8.0, 1.0])
     together = jax.jit(jax.vmap(one), compiler_options=FAST)(values)
@@ -393,4 +393,4 @@ def test_a_wrong_name_or_no_name_is_an_error_without_the_command_line_too():
     algo = ALGOS["cpo"].make(Corridor())
     for limits, message in (({"wal": 1.0}, "did you mean 'wall'"), ({}, "at least")):
         with pytest.raises(ConfigError, match=message):
-            algo.init(jax.random.key(0), ALGOS["cpo"].config(**TINY, cost_limits=limits))
+            algo.init(jax.random.key(0), ALGOS["cpo"].config(**TINY, cost_limits=limits), FIRST)

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 from scipy.optimize import minimize
+from toys import context
 
 from jaxsafe.algos.cpo import BOUNDED, FREE, RECOVER, RETURN, CPOConfig, Margin, cpo_step, dual
 from jaxsafe.learn.on_policy import Batch
-from jaxsafe.learn.steps import mean_kl
+from jaxsafe.learn.steps import Pair, mean_kl
 from jaxsafe.learn.surrogates import plain
 from jaxsafe.nn.gaussian import log_prob, sample
 from jaxsafe.nn.networks import init_params, policy
@@ -174,12 +175,12 @@ def learner(**options):
     def objective(adv):
         return lambda actor, batch: plain(policy(actor, batch.obs, cfg), batch, adv(batch), cfg)
 
-    pair = objective(lambda batch: batch.adv_r), objective(lambda batch: batch.adv_c)
+    pair = Pair(objective(lambda batch: batch.adv_r), objective(lambda batch: batch.adv_c))
 
     def step(violation, margin, batch=batch, axis_name=None):
-        excess, length = LENGTH * jnp.float32(violation), jnp.float32(LENGTH)
-        key = jax.random.key(1)
-        return cpo_step.update(actor, margin, *pair, excess, length, batch, key, cfg, axis_name)
+        excess = LENGTH * jnp.float32(violation)
+        told = context(cfg, axis_name=axis_name, excess=excess, length=LENGTH)
+        return cpo_step.update(actor, margin, pair, batch, told)
 
     return step, batch, cfg
 

@@ -9,6 +9,7 @@ import pytest
 from toys import Clock
 
 from jaxsafe.config import ConfigError
+from jaxsafe.learn.acting import reflex
 from jaxsafe.report import plots, scores
 from jaxsafe.run import evaluation, run_folder
 from jaxsafe.run.run_folder import Metrics, read_config, read_metrics
@@ -107,7 +108,8 @@ def test_an_interval_is_over_seeds_and_of_one_seed_over_its_episodes():
 
 
 def test_discounted_sums_and_named_costs_of_an_episode_by_hand():
-    three = evaluation.episode(Clock(lives=(3, 3)), lambda obs, _: obs[:1], jax.random.key(0), 0.5, 0.1)
+    player = reflex(lambda obs: obs[:1], Clock(lives=(3, 3)))
+    three = evaluation.episode(player, jax.random.key(0), 0.5, 0.1)
     assert (three.ret, three.length) == (3, 3) and three.cost == 6  # 1 and 2 a step
     np.testing.assert_allclose(three.discounted_ret, 1 + 0.5 + 0.25)
     np.testing.assert_allclose(three.discounted_cost, 2 * (1 + 0.1 + 0.01), rtol=1e-6)

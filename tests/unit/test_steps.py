@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from toys import context
 
 from jaxsafe.algos.ppo import PPOConfig
 from jaxsafe.learn.on_policy import Batch
@@ -34,9 +35,9 @@ def problem(cfg, seed=0, size=64):
 
 def improve(cfg, objective=None, seed=0, iteration=0):
     params, batch, default = problem(cfg, seed)
-    state = adam_epochs.init(params["actor"], cfg)._replace(iteration=jnp.int32(iteration))
+    state = adam_epochs.init(params["actor"], cfg)
     actor, _, metrics = adam_epochs.update(
-        params["actor"], state, objective or default, batch, jax.random.key(1), cfg, None
+        params["actor"], state, objective or default, batch, context(cfg, iteration=iteration)
     )
     return params["actor"], actor, metrics
 
@@ -92,10 +93,10 @@ def test_two_devices_take_the_step_of_one():
     cfg = dataclasses.replace(PPOConfig(**SMALL, lr=1e-2), minibatches=1)
     params, batch, objective = problem(cfg)
     args = (params["actor"], adam_epochs.init(params["actor"], cfg), objective)
-    whole = adam_epochs.update(*args, batch, jax.random.key(1), cfg, None)
+    whole = adam_epochs.update(*args, batch, context(cfg))
     halves = jax.tree.map(lambda x: x.reshape(2, -1, *x.shape[1:]), batch)
     parts = jax.vmap(
-        lambda half: adam_epochs.update(*args, half, jax.random.key(1), cfg, "devices"),
+        lambda half: adam_epochs.update(*args, half, context(cfg, axis_name="devices")),
         axis_name="devices",
     )(halves)
     for a, b in zip(jax.tree.leaves(whole), jax.tree.leaves(parts), strict=True):

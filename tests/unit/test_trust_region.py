@@ -3,6 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
+from toys import context
 
 from jaxsafe.algos.cpo import CPOConfig
 from jaxsafe.algos.trpo import TRPOConfig
@@ -82,8 +83,8 @@ def test_a_kl_per_action_is_half_the_kl_of_two_actions():
         def objective(actor, batch):
             return plain(policy(actor, batch.obs, cfg), batch, batch.adv_r, cfg)
 
-        update = jax.jit(trust_region.update, static_argnums=(2, 6))
-        return update(actor, (), objective, batch, keys[2], cfg, None)
+        update = jax.jit(trust_region.update, static_argnums=2)
+        return update(actor, (), objective, batch, context(cfg))
 
     mean, _, metrics = step(target_kl=0.01, damping=0.1, kl_per_action=True)
     total, _, twice = step(target_kl=0.02, damping=0.2)
@@ -120,7 +121,7 @@ def natural(step, **options):
     def objective(actor, batch):
         return plain(policy(actor, batch.obs, cfg), batch, batch.adv_r, cfg)
 
-    after, _, metrics = step.update(actor, (), objective, batch, jax.random.key(0), cfg, None)
+    after, _, metrics = step.update(actor, (), objective, batch, context(cfg))
     start, unravel = ravel_pytree(actor)
     g = jax.grad(lambda x: objective(unravel(x), batch)[0])(start)
     hessian = jax.hessian(lambda x: kl(old, policy(unravel(x), obs, cfg)).mean())(start)
