@@ -16,8 +16,9 @@ import numpy as np
 from jaxsafe.config import ConfigError
 from jaxsafe.envs.engines import Physics
 from jaxsafe.envs.safety_gym import scene as scenes
+from jaxsafe.envs.safety_gym.arena import World
 from jaxsafe.envs.safety_gym.config import read
-from jaxsafe.envs.safety_gym.task import SafetyGym, World
+from jaxsafe.envs.safety_gym.task import SafetyGym
 from jaxsafe.types import State
 
 # Velocities and poses of a well-conditioned step agree this well (m and rad, per s).

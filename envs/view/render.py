@@ -26,8 +26,9 @@ from PIL import Image, ImageDraw, ImageFont
 from jaxsafe.config import ConfigError, nearest
 from jaxsafe.envs import engines
 from jaxsafe.envs.safety_gym import scene as scenes
+from jaxsafe.envs.safety_gym.arena import World
 from jaxsafe.envs.safety_gym.config import SafetyGymConfig
-from jaxsafe.envs.safety_gym.task import SafetyGym, World
+from jaxsafe.envs.safety_gym.task import SafetyGym
 from jaxsafe.envs.wrap import innermost, raw_steps
 from jaxsafe.learn.acting import Player
 from jaxsafe.types import PyTree, State

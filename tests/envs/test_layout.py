@@ -15,8 +15,8 @@ from tasks import FAST, HERE, change, moved, put, task
 from jaxsafe import envs
 from jaxsafe.config import ConfigError
 from jaxsafe.envs.safety_gym import layout as layouts
+from jaxsafe.envs.safety_gym.arena import World
 from jaxsafe.envs.safety_gym.config import defaults, read
-from jaxsafe.envs.safety_gym.task import World
 
 DATA = Path(__file__).parent.parent / "data"
 RECORDED = ("point_goal2", "car_push2", "doggo_button2")
