@@ -13,7 +13,8 @@ state. A goal that finds no room ends the episode, where the original raises. A 
 room is used as the last of its 10,000 tries left it; `make` refuses layouts without hope.
 """
 
-from functools import partial
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +22,7 @@ import numpy as np
 
 from jaxsafe.config import ConfigError
 from jaxsafe.envs import engines
-from jaxsafe.envs.engines import Readings
+from jaxsafe.envs.engines import Engine, Physics, Readings
 from jaxsafe.envs.safety_gym import costs as constraints
 from jaxsafe.envs.safety_gym import layout as layouts
 from jaxsafe.envs.safety_gym import observe, rewards, sleeping
@@ -31,6 +32,15 @@ from jaxsafe.envs.safety_gym.config import SafetyGymConfig
 from jaxsafe.types import State
 
 MAX_VALUE = 1e10  # MuJoCo's mjMAXVAL: beyond it a state is bad
+
+
+class Drive(NamedTuple):
+    """What the physics of a step is given, and the keys for what comes after it."""
+
+    ctrl: jax.Array  # [nu]
+    substeps: jax.Array  # int32 []
+    key: jax.Array
+    goal_key: jax.Array
 
 
 class SafetyGym:
@@ -67,9 +77,14 @@ class SafetyGym:
         if seeks_goal and cfg.task in ("x", "z"):
             raise ConfigError(f"env.observe_goal_*: the task {cfg.task!r} has no goal to observe")
         self.cost_names = constraints.cost_names(cfg)
+
+        def shown(key: jax.Array) -> dict[str, jax.Array]:
+            world, ctrl = self.begin(key)
+            _, readings = self._engine.forward(world.physics, ctrl)
+            return observe.components(self.arena, world, readings, ctrl)
+
         with jax.ensure_compile_time_eval():
-            world, readings, ctrl = jax.eval_shape(self._begin, jax.random.key(0))
-            parts = jax.eval_shape(partial(observe.components, self.arena), world, readings, ctrl)
+            parts = jax.eval_shape(shown, jax.random.key(0))
         self.observation_spec: dict[str, tuple[int, ...]] = {
             name: parts[name].shape for name in observe.in_order(self.arena, parts)
         }
@@ -105,11 +120,43 @@ class SafetyGym:
     # Episode ---------------------------------------------------------------------------------------
 
     def reset(self, key: jax.Array) -> State:
-        world, readings, ctrl = self._begin(key)
+        world, ctrl = self.begin(key)
+        return self.begun(world, ctrl, *self._engine.forward(world.physics, ctrl))
+
+    def step(self, state: State, action: jax.Array) -> State:
+        drive = self.drive(state.physics, action)
+        run = self._engine.run(state.physics.physics, drive.ctrl, drive.substeps)
+        return self.judge(state, drive, *run)
+
+    def begin(self, key: jax.Array) -> tuple[World, jax.Array]:
+        """What comes before the physics of a reset: layout, headings, first goal; and controls."""
+        cfg = self.config
+        if cfg._seed is not None:
+            key = jax.random.fold_in(key, cfg._seed)
+        if not cfg.randomize_layout:
+            key = jax.random.key(0)
+        key, layout_key, heading_key, goal_key = jax.random.split(key, 4)
+        xy, _ = layouts.sample_layout(self.place, layout_key)
+        headings = jax.random.uniform(heading_key, (len(xy),), maxval=2 * jnp.pi)
+        if cfg.robot_rot is not None:
+            headings = headings.at[0].set(cfg.robot_rot)
+        world = self.arena.at_rest(xy, headings, key)
+        if self.arena.goal_kind:  # the first goal is discarded, a quirk of the original
+            world, _ = self._next_goal(world, goal_key, jnp.bool_(True))
+            theirs = cfg.rules == "safety_gymnasium"
+            delay = cfg.buttons_resampling_delay if theirs else 0
+            world = world.replace(buttons_timer=jnp.int32(delay))
+        return world, jnp.zeros(self.action_size)
+
+    def begun(self, world: World, ctrl: jax.Array, physics: Physics, readings: Readings) -> State:
+        """What comes after the physics of a reset."""
+        world = world.replace(physics=physics)
+        if "subtreecom" in self.arena.sensors:
+            world = world.replace(last_com=self.arena.sensor(readings, "subtreecom"))
         zero = jnp.zeros(())
         return State(
             physics=world,
-            obs=self._observe(world, readings, ctrl),
+            obs=observe.observe(self.arena, world, readings, ctrl, self.ray_slack),
             reward=zero,
             cost=zero,
             costs=jnp.zeros(len(self.cost_names)),
@@ -117,8 +164,9 @@ class SafetyGym:
             info={"goal_met": zero, "exception": zero, "overflow": readings.overflow},
         )
 
-    def step(self, state: State, action: jax.Array) -> State:
-        cfg, world = self.config, state.physics
+    def drive(self, world: World, action: jax.Array) -> Drive:
+        """What comes before the physics of a step."""
+        cfg = self.config
         key, noise_key, skip_key, goal_key = jax.random.split(world.key, 4)
         low, high = self.scene.model.actuator_ctrlrange.T
         ctrl = jnp.clip(action, low, high)
@@ -128,9 +176,12 @@ class SafetyGym:
         if cfg.frameskip_binom_p < 1:
             draws = jax.random.bernoulli(skip_key, cfg.frameskip_binom_p, (cfg.frameskip_binom_n,))
             substeps = draws.sum(dtype=jnp.int32)
-        physics, readings = self._engine.run(world.physics, ctrl, substeps)
-        moved = world.replace(physics=physics, key=key)
+        return Drive(ctrl, substeps, key, goal_key)
 
+    def judge(self, state: State, drive: Drive, physics: Physics, readings: Readings) -> State:
+        """What comes after the physics of a step: reward, costs, next goal, observation."""
+        cfg, world, key = self.config, state.physics, drive.key
+        moved = world.replace(physics=physics, key=key)
         reward, moved = rewards.reward(self.arena, moved, readings)
         costs, cost = constraints.costs(self.arena, moved, readings)
         moved = moved.replace(
@@ -140,9 +191,9 @@ class SafetyGym:
         reward += cfg.reward_goal * success
         terminated = success
         if cfg.continue_goal and self.arena.goal_kind:
-            moved, found = self._next_goal(moved, goal_key, success)
+            moved, found = self._next_goal(moved, drive.goal_key, success)
             terminated = success & ~found & cfg.terminate_resample_failure
-        obs = self._observe(moved, readings, ctrl)
+        obs = observe.observe(self.arena, moved, readings, drive.ctrl, self.ray_slack)
 
         bad = ~jnp.stack(
             [(jnp.abs(x) < MAX_VALUE).all() for x in (physics.qpos, physics.qvel, physics.warmstart)]
@@ -162,34 +213,6 @@ class SafetyGym:
                 "overflow": readings.overflow,
             },
         )
-
-    def _begin(self, key: jax.Array) -> tuple[World, Readings, jax.Array]:
-        """A fresh episode: layout, headings, first goal, and a forward pass."""
-        cfg = self.config
-        if cfg._seed is not None:
-            key = jax.random.fold_in(key, cfg._seed)
-        if not cfg.randomize_layout:
-            key = jax.random.key(0)
-        key, layout_key, heading_key, goal_key = jax.random.split(key, 4)
-        xy, _ = layouts.sample_layout(self.place, layout_key)
-        headings = jax.random.uniform(heading_key, (len(xy),), maxval=2 * jnp.pi)
-        if cfg.robot_rot is not None:
-            headings = headings.at[0].set(cfg.robot_rot)
-        world = self.arena.at_rest(xy, headings, key)
-        if self.arena.goal_kind:  # the first goal is discarded, a quirk of the original
-            world, _ = self._next_goal(world, goal_key, jnp.bool_(True))
-            theirs = cfg.rules == "safety_gymnasium"
-            delay = cfg.buttons_resampling_delay if theirs else 0
-            world = world.replace(buttons_timer=jnp.int32(delay))
-        ctrl = jnp.zeros(self.action_size)
-        physics, readings = self._engine.forward(world.physics, ctrl)
-        world = world.replace(physics=physics)
-        if "subtreecom" in self.arena.sensors:
-            world = world.replace(last_com=self.arena.sensor(readings, "subtreecom"))
-        return world, readings, ctrl
-
-    def _observe(self, world: World, readings: Readings, ctrl: jax.Array) -> jax.Array:
-        return observe.observe(self.arena, world, readings, ctrl, self.ray_slack)
 
     # Goals -----------------------------------------------------------------------------------------
 
@@ -211,3 +234,39 @@ class SafetyGym:
         dist_goal, dist_box, box_goal = self.arena.distances(new)
         new = new.replace(last_dist_goal=dist_goal, last_dist_box=dist_box, last_box_goal=box_goal)
         return jax.tree.map(lambda a, b: jnp.where(wanted, a, b), new, world)
+
+
+def in_parts(env: SafetyGym, **options: Any) -> tuple[Callable, Callable]:
+    """`reset` and `step` over a batch, each compiled in two parts around the physics.
+
+    JAX keeps no program with a host callback in its compilation cache, and engine c is one. It keeps
+    these parts, so that a second process that needs them starts at once.
+
+    Args:
+        options: of `jax.jit`.
+    """
+
+    def compiled(f: Callable) -> Callable:
+        return jax.jit(jax.vmap(f), **options)
+
+    begin, begun, drive, judge = map(compiled, (env.begin, env.begun, env.drive, env.judge))
+    run, forward = physics_of(env._engine, **options)
+
+    def reset(keys: jax.Array) -> State:
+        world, ctrl = begin(keys)
+        return begun(world, ctrl, *forward(world.physics, ctrl))
+
+    def step(state: State, action: jax.Array) -> State:
+        given = drive(state.physics, action)
+        return judge(state, given, *run(state.physics.physics, given.ctrl, given.substeps))
+
+    return reset, step
+
+
+def physics_of(engine: Engine, **options: Any) -> tuple[Callable, Callable]:
+    """`engine.run` and `engine.forward` over a batch; a callback alone is not compiled."""
+    both = jax.vmap(engine.run), jax.vmap(engine.forward)
+    if engine.name == "c":
+        return both
+    run, forward = (jax.jit(f, **options) for f in both)
+    return run, forward
