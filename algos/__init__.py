@@ -1,6 +1,9 @@
 """The algorithms by name. A new one is a module and a line here."""
 
+import importlib
+import sys
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -30,6 +33,7 @@ from jaxsafe.algos import (
     trpo_saute,
     trpo_simmer_pid,
 )
+from jaxsafe.config import ConfigError, nearest
 from jaxsafe.types import Algorithm
 
 
@@ -142,3 +146,31 @@ ALGOS: dict[str, Entry] = {
         trpo_simmer_pid.PUBLISHED,
     ),
 }
+
+
+def load(address: str) -> None:
+    """Import 'module:name', from the working directory too, and register it under that address.
+
+    This executes the module, so an address comes from the user, never from a file.
+
+    Raises:
+        ConfigError: no such module, or nothing of that name in it.
+    """
+    module, _, name = address.partition(":")
+    if not (module and name):
+        raise ConfigError(f"algo={address}: expected module:name")
+    if (here := str(Path.cwd())) not in sys.path:
+        sys.path.insert(0, here)
+    try:
+        found = importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if not error.name or not f"{module}.".startswith(f"{error.name}."):  # a module that it imports
+            raise
+        raise ConfigError(f"algo={address}: no module {module!r} in {here} or installed") from error
+    if name not in vars(found):
+        public = [key for key in vars(found) if not key.startswith("_")]
+        raise ConfigError(f"algo={address}: {module} has no {name!r}{nearest(name, public)}")
+    entry = vars(found)[name]
+    if not isinstance(entry, Entry):
+        raise ConfigError(f"algo={address} ({type(entry).__name__}) is no Entry of jaxsafe.algos")
+    ALGOS[address] = entry

@@ -15,11 +15,11 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from jaxsafe import algos
 from jaxsafe.algos import ALGOS, Entry
 from jaxsafe.config import from_dict
 from jaxsafe.envs import ENVS
-from jaxsafe.run import command, compat, run_folder
+from jaxsafe.run import compat, run_folder
+from jaxsafe.run.settings import algo_options
 
 HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE), str(HERE / "results")]
@@ -103,7 +103,7 @@ def measured(name: str) -> str:
         how += f", `env.rules={rules}`" if rules != "safety_gym" else ""
         options = {k: x for k, x in config["algo"].items() if k != "name"}
         given = dataclasses.asdict(from_dict(ALGOS[name].config, options, "algo."))
-        usual = command.algo_options(algos, name, config["preset"], config.get("compat", "none"))
+        usual = algo_options(ALGOS[name], config["preset"], config.get("compat", "none"))
         how += "".join(f", `algo.{k}={given[k]}`" for k in options if given[k] != usual[k])
         rows.append(f"| {how} | {ret} | {cost} | {results.published(config)} |")
     if not rows:

@@ -4,39 +4,52 @@
     print(jaxsafe.evaluate(run))
     jaxsafe.render(run, "policy.gif")
 
-They are the scripts' own functions, so a run folder is the same whoever trained it. This is the one
-module of the package that knows the environments and the algorithms; `import jaxsafe` loads it when one
-of its names is first used.
+They are the scripts' own functions, so a run folder is the same whoever trained it. `import jaxsafe`
+loads this module when one of its names is first used.
 """
 
-import contextlib
 import dataclasses
 import functools
-import re
-from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from hydra.errors import HydraException
-from omegaconf.errors import OmegaConfBaseException
 
 from jaxsafe import algos, envs
+from jaxsafe.algos import Entry as Row
 from jaxsafe.config import ConfigError, flat, nearest
 from jaxsafe.envs import SafetyGym, SafetyGymConfig
 from jaxsafe.envs.check import check_env
 from jaxsafe.envs.engines import default_engine
 from jaxsafe.learn.acting import Player
-from jaxsafe.report import compare
-from jaxsafe.run import command, distributed, run_folder, runner, sweeps
+from jaxsafe.report import evaluation, film, sweep_summary
+from jaxsafe.report.evaluation import Scores
+from jaxsafe.report.finish import finish
+from jaxsafe.report.group import Group
+from jaxsafe.run import distributed, run_folder, session
+from jaxsafe.run import sweep as sweeps
+from jaxsafe.run.devices import use_compilation_cache
+from jaxsafe.run.policies import Opened, open_run
 from jaxsafe.run.progress import Report
-from jaxsafe.types import Algorithm, Env, PyTree
+from jaxsafe.run.session import Session
+from jaxsafe.run.settings import (
+    DEFAULT,
+    Entries,
+    EnvEntry,
+    TrainConfig,
+    ask,
+    find_env,
+    load,
+    nested,
+    settle,
+    to_plain,
+)
+from jaxsafe.types import Env, PyTree
 
 __all__ = ["ConfigError", "Run", "SweepResult", "evaluate", "make", "render", "sweep", "train"]
 
-SETTINGS = [f.name for f in dataclasses.fields(runner.TrainConfig)]
+SETTINGS = [f.name for f in dataclasses.fields(TrainConfig)]
 PLAIN = (bool, int, float, str, list, tuple, dict, type(None))
 
 
@@ -66,7 +79,7 @@ def make(env: str | SafetyGymConfig, **options: Any) -> SafetyGym:
         Learning", for the tasks and their options.
     """
     if isinstance(env, str):
-        command.load_own(env, envs)
+        load("env", env)
     return envs.make(env, **options)
 
 
@@ -92,11 +105,9 @@ class Run:
     """
 
     def __init__(self, folder: str | Path, env: str | Env | None = None, algo: Any = None):
-        self._known = registries(env, algo)
+        self._entries = chosen(env, algo).entries
         self.folder = Path(folder).expanduser()
-        self.settings = command.settle(
-            run_folder.read_config(self.folder), self._known.envs, self._known.algos
-        )
+        self.settings = settle(run_folder.read_config(self.folder), self._entries)
 
     def __repr__(self) -> str:
         s = self.settings
@@ -147,7 +158,8 @@ class Run:
         Raises:
             ConfigError: no such policy, or no checkpoint yet.
         """
-        return self._act(self._opened[3], self._checked(index), obs, key)
+        self._opened.actor(index)
+        return self._act(self._opened.params, index, obs, key)
 
     def player(self, index: int = 0) -> Player:
         """A trained policy with its memory: `carry = player.begin()`, then at each step
@@ -156,11 +168,13 @@ class Run:
         Args:
             index: which policy.
 
+        Returns:
+            The policy, with its parameters and `task`, the environment that it meets.
+
         Raises:
             ConfigError: no such policy, or no checkpoint yet.
         """
-        params, algo = self._params(index), self._opened[2]
-        return Player(algo.policy, params, algo.task(params))
+        return self._opened.actor(index).player
 
     def env(self, index: int = 0) -> Env:
         """The environment as a policy meets it: with what an algorithm adds to the observation, as
@@ -177,25 +191,14 @@ class Run:
         """
         return self.player(index).task
 
-    def _checked(self, index: int) -> int:
-        count = len(self.settings.configs) * self.settings.train.num_seeds
-        if not 0 <= index < count:
-            raise ConfigError(f"index {index}: the run has {count} policies, from 0")
-        return index
-
-    def _params(self, index: int) -> PyTree:
-        """What acts of one policy."""
-        self._checked(index)
-        return jax.tree.map(lambda x: x[index], self._opened[3])
-
     @functools.cached_property
-    def _opened(self) -> tuple[command.Settings, Env, Algorithm, PyTree]:
-        runner.use_compilation_cache()
-        return command.open_run(self.folder, None, self._known.envs, self._known.algos)
+    def _opened(self) -> Opened:
+        use_compilation_cache()
+        return open_run(self.folder, entries=self._entries)
 
     @functools.cached_property
     def _act(self) -> Any:
-        algo = self._opened[2]
+        algo = self._opened.algo
 
         def act(every: PyTree, index: Any, obs: jax.Array, key: jax.Array | None) -> jax.Array:
             params = jax.tree.map(lambda x: x[index], every)
@@ -215,11 +218,11 @@ class SweepResult(NamedTuple):
     """
 
     folder: Path
-    rows: list[compare.Group]
+    rows: list[Group]
     runs: list[Run]
 
     def __str__(self) -> str:
-        return sweeps.markdown(self.rows)
+        return sweep_summary.markdown(self.rows)
 
 
 def train(env: str | Env | None = None, algo: Any = None, **options: Any) -> Run:
@@ -242,7 +245,8 @@ def train(env: str | Env | None = None, algo: Any = None, **options: Any) -> Run
             `num_seeds`, `seed`, `devices`, `preset`, `compat`, `run_dir`, `resume`, `init_from`,
             `video`, ...) and of the algorithm, whose prefix may be left out (`cost_limit`:
             undiscounted cost of an episode). An option of the environment is
-            `**{"env.hazards_num": 12}`, or an argument of `make`.
+            `**{"env.hazards_num": 12}`, or an argument of `make`. Values may be NumPy's numbers and
+            arrays, tuples and paths.
 
     Returns:
         The run. One with an object of yours goes on, and opens, with that object alone
@@ -251,28 +255,24 @@ def train(env: str | Env | None = None, algo: Any = None, **options: Any) -> Run
     Raises:
         ConfigError: where the script would print a line and end: an unknown name (with the nearest
             valid one), a value of the wrong type or out of bounds, a run that does not fit the memory.
-        jaxsafe.checkpoint.CheckpointError, OSError: the disk failed; the last checkpoint stays.
+        jaxsafe.run.checkpoint.CheckpointError, OSError: the disk failed; the last checkpoint stays.
         KeyboardInterrupt: stopped, see above.
     """
     for name in distributed.OPTIONS:
         if options.get(name) is not None:
             raise ConfigError(f"{name}: several processes are for scripts/train.py")
-    known = registries(env, algo)
+    choice = chosen(env, algo)
+    settings = ask(nested(choice.given | named(choice, options)), choice.entries)
     report = Report(hosted=True)
-    with one_line():
-        settings = command.compose(texts(known, options), known.envs, known.algos)
-        folder = command.choose_folder(settings, known.envs, known.algos, None, report.line)
-        program_env, program = command.prepare(settings, known.envs, known.algos)
-        say_whose(known, report)
-        needed = {kind: f"<your {name}>" for kind, name in known.own.items()}
-        if ":" in settings.env_name:
-            needed["env"] = repr(settings.env_name)
-        again = "".join(f"{kind}={what}, " for kind, what in needed.items())
-        again = f"jaxsafe.train({again}resume={str(folder)!r})"
-        status = command.run(
-            settings, program_env, program, folder, known.envs, known.algos, report, again
-        )
-    if status:
+    folder = session.choose_folder(settings, None, report.line)
+    made, program = session.prepare(settings)
+    choice.say_whose(report)
+    names = {"env": settings.env_name, "algo": settings.algo_name}
+    needed = {kind: repr(name) for kind, name in names.items() if ":" in name}
+    needed |= {kind: f"<your {name}>" for kind, name in choice.objects.items()}
+    again = "".join(f"{kind}={what}, " for kind, what in needed.items())
+    again = f"jaxsafe.train({again}resume={str(folder)!r})"
+    if session.run(Session(settings, folder, made, program, again), report, finish):
         raise KeyboardInterrupt(f"stopped; continue with {again}")
     return Run(folder, env, algo)
 
@@ -299,26 +299,24 @@ def sweep(env: Any = None, algo: Any = None, **options: Any) -> SweepResult:
 
     Raises:
         ConfigError: as of `train`, or nothing to sweep.
-        jaxsafe.checkpoint.CheckpointError, OSError: the disk failed; what was saved stays.
+        jaxsafe.run.checkpoint.CheckpointError, OSError: the disk failed; what was saved stays.
         KeyboardInterrupt: stopped, with a checkpoint.
     """
-    known = registries(env, algo)
+    choice = chosen(env, algo)
+    asked = sweeps.plan(*asked_for(choice, options), choice.entries)
+    report = Report(hosted=True)
+    choice.say_whose(report)
     again = "the same call of jaxsafe.sweep"
-    with one_line():
-        asked = sweeps.read(texts(known, options, swept=True), known.envs, known.algos)
-        report = Report(hosted=True)
-        say_whose(known, report)
-        if sweeps.train(asked, known.envs, known.algos, again, report):
-            raise KeyboardInterrupt(f"stopped; continue with {again}")
-        sweeps.summarise(asked.folder, known.envs, known.algos)
-        rows = sweeps.rows_of(asked.folder, known.envs, known.algos)
+    summarise = functools.partial(sweep_summary.summarise, entries=choice.entries)
+    if sweeps.train(asked, again, report, sweeps.After(finish, summarise)):
+        raise KeyboardInterrupt(f"stopped; continue with {again}")
+    summarise(asked.folder)
+    rows = sweep_summary.rows_of(asked.folder, choice.entries)
     folders = (path.parent for path in sorted(asked.folder.glob("*/config.yaml")))
     return SweepResult(asked.folder, rows, [Run(folder, env, algo) for folder in folders])
 
 
-def evaluate(
-    run: Run | str | Path, episodes: int = 100, seed: int = 1, setting: int = 0
-) -> command.Scores:
+def evaluate(run: Run | str | Path, episodes: int = 100, seed: int = 1, setting: int = 0) -> Scores:
     """Fresh whole episodes of a run's deterministic policies, scripts/evaluate.py as a function.
 
     Args:
@@ -347,8 +345,7 @@ def evaluate(
         )
     if not 0 <= setting < (count := len(run.settings.configs)):
         raise ConfigError(f"setting {setting}: the run has {count}, from 0")
-    settings, _, algo, params = run._opened
-    return command.evaluate(settings, algo, params, episodes, seed, run.folder)[setting]
+    return evaluation.evaluate(run._opened, episodes, seed)[setting]
 
 
 def render(
@@ -368,65 +365,64 @@ def render(
     Raises:
         ConfigError: no run folder, no checkpoint yet, no such policy, another kind of file, or an
             environment that is none of Safety Gym's.
-        jaxsafe.command.NoVideo: this machine can draw nothing: no EGL, OSMesa or display.
+        jaxsafe.report.film.NoVideo: this machine can draw nothing: no EGL, OSMesa or display.
     """
     run = run if isinstance(run, Run) else Run(run)
     out = Path(path or run.folder / "video.mp4").expanduser()
-    command.check_video(out)
-    settings, env, algo, _ = run._opened
-    actor = command.Actor(settings, env, algo, run._params(index))
-    command.film(run._known.envs, [actor], out, seed)
+    film.check_video(out)
+    film.film([run._opened.actor(index)], out, seed)
     return out
 
 
-# ---- from Python's values to a command line --------------------------------------------------
+# ---- what the caller chose --------------------------------------------------------------------
 
 
-class Registries(NamedTuple):
-    """What the functions of `command` are handed: what the package has, and the caller's objects."""
+class Chosen(NamedTuple):
+    """An environment and an algorithm, as the arguments of `train` name them."""
 
-    envs: Any
-    algos: Any
-    chosen: list[str]  # the arguments of a command line that choose from them
-    own: dict[str, str]  # 'env', 'algo': the names of the caller's objects
+    given: dict[str, Any]  # the options that choose them, as 'env' and 'env.hazards_num'
+    entries: Entries  # the caller's objects
+    objects: dict[str, str]  # 'env', 'algo': what the caller's objects are called
 
-
-def registries(env: Any, algo: Any) -> Registries:
-    known_envs, env_texts, own_env = choose_env(env)
-    known_algos, algo_texts, own_algos = choose_algo(algo)
-    return Registries(known_envs, known_algos, [*env_texts, *algo_texts], own_env | own_algos)
-
-
-def say_whose(known: Registries, report: Report) -> None:
-    if known.own:
-        report.line(
-            f"only this program knows {' and '.join(known.own.values())}: the run continues and opens "
-            "from Python with the same object, not from the command line"
-        )
+    def say_whose(self, report: Report) -> None:
+        if self.objects:
+            report.line(
+                f"only this program knows {' and '.join(self.objects.values())}: the run continues and "
+                "opens from Python with the same object, not from the command line"
+            )
 
 
-def choose_env(env: Any) -> tuple[Any, list[str], dict[str, str]]:
-    """A registry that has `env`, the arguments that choose it, and its name if it is the caller's."""
+def chosen(env: Any, algo: Any) -> Chosen:
+    env_given, own_envs = choose_env(env)
+    algo_given, own_algos = choose_algo(algo)
+    objects = {"env": ", ".join(own_envs), "algo": ", ".join(own_algos)}
+    objects = {kind: names for kind, names in objects.items() if names}
+    return Chosen(env_given | algo_given, Entries(own_envs, own_algos), objects)
+
+
+def choose_env(env: Any) -> tuple[dict[str, Any], dict[str, EnvEntry]]:
+    """The options that choose `env`, and its entry if it is the caller's."""
     if env is None:
-        return envs, [], {}
+        return {}, {}
     if isinstance(env, str):
-        command.load_own(env, envs)
-        return envs, [f"env={text(env)}"], {}
+        load("env", env)
+        return {"env": env}, {}
     if isinstance(env, list | tuple):
         if not env or not all(isinstance(e, str) for e in env):
             raise ConfigError("env: expected names in a list; an object of yours stands alone")
-        return envs, ["env=" + ",".join(map(text, env))], {}
+        for name in env:
+            load("env", name)
+        return {"env": list(env)}, {}
     gym = isinstance(env, SafetyGym)
-    fields = command.to_plain(described(env))
+    fields = to_plain(described(env))
     if gym and isinstance(envs.ENVS.get(env.name), dict):  # a name and options say it all
-        defaults = command.to_plain(envs.env_defaults(env.name))
+        defaults = find_env(env.name)[1].defaults
         fields["engine"] = "auto" if env.engine == default_engine() else env.engine
-        changed = [f"env.{k}={text(v)}" for k, v in fields.items() if v != defaults[k]]
-        return envs, [f"env={env.name}", *changed], {}
+        return {"env": env.name} | {f"env.{k}": v for k, v in fields.items() if v != defaults[k]}, {}
     name = env.name if gym else type(env).__name__
     env = check_env(env, name)
 
-    def made(_: str, **options: Any) -> Env:
+    def made(**options: Any) -> Env:
         if options:
             raise ConfigError(
                 f"{', '.join(f'env.{k}={v}' for k, v in options.items())}: this {name} has another "
@@ -434,14 +430,8 @@ def choose_env(env: Any) -> tuple[Any, list[str], dict[str, str]]:
             )
         return env
 
-    own = {
-        "ENVS": {**envs.ENVS, name: fields},
-        "canonical": lambda given: given if given == name else envs.canonical(given),
-        "env_defaults": lambda given: dict(fields) if given == name else envs.env_defaults(given),
-        "make": made,
-    }
-    drawn = [] if gym else ["video=false"]  # there is a picture of Safety Gym's alone
-    return SimpleNamespace(**vars(envs) | own), [f"env={name}", *drawn], {"env": name}
+    drawn = {} if gym else {"video": False}  # there is a picture of Safety Gym's alone
+    return {"env": name, **drawn}, {name: EnvEntry(fields, made)}
 
 
 def described(env: Any) -> dict[str, Any]:
@@ -453,13 +443,15 @@ def described(env: Any) -> dict[str, Any]:
     return {name: value for name, value in values.items() if isinstance(value, PLAIN)}
 
 
-def choose_algo(algo: Any) -> tuple[Any, list[str], dict[str, str]]:
+def choose_algo(algo: Any) -> tuple[dict[str, Any], dict[str, Row]]:
     """As `choose_env`, for one algorithm or a list."""
     if algo is None:
-        return algos, [], {}
+        return {}, {}
+    several = type(algo) in (list, tuple)  # an entry is a tuple too
     names, own = [], {}
-    for one in algo if type(algo) in (list, tuple) else [algo]:  # an Entry is a tuple too
+    for one in algo if several else [algo]:
         if isinstance(one, str):
+            load("algo", one)
             names.append(one)
             continue
         kind: Any = getattr(one, "config", None)
@@ -469,70 +461,51 @@ def choose_algo(algo: Any) -> tuple[Any, list[str], dict[str, str]]:
                 f"algo: expected a name or an object with a config class and make, not {one!r}"
             )
         name = kind.__name__.removesuffix("Config")
-        own[name] = algos.Entry(kind, make_algo, "", {})
+        own[name] = Row(kind, make_algo, "", {})
         names.append(name)
-    known = SimpleNamespace(ALGOS={**algos.ALGOS, **own}) if own else algos
-    whose = {"algo": ", ".join(own)} if own else {}
-    return known, ["algo=" + ",".join(map(text, names))], whose
+    return {"algo": names if several else names[0]}, own
 
 
-def texts(known: Registries, options: dict[str, Any], swept: bool = False) -> list[str]:
-    """The arguments of the script that does the same. `swept`: a list holds several values."""
-    out = [*known.chosen]
-    for name, value in (flat(options) if swept else options).items():
-        key, value = key_of(name, known, swept), as_list(value)
-        if swept and isinstance(value, list):
-            if not value:
-                raise ConfigError(f"{name}=[]: expected values to sweep")
-            out.append(f"{key}={','.join(text(v) for v in value)}")
+def named(choice: Chosen, options: dict[str, Any], *more: str) -> dict[str, Any]:
+    """Options by their full names: 'total_steps' stays, 'cost_limit' is 'algo.cost_limit'.
+
+    Raises:
+        ConfigError: no run and no algorithm has such an option.
+    """
+    rows = {**algos.ALGOS, **choice.entries.algos}.values()
+    fields = {f.name for row in rows for f in dataclasses.fields(row.config)}
+
+    def full(name: str) -> str:
+        head = name.partition(".")[0]
+        if head in DEFAULT or name in (*SETTINGS, *more):
+            return name
+        if head not in fields:
+            raise ConfigError(f"unknown option {name}{nearest(name, [*SETTINGS, *more, *fields])}")
+        return f"algo.{name}"
+
+    return {full(name): value for name, value in options.items()}
+
+
+def asked_for(choice: Chosen, options: dict[str, Any]) -> tuple[dict[str, Any], dict[str, list[Any]]]:
+    """What to sweep, as `run.sweep.plan` takes it: a list holds the values of an option.
+
+    Raises:
+        ConfigError: a list is empty, or there is no such option.
+    """
+    given, several = {}, {}
+    for name, value in {**choice.given, **named(choice, flat(options), "max_parallel")}.items():
+        values = as_list(value)
+        if not isinstance(values, list):
+            given[name] = value
+        elif values:
+            several[name] = [to_plain(v, name) for v in values]
         else:
-            out.append(f"{key}={text(value)}")
-    return out
+            raise ConfigError(f"{name.removeprefix('algo.')}=[]: expected values to sweep")
+    return to_plain(nested(given)), several
 
 
 def as_list(value: Any) -> Any:
+    """What holds several values, as a list of them."""
     if isinstance(value, np.ndarray | jax.Array):
         return value.tolist()
     return list(value) if isinstance(value, range) else value
-
-
-def key_of(name: str, known: Registries, swept: bool) -> str:
-    """'total_steps', 'algo.cost_limit': an option as the command line calls it."""
-    own = [*SETTINGS, *(["max_parallel"] if swept else [])]
-    head = name.partition(".")[0]
-    if head in ("env", "algo") or name in own:
-        return name
-    fields = {f.name for a in known.algos.ALGOS.values() for f in dataclasses.fields(a.config)}
-    if head not in fields:
-        raise ConfigError(f"unknown option {name}{nearest(name, [*own, *fields])}")
-    return f"algo.{name}"
-
-
-def text(value: Any) -> str:
-    """A plain value in Hydra's grammar."""
-    value = value.item() if isinstance(value, np.generic) else as_list(value)
-    if isinstance(value, str | Path):
-        value = str(value)
-        bare = re.fullmatch(r"[A-Za-z_./][\w./:-]*", value)
-        if bare and value.lower() not in ("true", "false", "null", "inf", "nan"):
-            return value
-        escaped = re.sub(r"(\\*)('|$)", lambda m: 2 * m[1] + ("\\'" if m[2] else ""), value)
-        return f"'{escaped}'"
-    if isinstance(value, list | tuple):
-        return f"[{','.join(map(text, value))}]"
-    if isinstance(value, dict):
-        return f"{{{','.join(f'{text(k)}: {text(v)}' for k, v in value.items())}}}"
-    if value is None or isinstance(value, bool):
-        return {None: "null", True: "true", False: "false"}[value]
-    if isinstance(value, int | float):
-        return repr(value)
-    raise ConfigError(f"{value!r}: expected a number, a string, true or false, None, a list or a dict")
-
-
-@contextlib.contextmanager
-def one_line() -> Iterator[None]:
-    """Hydra's errors, several lines long, as a ConfigError of one."""
-    try:
-        yield
-    except (HydraException, OmegaConfBaseException) as error:
-        raise ConfigError(command.one_line(error)) from error

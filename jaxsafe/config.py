@@ -17,6 +17,12 @@ class ConfigError(ValueError):
     """A setting that cannot be used. The message is one line for the user."""
 
 
+def one_line(error: BaseException) -> str:
+    """The first line of what an error says, or its kind if it says nothing."""
+    lines = (line.strip() for line in str(error).splitlines())
+    return next((line for line in lines if line), type(error).__name__)
+
+
 @dataclass_transform(frozen_default=True, kw_only_default=True)
 def config(cls: type[T]) -> type[T]:
     """Make `cls` a frozen dataclass and a pytree: floats, alone or by name, are leaves, others static.

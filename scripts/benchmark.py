@@ -24,9 +24,11 @@ import numpy as np
 
 from jaxsafe import algos, envs
 from jaxsafe.config import ConfigError
-from jaxsafe.learn.rollout import collect, init_rollout
-from jaxsafe.run import run_folder, runner
-from jaxsafe.run.runner import device_name, use_compilation_cache
+from jaxsafe.learn.rollout import collect, init_rollout, memoryless
+from jaxsafe.run import run_folder
+from jaxsafe.run.devices import check_devices, device_name, use_compilation_cache
+from jaxsafe.run.settings import TrainConfig
+from jaxsafe.run.spread import build
 from jaxsafe.types import Shared
 
 
@@ -53,7 +55,7 @@ def stepping(env, num_envs: int, seeds: int, horizon: int):
     def run(state):
         rollout, key = state
         key, next_key = jax.random.split(key)
-        rollout, trajectory = collect(env, policy, rollout, key, horizon)
+        rollout, trajectory = collect(env, memoryless(policy), rollout, key, horizon)
         return (rollout, next_key), trajectory.reward.sum() + trajectory.obs.sum()
 
     def init(key):
@@ -65,9 +67,9 @@ def stepping(env, num_envs: int, seeds: int, horizon: int):
 
 def training(env, algo: str, cfg, seeds: int, devices: int):
     """(state, fn): one update of `algo`."""
-    settings = runner.TrainConfig(num_seeds=seeds, devices=devices)
-    runner.check_devices(settings)
-    program = runner.build(env, algos.ALGOS[algo].make, [cfg], settings)
+    settings = TrainConfig(num_seeds=seeds, devices=devices)
+    check_devices(settings)
+    program = build(env, algos.ALGOS[algo].make, [cfg], settings)
     shared = Shared(np.int32(0))
     state = jax.jit(program.init)(jax.device_put(program.start, program.sharding), shared)
     return state, lambda ts: program.update(ts, shared)[0]

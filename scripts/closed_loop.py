@@ -19,7 +19,7 @@ from benchmark import versions
 
 from jaxsafe import envs
 from jaxsafe.config import ConfigError
-from jaxsafe.learn.rollout import collect, init_rollout
+from jaxsafe.learn.rollout import collect, init_rollout, memoryless
 
 TURN, NOISE = 4.0, 0.3  # action per radian, and its standard deviation
 
@@ -61,7 +61,9 @@ def run(name: str, variant: str, episodes: int) -> dict[str, list[float]]:
     policy = partial(flail if robot(env) == "doggo" else seek, env)
     reset_key, key = jax.random.split(jax.random.key(0))
     rollout = jax.jit(init_rollout, static_argnums=(0, 2, 3))(env, reset_key, episodes, False)
-    go = jax.jit(lambda rollout, key: collect(env, policy, rollout, key, env.episode_length))
+    go = jax.jit(
+        lambda rollout, key: collect(env, memoryless(policy), rollout, key, env.episode_length)
+    )
     trajectory = jax.device_get(go(rollout, key)[1])
     if not trajectory.ended[-1].all():
         raise ConfigError(f"{name}: episodes ended early, so their sums cannot be compared")

@@ -2,8 +2,7 @@
 
 import sys
 
-from jaxsafe import algos, envs
-from jaxsafe.run.command import evaluate_main
+from jaxsafe.commands.evaluate import main
 
 if __name__ == "__main__":
-    sys.exit(evaluate_main(envs, algos))
+    sys.exit(main())

@@ -2,8 +2,7 @@
 
 import sys
 
-from jaxsafe import algos, envs
-from jaxsafe.interop.migrate import main
+from jaxsafe.commands.migrate import main
 
 if __name__ == "__main__":
-    sys.exit(main(envs, algos))
+    sys.exit(main())

@@ -2,8 +2,7 @@
 
 import sys
 
-from jaxsafe import algos, envs
-from jaxsafe.report.compare import main
+from jaxsafe.commands.plot import main
 
 if __name__ == "__main__":
-    sys.exit(main(envs, algos))
+    sys.exit(main())

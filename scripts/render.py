@@ -2,8 +2,7 @@
 
 import sys
 
-from jaxsafe import algos, envs
-from jaxsafe.run.viewing import render_main
+from jaxsafe.commands.render import main
 
 if __name__ == "__main__":
-    sys.exit(render_main(envs, algos))
+    sys.exit(main())

@@ -2,8 +2,7 @@
 
 import sys
 
-from jaxsafe import algos, envs
-from jaxsafe.run.sweeps import main
+from jaxsafe.commands.sweep import main
 
 if __name__ == "__main__":
-    sys.exit(main(envs, algos))
+    sys.exit(main())

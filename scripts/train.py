@@ -2,8 +2,7 @@
 
 import sys
 
-from jaxsafe import algos, envs
-from jaxsafe.run.command import train_main
+from jaxsafe.commands.train import main
 
 if __name__ == "__main__":
-    sys.exit(train_main(envs, algos))
+    sys.exit(main())

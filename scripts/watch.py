@@ -2,8 +2,7 @@
 
 import sys
 
-from jaxsafe import algos, envs
-from jaxsafe.run.viewing import watch_main
+from jaxsafe.commands.watch import main
 
 if __name__ == "__main__":
-    sys.exit(watch_main(envs, algos))
+    sys.exit(main())

@@ -95,6 +95,32 @@ class Clock:
 
 
 @dataclass(frozen=True)
+class Recall:
+    """A sign is shown at the first observation only, and is to be pulled towards at every step.
+
+    Observation [2]: the sign (0 but at the first), and 1. Reward: 1 - |a - sign|, a in [-1, 1]. The
+    best return of an episode of T steps is T. It is 1 for a policy without memory, which earns nothing
+    from the second step on. Cost: 1 where a > 0.
+    """
+
+    obs_size: int = 2
+    action_size: int = 1
+    episode_length: int = 6
+    cost_names: tuple[str, ...] = ("right",)
+
+    def reset(self, key: jax.Array) -> State:
+        sign = jax.random.rademacher(key, (), jnp.float32)
+        obs, zero = jnp.stack([sign, jnp.ones(())]), jnp.zeros(())
+        return State(sign, obs, zero, zero, zero[None], jnp.bool_(False), {})
+
+    def step(self, state: State, action: jax.Array) -> State:
+        sign, a = state.physics, jnp.clip(action[0], -1.0, 1.0)
+        cost = (a > 0).astype(jnp.float32)
+        obs = jnp.array([0.0, 1.0])
+        return State(sign, obs, 1 - jnp.abs(a - sign), cost, cost[None], jnp.bool_(False), {})
+
+
+@dataclass(frozen=True)
 class Lever:
     """Two levers; the first earns and costs, the second earns for free. Its optimum is known.
 

@@ -18,15 +18,17 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 
-from jaxsafe import algos, envs
-from jaxsafe.report import compare, plots, scores, stats, tables
+from jaxsafe.report import plots, scores, stats, tables
+from jaxsafe.report.group import Group, group, ordered
+from jaxsafe.report.published import beside, read_published
+from jaxsafe.report.read import read
 from jaxsafe.run import run_folder
 
 HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE), str(HERE.parent)]
 marked, run = importlib.import_module("tables"), importlib.import_module("run")
 # OmniSafe: evaluated policies. We know of no constrained table of Push.
-PUBLISHED = compare.read_published(HERE / "published.csv")
+PUBLISHED = read_published(HERE / "published.csv")
 SWEEP = "jaxsafe, and dynamics"  # `solver` of the rows that are compared with each other
 # Why cells lie outside the published spread, by algorithm, or of one task alone.
 FIRST = "first-order learners earn less there (see below)"
@@ -130,14 +132,14 @@ def beyond(value: float, spread: tuple[float, float]) -> float:
     return float(np.sign(value - mean) * max(0.0, abs(value - mean) - width))
 
 
-def outside(groups: Sequence[compare.Group]) -> str:
+def outside(groups: Sequence[Group]) -> str:
     """The cells whose mean lies outside the published spread, the published training curve, and why."""
     with (HERE / "published_curves.csv").open() as file:
         curves = {(r["env"], r["algo"]): (r["return"], r["cost"]) for r in csv.DictReader(file)}
     lines, within, count = ["| run | return | cost | ours | their curve | why |"], 0, 0
     lines.append("|---|---:|---:|---:|---:|---|")
     for g in sorted(groups, key=lambda g: (g.name, g.env)):
-        if theirs := compare.beside(g, PUBLISHED):
+        if theirs := beside(g, PUBLISHED):
             off = beyond(g.ret.mean, theirs.ret), beyond(g.cost.mean, theirs.cost)
             count, within = count + 1, within + (not any(off))
             if any(off):
@@ -152,10 +154,10 @@ def outside(groups: Sequence[compare.Group]) -> str:
     return "\n".join([summary, "", *lines])
 
 
-def held(groups: Sequence[compare.Group]) -> str:
+def held(groups: Sequence[Group]) -> str:
     """How many constrained cells cost at most 1.2 times the limit, ours in training and published."""
     free = {"pg", "npg", "trpo", "ppo"}
-    cells = [(g, compare.beside(g, PUBLISHED)) for g in groups if g.name not in free]
+    cells = [(g, beside(g, PUBLISHED)) for g in groups if g.name not in free]
     kept = [theirs for g, theirs in cells if g.cost.mean <= 30]
     costs = [theirs.cost[0] for _, theirs in cells if theirs]
     return (
@@ -165,7 +167,7 @@ def held(groups: Sequence[compare.Group]) -> str:
     )
 
 
-def conventions(ours: Sequence[compare.Group], theirs: Sequence[compare.Group]) -> str:
+def conventions(ours: Sequence[Group], theirs: Sequence[Group]) -> str:
     """Return and cost of the same runs without and with `compat=omnisafe`, and OmniSafe's."""
     usual = {(g.env, g.name): g for g in ours}
     lines = ["| | `compat=none` | `compat=omnisafe` | OmniSafe |", "|---|---:|---:|---:|"]
@@ -177,7 +179,7 @@ def conventions(ours: Sequence[compare.Group], theirs: Sequence[compare.Group]) 
     return "\n".join(lines)
 
 
-def by_algorithm(groups: Sequence[compare.Group]) -> str:
+def by_algorithm(groups: Sequence[Group]) -> str:
     """Return and cost of each algorithm on each task, and below them what is published."""
     tasks = sorted({g.env for g in groups})
     found = {(g.env, g.name): g for g in groups}
@@ -188,7 +190,7 @@ def by_algorithm(groups: Sequence[compare.Group]) -> str:
             figures = []
             if g := found.get((env, algo)):
                 figures.append(f"{g.ret.mean:.1f}, {g.cost.mean:.1f}")
-                if theirs := compare.beside(g, PUBLISHED):
+                if theirs := beside(g, PUBLISHED):
                     figures.append(f"*{theirs.ret[0]:.1f}, {theirs.cost[0]:.1f}*")
             cells.append("<br>".join(figures))
         lines.append(f"| `{algo}` | {' | '.join(cells)} |")
@@ -347,21 +349,21 @@ def throughput(path: Path) -> None:
     plt.close(figure)
 
 
-def figures(groups: Sequence[compare.Group]) -> None:
+def figures(groups: Sequence[Group]) -> None:
     """Curves of every task, of the main algorithms and of the others, and return against cost."""
     for name, main in (("curves", True), ("curves_others", False)):
         plots.save(
             plots.learning([g for g in groups if (g.name in run.MAIN) == main]), HERE / name, ["png"]
         )
-    known = {(g.env, g.name): compare.beside(g, PUBLISHED) for g in groups}
+    known = {(g.env, g.name): beside(g, PUBLISHED) for g in groups}
     plots.save(plots.trade_off(groups, "last 10 % of training", known), HERE / "trade_off", ["png"])
 
 
 def main() -> None:
     throughput(HERE / "throughput.png")
-    runs = [x for x in compare.read([HERE], envs, algos) if x.config["preset"] == "fast"]
+    runs = [x for x in read([HERE]) if x.config["preset"] == "fast"]
     ours, theirs = (
-        compare.ordered(compare.group([x for x in runs if x.config["compat"] == c], ["algo.name"]))
+        ordered(group([x for x in runs if x.config["compat"] == c], ["algo.name"]))
         for c in ("none", "omnisafe")
     )
     groups = [g for g in ours if g.name in run.ALGOS]

@@ -11,20 +11,21 @@ Engine(config) is given.
 Source: the configs of OmniSafe after 0.5.0 (2025), and Safety Gym's Engine.
 """
 
-import argparse
 import dataclasses
 import json
 import math
-import shlex
-import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import yaml
 
-from jaxsafe.config import ConfigError, convert, from_dict, nearest
-from jaxsafe.run import command
+from jaxsafe import algos, envs
+from jaxsafe.config import ConfigError, convert, from_dict, nearest, one_line
+from jaxsafe.envs.safety_gym import suite
+from jaxsafe.envs.safety_gym.config import defaults
+from jaxsafe.envs.safety_gym.config import read as read_config
+from jaxsafe.run.settings import algo_options, as_text
 
 ALGORITHMS = {
     "CPO": "cpo",
@@ -295,12 +296,11 @@ class Migrated(NamedTuple):
     lines: list[Line]
 
 
-def omnisafe(config: dict[str, Any], envs: Any, algos: Any, algo: str = "", env: str = "") -> Migrated:
+def omnisafe(config: dict[str, Any], algo: str = "", env: str = "") -> Migrated:
     """The command line for a config of OmniSafe.
 
     Args:
         config: its tree, as in a run's config.json, or with `defaults` as in OmniSafe's own files.
-        envs, algos: the registries, as modules.
         algo, env: OmniSafe's names, if the config has none; an env may be one of ours.
     Raises:
         ConfigError: a key, an algorithm or an environment that is unknown or has no counterpart, or a
@@ -313,10 +313,10 @@ def omnisafe(config: dict[str, Any], envs: Any, algos: Any, algo: str = "", env:
         if key not in OMNISAFE:
             raise ConfigError(f"unknown key {key} of OmniSafe{nearest(key, OMNISAFE)}")
     name = find_algorithm(algo or values.get("algo"))
-    target = find_environment(env or values.get("env_id"), envs)
+    target = find_environment(env or values.get("env_id"))
     entry = algos.ALGOS[name]
-    preset = command.algo_options(algos, name, "published", "omnisafe")
-    start = {f"algo.{k}": v for k, v in preset.items() if k != "name"}
+    preset = algo_options(entry, "published", "omnisafe")
+    start = {f"algo.{k}": v for k, v in preset.items()}
     start |= {"num_envs": preset["num_envs"], "seed": 0, "total_steps": 10_000_000}
     facts = Facts(values, name, "epochs" not in preset)
     found: dict[str, Any] = {}
@@ -361,11 +361,11 @@ def find_algorithm(theirs: Any) -> str:
     return ALGORITHMS[theirs]
 
 
-def find_environment(theirs: Any, envs: Any) -> list[str]:
+def find_environment(theirs: Any) -> list[str]:
     """Options for the environment that OmniSafe calls `theirs`, or that is called so here."""
     if not theirs:
         raise ConfigError("no env_id in the file: add --env, as in --env SafetyPointGoal1-v0")
-    if ours := envs.suite.safety_gymnasium(theirs):
+    if ours := suite.safety_gymnasium(theirs):
         return [f"env={ours}", "env.rules=safety_gymnasium"]
     if theirs.startswith("Safety"):
         raise ConfigError(
@@ -375,7 +375,7 @@ def find_environment(theirs: Any, envs: Any) -> list[str]:
     return [f"env={envs.canonical(theirs)}"]
 
 
-def safety_gym(config: dict[str, Any], envs: Any) -> Migrated:
+def safety_gym(config: dict[str, Any]) -> Migrated:
     """The command line for the dict that Safety Gym's Engine takes; its options are ours by name.
 
     The environment is the registered one of that task and robot, if any, that differs least from it.
@@ -384,7 +384,7 @@ def safety_gym(config: dict[str, Any], envs: Any) -> Migrated:
         ConfigError: an option that Engine does not have, or a value of the wrong type.
     """
     config = {**config}
-    known = [field for field in envs.defaults() if field not in OURS_ALONE]
+    known = [field for field in defaults() if field not in OURS_ALONE]
     for key in config:
         if key not in known:
             raise ConfigError(f"unknown option {key} of Engine{nearest(key, known)}")
@@ -392,7 +392,7 @@ def safety_gym(config: dict[str, Any], envs: Any) -> Migrated:
     for key in [k for k in VISION if k in config]:
         asked = key == "observe_vision" and bool(config[key])
         lines.append(Line(key, config.pop(key), "vision is not available yet", asked))
-    options = dataclasses.asdict(envs.read(envs.defaults(**config)))
+    options = dataclasses.asdict(read_config(defaults(**config)))
     options = {k: v for k, v in options.items() if k not in VISION}
 
     def differences(name: str) -> dict[str, Any]:
@@ -403,7 +403,7 @@ def safety_gym(config: dict[str, Any], envs: Any) -> Migrated:
         found = differences(name)
         return "task" in found, "robot_base" in found, len(found)
 
-    name = min(envs.suite.suite(), key=distance)
+    name = min(suite.suite(), key=distance)
     argv = [f"env={name}", *(written(f"env.{k}", v) for k, v in differences(name).items())]
     lines += [Line(k, config[k], written(f"env.{k}", options[k])) for k in config]
     return Migrated(argv, lines)
@@ -421,14 +421,8 @@ def flatten(tree: Any, head: str = "") -> dict[str, Any]:
 
 
 def written(key: str, value: Any) -> str:
-    """An option as train.py reads it: lists in brackets, true, false and null."""
-    return f"{key}={text_of(value)}"
-
-
-def text_of(value: Any) -> str:
-    if isinstance(value, list | tuple):
-        return f"[{','.join(map(text_of, value))}]"
-    return json.dumps(value) if value is None or isinstance(value, bool) else str(value)
+    """An option as train.py reads it."""
+    return f"{key}={as_text(value)}"
 
 
 def read(path: Path) -> dict[str, Any]:
@@ -436,15 +430,13 @@ def read(path: Path) -> dict[str, Any]:
     try:
         text = path.read_text()
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"cannot read {path}: {command.one_line(error)}") from error
+        raise ConfigError(f"cannot read {path}: {one_line(error)}") from error
     if path.suffix not in (".json", ".yaml", ".yml"):
         raise ConfigError(f"{path}: expected a name that ends in .json or .yaml")
     try:
         tree = json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)
     except (json.JSONDecodeError, yaml.YAMLError) as error:
-        raise ConfigError(
-            f"{path} is no {path.suffix[1:].upper()}: {command.one_line(error)}"
-        ) from error
+        raise ConfigError(f"{path} is no {path.suffix[1:].upper()}: {one_line(error)}") from error
     flatten(tree)
     return tree
 
@@ -452,34 +444,6 @@ def read(path: Path) -> dict[str, Any]:
 def report(lines: list[Line]) -> str:
     """A line a key; what the command does not do comes last."""
     return "\n".join(
-        f"{'no counterpart: ' * line.lost}{line.key}={text_of(line.value)}: {line.text}"
+        f"{'no counterpart: ' * line.lost}{line.key}={as_text(line.value)}: {line.text}"
         for line in sorted(lines, key=lambda line: line.lost)
     )
-
-
-def main(envs: Any, algos: Any) -> int:
-    """scripts/migrate.py. Exit status 2 for a file that has no counterpart."""
-
-    def migrate() -> int:
-        parser = argparse.ArgumentParser(
-            description=(__doc__ or "").partition("\n")[0],
-            epilog=(__doc__ or "").partition("\n\n")[2],
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
-        parser.error = command.fail  # type: ignore[method-assign]
-        parser.add_argument("source", choices=("omnisafe", "safety_gym"))
-        parser.add_argument("config", type=Path, metavar="CONFIG")
-        parser.add_argument("--algo", default="", help="OmniSafe's name (default: the file's)")
-        parser.add_argument("--env", default="", help="OmniSafe's name, or ours (default: the file's)")
-        args = parser.parse_args()
-        tree = read(args.config)
-        if args.source == "omnisafe":
-            algo = args.algo or (args.config.stem if args.config.stem in ALGORITHMS else "")
-            found = omnisafe(tree, envs, algos, algo, args.env)
-        else:
-            found = safety_gym(tree, envs)
-        print(report(found.lines), file=sys.stderr, flush=True)
-        print(shlex.join(["python", "scripts/train.py", *found.argv]))
-        return 0
-
-    return command.guarded(migrate)

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxsafe.config import ConfigError, config
+from jaxsafe.learn.acting import begun_anew
 from jaxsafe.learn.augment import Augmentation, nothing
 from jaxsafe.learn.batch import all_finite, batch_mean, centre, masked_mean, psum, select, standardise
 from jaxsafe.learn.constraints import Names, check_names, each, limit, signal, spread, unnamed
@@ -27,7 +28,16 @@ from jaxsafe.learn.steps import Context, Pair, Step, adam, fit_critic, stops_cri
 from jaxsafe.learn.surrogates import Surrogate, with_entropy
 from jaxsafe.learn.treatments import Treatment
 from jaxsafe.nn.gaussian import Gaussian, entropy, log_prob, sample
-from jaxsafe.nn.networks import init_params, policy, share_trunk, stack, stack_critics, values
+from jaxsafe.nn.networks import (
+    init_params,
+    init_recurrent,
+    policy,
+    read,
+    remember,
+    share_trunk,
+    stack,
+    stack_critics,
+)
 from jaxsafe.types import Algorithm, Clocks, Env, Metrics, Policy, PyTree, Shared
 
 
@@ -40,7 +50,8 @@ class OnPolicyConfig:
     stagger: bool = True  # spread the first episodes' ends over time
     total_iterations: float = float("inf")  # where what decays reaches 0; inf: total_steps' end
     hidden: tuple[int, ...] = (64, 64)  # units of each network [O]
-    trunk: Literal["separate", "shared"] = "separate"  # networks of their own [O, S], or one for all
+    # networks of their own [O, S], one with common hidden layers, or one with a memory
+    trunk: Literal["separate", "shared", "gru"] = "separate"
     value_coef: float = (
         0.5  # of each critic's squared error in the loss of a shared trunk; else unused; SB3
     )
@@ -84,7 +95,7 @@ class TrainState:
 
     config: the algorithm's, with its floats as arrays.
     params: {'actor', 'critic_r', 'critic_c'}; of several constraints critic_c is stacked, [K, ...].
-        With a shared trunk {'actor'}, see networks.share_trunk.
+        With one network for all {'actor'}, see nn.networks.
     opt_state: {'actor': the step's own, 'critics': Adam's for all critics, stacked, or ()}.
     dual: the treatment's state.
     normaliser: Normaliser, or () without `obs_normalize`.
@@ -118,12 +129,13 @@ class Learned:
 
 @flax.struct.dataclass
 class Batch:
-    """B = T * N transitions, as the policy sees them: observations are normalised.
+    """B = T * N transitions, as the policy sees them: observations are normalised. With a memory N
+    sequences of T, and [N, T] stands for [B].
 
-    obs [B, O]; action [B, A]; log_prob [B] and old (Gaussian [B, A]) of the policy that acted;
-    adv_r standardised, adv_c only centred, in cost units or, with `cost_normalize`, in standard
-    deviations of a step's; ret_r, ret_c: the critics' targets [B]. Of several constraints adv_c and
-    ret_c are [B, K].
+    obs [B, O], or `Sequences`; action [B, A]; log_prob [B] and old (Gaussian [B, A]) of the policy
+    that acted; adv_r standardised, adv_c only centred, in cost units or, with `cost_normalize`, in
+    standard deviations of a step's; ret_r, ret_c: the critics' targets [B]. Of several constraints
+    adv_c and ret_c are [B, K].
     """
 
     obs: jax.Array
@@ -240,6 +252,11 @@ def loop(
         opt_critics = jax.vmap(adam(cfg.critic_lr, cfg).init)(stack_critics(params))
         if cfg.trunk == "shared":
             params, opt_critics = share_trunk(params, cfg), ()
+        if cfg.trunk == "gru":
+            critics = 1 + (len(names) or 1)
+            params, opt_critics = init_recurrent(params_key, *sizes, critics, cfg), ()
+        rollout = init_rollout(wrapped, own(rollout_key, axis_name), cfg.num_envs, cfg.stagger)
+        carry = jnp.zeros((cfg.num_envs, cfg.hidden[-1])) if cfg.trunk == "gru" else ()
         return TrainState(
             config=cfg,
             params=params,
@@ -247,7 +264,7 @@ def loop(
             dual=dual,
             normaliser=init_normaliser(env.obs_size) if cfg.obs_normalize else (),
             signals=init_signals(cfg, len(named(cfg)) or 1),
-            rollout=init_rollout(wrapped, own(rollout_key, axis_name), cfg.num_envs, cfg.stagger),
+            rollout=dataclasses.replace(rollout, carry=carry),
             episode_length=jnp.float32(env.episode_length),
             past_costs=empty_window(cfg.cost_window, jnp.shape(limit(cfg, named(cfg)))),
             key=key,
@@ -260,10 +277,15 @@ def loop(
         cfg = ts.config
         key, rollout_key, step_key, critic_key = jax.random.split(ts.key, 4)
 
-        def behave(obs: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-            dist = policy(ts.params["actor"], see(ts, obs), cfg)
+        acting = learned_of(ts)
+
+        def behave(
+            carry: PyTree, obs: jax.Array, first: jax.Array, key: jax.Array
+        ) -> tuple[jax.Array, jax.Array, PyTree]:
+            carry = begun_anew(remembering, acting, carry, first)
+            dist, carry = decide(acting, carry, obs)
             action = sample(dist, key)
-            return action, log_prob(dist, action)
+            return action, log_prob(dist, action), carry
 
         pool = augmentation.renew(ts.rollout.pool, cfg, ts.dual)
         rollout, traj = collect(
@@ -278,7 +300,8 @@ def loop(
         charged = signal(env, traj, names)
         reward, cost, signals = learned(ts, augmentation.reward(traj, cfg), charged, axis_name)
         last_obs = augmentation.last_obs(traj, cfg)
-        batch, explained = estimate(ts, traj, last_obs, reward, cost, names, axis_name)
+        carry = ts.rollout.carry
+        batch, explained = estimate(ts, traj, carry, last_obs, reward, cost, names, axis_name)
         length = mean_length(ts.episode_length, traj.ended, traj.length, axis_name)
         cost_rate = batch_mean(traj.cost, axis_name)
         episode_cost = batch_mean(charged, axis_name, (0, 1)) * length
@@ -303,7 +326,8 @@ def loop(
             (dual, normaliser, signals, length, past_costs),
             (ts.dual, ts.normaliser, ts.signals, ts.episode_length, ts.past_costs),
         )
-        metrics |= explained | {"train/cost_estimate": episode_cost}
+        # J_c of each named cost; of the cost itself it is among the next
+        metrics |= explained | ({"train/cost_estimate": episode_cost} if names else {})
         metrics = spread(metrics, names) | episode_metrics(env, traj, axis_name)
         metrics |= {
             "train/cost_rate": cost_rate,  # per environment step
@@ -329,11 +353,25 @@ def loop(
     def act(
         learned: Learned, carry: PyTree, obs: jax.Array, key: jax.Array | None
     ) -> tuple[jax.Array, PyTree, dict[str, Any]]:
-        dist = policy(learned.params["actor"], see(learned, obs), learned.config)
+        dist, carry = decide(learned, carry, obs)
         return (dist.mean if key is None else sample(dist, key)), carry, {}
 
-    acting = Policy(init=lambda learned: (), act=act)
-    return Algorithm(init, update, acting, learned_of, task, clocks)
+    remembering = Policy(init=nothing_yet, act=act)
+    return Algorithm(init, update, remembering, learned_of, task, clocks)
+
+
+def decide(learned: Learned, carry: PyTree, obs: jax.Array) -> tuple[Gaussian, PyTree]:
+    """The action distribution for `obs` [..., O] as the environment gives it, and the next carry."""
+    actor, cfg = learned.params["actor"], learned.config
+    if cfg.trunk == "gru":
+        carry, dist, _ = remember(actor, carry, see(learned, obs), cfg)
+        return dist, carry
+    return policy(actor, see(learned, obs), cfg), carry
+
+
+def nothing_yet(learned: Learned) -> PyTree:
+    """The carry at the start of an episode."""
+    return jnp.zeros(learned.config.hidden[-1]) if learned.config.trunk == "gru" else ()
 
 
 def learned_of(ts: TrainState) -> Learned:
@@ -408,11 +446,13 @@ def check(cfg: Any) -> None:
     for name in ("num_envs", "horizon", "minibatches", "cost_window"):
         if getattr(cfg, name) < 1:
             raise ConfigError(f"{name}={getattr(cfg, name)}: expected at least 1")
-    size = cfg.num_envs * cfg.horizon
+    # a network with a memory learns from whole sequences, one of each environment
+    rows = "num_envs" if cfg.trunk == "gru" else "num_envs * horizon"
+    size = cfg.num_envs * (1 if cfg.trunk == "gru" else cfg.horizon)
     if size % cfg.minibatches:
         divisors = [m for m in range(1, size + 1) if size % m == 0]
         raise ConfigError(
-            f"minibatches={cfg.minibatches}: expected a divisor of num_envs * horizon = {size}; "
+            f"minibatches={cfg.minibatches}: expected a divisor of {rows} = {size}; "
             f"the nearest is {min(divisors, key=lambda m: abs(m - cfg.minibatches))}"
         )
 
@@ -420,6 +460,7 @@ def check(cfg: Any) -> None:
 def estimate(
     ts: TrainState,
     traj: Trajectory,
+    carry: PyTree,
     next_obs: jax.Array,
     reward: jax.Array,
     cost: jax.Array,
@@ -427,13 +468,16 @@ def estimate(
     axis_name: str | None,
 ) -> tuple[Batch, Metrics]:
     """Advantages and targets of `reward` [T, N] and of `cost` [T, N] or, for several `names`,
-    [T, N, K], under the parameters that acted. next_obs [T, N, O]: whose value a step leads to."""
+    [T, N, K], under the parameters that acted.
+
+    Args:
+        carry: what the policy remembered before the rollout.
+        next_obs: float [T, N, O], whose value each step leads to.
+    """
     cfg = ts.config
     obs, next_obs = see(ts, traj.obs), see(ts, next_obs)
-    old = policy(ts.params["actor"], obs, cfg)
+    seen, old, v, next_v = read(ts.params, obs, next_obs, traj.first, carry, cfg)
     ratio = jnp.exp(log_prob(old, traj.action) - traj.log_prob)  # 1: the policy is still the same
-
-    v, next_v = values(ts.params, obs, cfg), values(ts.params, next_obs, cfg)
     v_c, next_v_c = (x[..., 1:].reshape(cost.shape) for x in (v, next_v))
 
     def both(v: jax.Array, next_v: jax.Array, signal: jax.Array, discount: Any, decay: Any):
@@ -446,15 +490,17 @@ def estimate(
     adv_r, error_r, ret_r = both(v[..., 0], next_v[..., 0], reward, cfg.discount, cfg.gae_lambda)
     of_cost = jax.vmap(both, (-1, -1, -1, None, None), -1) if names else both
     adv_c, error_c, ret_c = of_cost(v_c, next_v_c, cost, cfg.cost_discount, cfg.cost_gae_lambda)
+    # rows of a minibatch: single steps or, with a memory, whole sequences of an environment
+    rows = sequences if cfg.trunk == "gru" else steps
     batch = Batch(
-        obs=obs,
-        action=traj.action,
-        log_prob=traj.log_prob,
-        old=old,
-        adv_r=standardise(adv_r, axis_name),
-        adv_c=each(lambda x: centre(x, axis_name), names)(adv_c),
-        ret_r=ret_r,
-        ret_c=ret_c,
+        obs=seen if cfg.trunk == "gru" else steps(seen),
+        action=rows(traj.action),
+        log_prob=rows(traj.log_prob),
+        old=jax.tree.map(rows, old),
+        adv_r=rows(standardise(adv_r, axis_name)),
+        adv_c=rows(each(lambda x: centre(x, axis_name), names)(adv_c)),
+        ret_r=rows(ret_r),
+        ret_c=rows(ret_c),
     )
     metrics = {
         "train/explained_variance_r": explained_variance(error_r, ret_r, axis_name),
@@ -462,7 +508,17 @@ def estimate(
             lambda error, target: explained_variance(error, target, axis_name), names
         )(error_c, ret_c),
     }
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch), metrics
+    return batch, metrics
+
+
+def steps(x: jax.Array) -> jax.Array:
+    """[T * N, ...] of [T, N, ...]."""
+    return x.reshape(-1, *x.shape[2:])
+
+
+def sequences(x: jax.Array) -> jax.Array:
+    """[N, T, ...] of [T, N, ...]."""
+    return jnp.swapaxes(x, 0, 1)
 
 
 def explained_variance(error: jax.Array, target: jax.Array, axis_name: str | None) -> jax.Array:

@@ -15,7 +15,8 @@ import numpy as np
 
 from jaxsafe.types import Env, PyTree, State
 
-PolicyFn = Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
+# (carry [N, ...], obs [N, O], first [N], key) -> action [N, A], log_prob [N], carry
+Behaviour = Callable[[PyTree, jax.Array, jax.Array, jax.Array], tuple[jax.Array, jax.Array, PyTree]]
 
 
 @flax.struct.dataclass
@@ -40,6 +41,7 @@ class RolloutState:
     complete: bool [N], the episode began at step 0, so that its sums count in the statistics.
     pool: State of N fresh resets.
     used: int32 [], entries of the pool handed out.
+    carry: what the policy remembers of each environment, [N, ...]; () if it remembers nothing.
     """
 
     state: State
@@ -48,18 +50,20 @@ class RolloutState:
     complete: jax.Array
     pool: State
     used: jax.Array
+    carry: PyTree = ()
 
 
 @flax.struct.dataclass
 class Trajectory:
     """T steps of N environments; every field is [T, N, ...].
 
-    obs is before the step and next_obs after it, before any reset; truncated means out of time and
-    not terminated; done is either. episode and length (int32, steps) are sums so far, this step
-    included; ended marks complete episodes that end with it.
+    obs is before the step and next_obs after it, before any reset; first marks the first step of an
+    episode; truncated means out of time and not terminated; done is either. episode and length (int32,
+    steps) are sums so far, this step included; ended marks complete episodes that end with it.
     """
 
     obs: jax.Array
+    first: jax.Array
     action: jax.Array
     log_prob: jax.Array
     reward: jax.Array
@@ -102,9 +106,14 @@ def never(episode: Episode) -> jax.Array:
     return jnp.bool_(False)
 
 
+def memoryless(act: Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]) -> Behaviour:
+    """The behaviour of a policy that remembers nothing: (obs [N, O], key) -> action, log_prob."""
+    return lambda carry, obs, first, key: (*act(obs, key), carry)
+
+
 def collect(
     env: Env,
-    policy_fn: PolicyFn,
+    behave: Behaviour,
     rollout: RolloutState,
     key: jax.Array,
     horizon: int,
@@ -113,14 +122,16 @@ def collect(
     """Step all environments `horizon` times.
 
     Args:
-        policy_fn: (obs [N, O], key) -> action [N, A], log_prob [N].
+        behave: (carry [N, ...], obs [N, O], first [N], key) -> action [N, A], log_prob [N], carry. It
+            begins its carry anew where `first` holds; see `memoryless`.
         stop: sums so far -> bool [N], where a step terminates its episode besides the environment.
     """
 
     def step(rollout: RolloutState, key: jax.Array) -> tuple[RolloutState, Trajectory]:
         action_key, reset_key = jax.random.split(key)
         obs = rollout.state.obs
-        action, log_prob = policy_fn(obs, action_key)
+        first = rollout.steps == 0
+        action, log_prob, carry = behave(rollout.carry, obs, first, action_key)
         state = jax.vmap(env.step)(rollout.state, action)
         steps = rollout.steps + 1
         episode = jax.tree.map(jnp.add, rollout.episode, sums(state))
@@ -130,6 +141,7 @@ def collect(
         done = terminated | truncated
         record = Trajectory(
             obs=obs,
+            first=first,
             action=action,
             log_prob=log_prob,
             reward=state.reward,
@@ -143,7 +155,7 @@ def collect(
             episode=episode,
             length=steps,
         )
-        rollout = dataclasses.replace(rollout, state=state, steps=steps, episode=episode)
+        rollout = dataclasses.replace(rollout, state=state, steps=steps, episode=episode, carry=carry)
         rollout = restart(env, rollout, done, reset_key)
         kept = episode.kept_cost  # NaN would stay for good
         kept_cost = jnp.where(stopped | ~jnp.isfinite(kept), 0.0, kept)
@@ -166,7 +178,8 @@ def restart(env: Env, rollout: RolloutState, done: jax.Array, key: jax.Array) ->
         lambda carry: carry[1] + ends > num_envs, refill, (rollout.pool, rollout.used)
     )
     entry = used + jnp.cumsum(done) - 1
-    return RolloutState(
+    return dataclasses.replace(
+        rollout,
         state=where(done, jax.tree.map(lambda x: x[entry], pool), rollout.state),
         steps=jnp.where(done, 0, rollout.steps),
         episode=where(done, jax.tree.map(jnp.zeros_like, rollout.episode), rollout.episode),

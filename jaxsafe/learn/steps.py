@@ -15,7 +15,7 @@ import optax
 from jaxsafe.config import ConfigError
 from jaxsafe.learn.batch import batch_mean, pmean, select
 from jaxsafe.nn.gaussian import Gaussian, kl
-from jaxsafe.nn.networks import outputs, policy, stack, value
+from jaxsafe.nn.networks import outputs, policy, value
 from jaxsafe.types import Count, Metrics, PyTree
 
 # (actor, batch) -> (this device's mean of what to maximise, metrics)
@@ -134,7 +134,7 @@ def update_adam(
     learning rate falls linearly to 0 at `cfg.total_iterations`, if `cfg.lr_decay`.
     """
     cfg, axis_name = context.cfg, context.axis_name
-    objective = with_values(objective, cfg) if cfg.trunk == "shared" else objective
+    objective = with_values(objective, cfg) if cfg.trunk != "separate" else objective
     left = remaining(context.iteration, cfg) if cfg.lr_decay else 1.0
     optimiser = adam(cfg.lr * left, cfg)
 
@@ -179,9 +179,11 @@ def with_values(objective: Objective, cfg: Any) -> Objective:
 
     def joint(actor: PyTree, batch: Any) -> tuple[jax.Array, Metrics]:
         gain, metrics = objective(actor, batch)
-        targets = stack(batch.ret_r, batch.ret_c.T)
-        errors = jnp.mean((outputs(actor, batch.obs, cfg)[1] - targets.T) ** 2, axis=0)
-        of_cost = errors[1:].reshape(batch.ret_c.shape[1:])
+        of_costs = batch.ret_c.reshape(*batch.ret_r.shape, -1)  # [..., K]
+        targets = jnp.concatenate([batch.ret_r[..., None], of_costs], -1)
+        squares = (outputs(actor, batch.obs, cfg)[1] - targets) ** 2
+        errors = jnp.mean(squares.reshape(-1, squares.shape[-1]), axis=0)
+        of_cost = errors[1:].reshape(batch.ret_c.shape[batch.ret_r.ndim :])
         metrics = metrics | {"train/value_loss_r": errors[0], "train/value_loss_c": of_cost}
         metrics |= {"train/objective": gain}
         return gain - cfg.value_coef * errors.sum(), metrics
@@ -195,9 +197,9 @@ def own_trunk(actor: PyTree, cfg: Any) -> tuple[()]:
     Raises:
         ConfigError: a shared trunk, which such a step would leave without critics.
     """
-    if cfg.trunk == "shared":
+    if cfg.trunk != "separate":
         raise ConfigError(
-            "trunk=shared: expected separate, for a step by natural gradients moves the policy alone; "
+            f"trunk={cfg.trunk}: expected separate, for a natural gradient moves the policy alone; "
             "policy and critics share a trunk where Adam takes the steps, as in ppo_lag or focops"
         )
     return ()

@@ -1,17 +1,19 @@
 """The on-policy networks: a Gaussian policy, and a critic each for reward and for cost.
 
-They are networks of their own or, with `trunk` 'shared', one: hidden layers and the outputs of all.
+`trunk` 'separate': each is a network of its own. 'shared': they are one, with common hidden layers.
+'gru': they are one with a memory, in whose hidden layers the last is a gated recurrent unit.
 """
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
 from jaxsafe.nn.gaussian import Gaussian
+from jaxsafe.nn.recurrent import Recurrent, Sequences, unroll
 from jaxsafe.types import PyTree
 
 # range of a std that depends on the state; Haarnoja et al. (2018), the code of "Soft Actor-Critic"
@@ -99,18 +101,73 @@ def share_trunk(params: dict[str, PyTree], cfg: Any) -> dict[str, PyTree]:
     return {"actor": params["actor"] | {"mean": {"params": layers | {last: joined}}}}
 
 
-def outputs(actor: PyTree, obs: jax.Array, cfg: Any) -> tuple[jax.Array, jax.Array]:
-    """What the actor's network gives: the policy's outputs and, of a shared trunk, the critics' values
-    of reward and of each cost, float [..., 1 + K]."""
+def recurrent(cfg: Any, action_size: int, critics: int) -> Recurrent:
+    """The network of `trunk` 'gru': hidden layers, of which the last is the unit, then two heads."""
+    *before, size = cfg.hidden
+    encoder = (
+        MLP(tuple(before[:-1]), before[-1], cfg.init, cfg.activation, math.sqrt(2)) if before else None
+    )
+    heads = [(policy_outputs(action_size, cfg), 0.01), (critics, 1.0)]
+    linear = tuple(MLP((), out, cfg.init, cfg.activation, gain) for out, gain in heads)
+    return Recurrent(encoder, ACTIVATIONS[cfg.activation], size, linear)
+
+
+def init_recurrent(
+    key: jax.Array, obs_size: int, action_size: int, critics: int, cfg: Any
+) -> dict[str, PyTree]:
+    """{'actor': {'mean', 'log_std' [A]}} alone; the critics are in 'mean', too."""
+    net = recurrent(cfg, action_size, critics)
+    return {
+        "actor": {
+            "mean": net.init(key, jnp.zeros(cfg.hidden[-1]), jnp.zeros(obs_size)),
+            "log_std": jnp.full(action_size, cfg.init_log_std, jnp.float32),
+        }
+    }
+
+
+def net_of(actor: PyTree, cfg: Any) -> Recurrent:
+    """The network that has the parameters `actor`."""
+    critics = actor["mean"]["params"]["heads_1"]["Dense_0"]["bias"].shape[-1]
+    return recurrent(cfg, actor["log_std"].shape[-1], critics)
+
+
+def outputs(actor: PyTree, seen: Any, cfg: Any) -> tuple[jax.Array, jax.Array]:
+    """What the actor's network gives: the policy's outputs and, of a common trunk, the critics' values
+    of reward and of each cost, float [..., 1 + K].
+
+    Args:
+        seen: observations [..., O] or, for a recurrent network, `Sequences`.
+    """
     size = policy_outputs(actor["log_std"].shape[-1], cfg)
-    last = actor["mean"]["params"][f"Dense_{len(cfg.hidden)}"]
-    out: Any = mlp(cfg, last["bias"].shape[-1]).apply(actor["mean"], obs)
+    if cfg.trunk == "gru":
+        out: Any = unroll(net_of(actor, cfg), actor["mean"], seen)[1]
+    else:
+        last = actor["mean"]["params"][f"Dense_{len(cfg.hidden)}"]
+        out = mlp(cfg, last["bias"].shape[-1]).apply(actor["mean"], seen)
     return out[..., :size], out[..., size:]
 
 
-def policy(actor: PyTree, obs: jax.Array, cfg: Any) -> Gaussian:
-    """The policy's action distribution for `obs` [..., O]; its mean and log std are [..., A]."""
-    out, _ = outputs(actor, obs, cfg)
+def policy(actor: PyTree, seen: Any, cfg: Any) -> Gaussian:
+    """The policy's action distribution; its mean and log std are [..., A].
+
+    Args:
+        seen: observations [..., O] or, for a recurrent network, `Sequences`.
+    """
+    return distribution(actor, outputs(actor, seen, cfg)[0], cfg)
+
+
+def remember(
+    actor: PyTree, carry: jax.Array, obs: jax.Array, cfg: Any
+) -> tuple[jax.Array, Gaussian, jax.Array]:
+    """One step of a recurrent network: what it remembers [..., H], the action distribution, values."""
+    size = policy_outputs(actor["log_std"].shape[-1], cfg)
+    found: Any = net_of(actor, cfg).apply(actor["mean"], carry, obs)
+    carry, out = found
+    return carry, distribution(actor, out[..., :size], cfg), out[..., size:]
+
+
+def distribution(actor: PyTree, out: jax.Array, cfg: Any) -> Gaussian:
+    """The Gaussian of a policy's outputs."""
     if cfg.std == "state":
         mean, change = jnp.split(out, 2, axis=-1)
         return Gaussian(mean, jnp.clip(actor["log_std"] + change, *LOG_STD))
@@ -124,7 +181,48 @@ def value(critic: PyTree, obs: jax.Array, cfg: Any) -> jax.Array:
 
 
 def values(params: dict[str, PyTree], obs: jax.Array, cfg: Any) -> jax.Array:
-    """The values of reward and of each cost, float [..., 1 + K], whatever the trunk."""
+    """The values of reward and of each cost, float [..., 1 + K], of a network without memory."""
     if cfg.trunk == "shared":
         return outputs(params["actor"], obs, cfg)[1]
     return jax.vmap(lambda critic: value(critic, obs, cfg), out_axes=-1)(stack_critics(params))
+
+
+class Reading(NamedTuple):
+    """What the networks say of a rollout of T steps in N environments.
+
+    seen: what `policy` takes to say it again: observations [T, N, O], or `Sequences` of N.
+    dist: the action distribution [T, N, A].
+    value, next_value: float [T, N, 1 + K], of the observation before and after each step.
+    """
+
+    seen: Any
+    dist: Gaussian
+    value: jax.Array
+    next_value: jax.Array
+
+
+def read(
+    params: dict[str, PyTree],
+    obs: jax.Array,
+    next_obs: jax.Array,
+    first: jax.Array,
+    carry: PyTree,
+    cfg: Any,
+) -> Reading:
+    """Read a rollout.
+
+    Args:
+        obs, next_obs: float [T, N, O], before and after each step, before any reset.
+        first: bool [T, N], where an episode begins.
+        carry: what the policy remembered before the rollout: [N, H], or () without a memory.
+    """
+    actor = params["actor"]
+    if cfg.trunk != "gru":
+        v, next_v = values(params, obs, cfg), values(params, next_obs, cfg)
+        return Reading(obs, policy(actor, obs, cfg), v, next_v)
+    seen = Sequences(jnp.swapaxes(obs, 0, 1), jnp.swapaxes(first, 0, 1), carry)
+    h, out = unroll(net_of(actor, cfg), actor["mean"], seen)
+    h, out = jnp.swapaxes(h, 0, 1), jnp.swapaxes(out, 0, 1)
+    size = policy_outputs(actor["log_std"].shape[-1], cfg)
+    _, _, next_v = remember(actor, h, next_obs, cfg)
+    return Reading(seen, distribution(actor, out[..., :size], cfg), out[..., size:], next_v)

@@ -16,7 +16,7 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-import scipy.stats
+import scipy  # scipy.stats takes a second to import, and is imported at its first use
 
 DRAWS = 10_000
 ROOM = 10_000_000  # numbers drawn at once

@@ -74,7 +74,7 @@ def append_versions(folder: Path, device: str, engine: str | None) -> None:
         starts = []
     now = {
         "time": datetime.datetime.now().astimezone().isoformat(timespec="seconds"),
-        # as it was typed: `command` adds the ++ that Hydra needs
+        # as it was typed: `arguments` adds the ++ that Hydra needs
         "command": shlex.join([Path(sys.executable).name, *(x.removeprefix("++") for x in sys.argv)]),
         "commit": commit(),
         "device": device,

@@ -17,14 +17,17 @@ from tasks import FAST
 from toys import FIRST, Corridor
 
 import jaxsafe
-from jaxsafe import algos, api, envs
+from jaxsafe import algos, api
 from jaxsafe.algos.ppo import PPOConfig
 from jaxsafe.config import config
 from jaxsafe.learn.on_policy import on_policy
 from jaxsafe.learn.steps import adam_epochs
 from jaxsafe.learn.surrogates import clipped
 from jaxsafe.learn.treatments import penalty
-from jaxsafe.run import checkpoint, command, progress, run_folder, runner
+from jaxsafe.report.evaluation import evaluate
+from jaxsafe.run import checkpoint, progress, run_folder, spread, sweep
+from jaxsafe.run.arguments import compose
+from jaxsafe.run.settings import Settings, ask, nested, to_plain
 
 TINY: dict[str, Any] = {
     "num_envs": 4, "horizon": 8, "minibatches": 2, "epochs": 1, "critic_epochs": 1, "hidden": (4, 4),
@@ -44,13 +47,13 @@ PRICED = algos.Entry(
 
 @pytest.fixture(scope="module", autouse=True)
 def compiled_quickly():
-    def quick(program: runner.Program, ts: Any) -> Any:
+    def quick(program: spread.Program, ts: Any) -> Any:
         return (
             jax.jit(program.update, donate_argnums=0, compiler_options=FAST).lower(ts, FIRST).compile()
         )
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(runner, "compiled", quick)
+        patch.setattr(spread, "compiled", quick)
         yield
 
 
@@ -72,7 +75,7 @@ def run(tmp_path_factory) -> jaxsafe.Run:
 def test_importing_the_package_imports_neither_jax_nor_the_registries():
     code = (
         "import jaxsafe, sys; print({'jax', 'hydra', 'jaxsafe.api'} & {*sys.modules});"
-        "from jaxsafe import on_policy; print({'jaxsafe.envs', 'jaxsafe.algos'} & {*sys.modules});"
+        "import jaxsafe.learn.on_policy; print({'jaxsafe.envs', 'jaxsafe.algos'} & {*sys.modules});"
         "print(callable(jaxsafe.sweep), 'train' in dir(jaxsafe))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -140,30 +143,35 @@ SAME: dict[str, tuple[tuple[Any, Any, dict[str, Any]], list[str]]] = {
 }
 
 
+def asked(env: Any, algo: Any, **options: Any) -> Settings:
+    choice = api.chosen(env, algo)
+    return ask(nested(choice.given | api.named(choice, options)), choice.entries)
+
+
 @pytest.mark.parametrize("case", SAME)
 def test_arguments_mean_what_they_mean_on_the_command_line(case):
     (env, algo, options), expected = SAME[case]
-    known = api.registries(env, algo)
-    found = command.compose(api.texts(known, options), known.envs, known.algos)
-    assert found.plain() == command.compose(expected, envs, algos).plain()
+    assert asked(env, algo, **options).plain() == compose(expected).plain()
 
 
 def test_an_environment_that_was_made_is_recorded_by_its_name_and_options():
     env = jaxsafe.make("Safexp-PointGoal1-v0", hazards_num=12, hazards_size=0.1)
-    known = api.registries(env, None)
-    assert known.envs is envs and known.own == {}
-    found = command.compose(api.texts(known, {}), envs, algos)
+    assert api.chosen(env, None).objects == {}
     expected = ["env=point_goal1", "env.hazards_num=12", "env.hazards_size=0.1"]
-    assert found.plain() == command.compose(expected, envs, algos).plain()
+    assert asked(env, None).plain() == compose(expected).plain()
 
 
 @pytest.mark.parametrize(
-    "value",
-    ["run", "a b", "true", "1e3", "it's", "back\\slash", "end\\", "a\\'b", "[1", "x,y", "ü/(1)", ""],
-)
-def test_every_string_arrives_as_it_is(value):
-    assert command.parse(f"run_dir={api.text(value)}").value() == value
-    assert command.parse(f"run_dir=[{api.text(value)}]").value() == [value]
+    "value, expected",
+    [
+        (np.int64(3), 3), (np.float32(0.5), 0.5), (np.bool_(True), True), (np.arange(2), [0, 1]),
+        (jnp.array([1.5]), [1.5]), ((8, (4,)), [8, [4]]), (range(2), [0, 1]), (Path("a/b"), "a/b"),
+        ("it's [1, x=2", "it's [1, x=2"), ({"a": np.float64(1)}, {"a": 1.0}), (None, None),
+    ],
+)  # fmt: skip
+def test_a_value_of_python_is_the_plain_value_that_it_stands_for(value, expected):
+    found = to_plain(value)
+    assert found == expected and type(found) is type(expected)
 
 
 @pytest.mark.parametrize(
@@ -228,8 +236,7 @@ def test_a_policy_acts_on_what_its_environment_shows(run):
 
 def test_evaluation_is_that_of_the_script(run):
     scores = jaxsafe.evaluate(run, episodes=3)
-    settings, _, algo, states = run._opened
-    (expected,) = command.evaluate(settings, algo, states, 3, 1, run.folder)
+    (expected,) = evaluate(run._opened, 3, 1)
     assert scores == expected
     assert len(scores.seeds["return"]) == 2
     assert str(scores).splitlines()[1].startswith("return ")
@@ -289,10 +296,10 @@ def test_an_interrupted_run_is_saved_and_continues(signals, run, capsys):
 
 
 def test_an_interrupt_with_nothing_to_save_leaves_the_program_running(monkeypatch):
-    def compiling(program: runner.Program, ts: Any) -> Any:
+    def compiling(program: spread.Program, ts: Any) -> Any:
         signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(runner, "compiled", compiling)
+    monkeypatch.setattr(spread, "compiled", compiling)
     with pytest.raises(KeyboardInterrupt, match="stopped before the first update; nothing to save"):
         jaxsafe.train(Corridor(), run_dir="run", **TINY)
 
@@ -300,17 +307,26 @@ def test_an_interrupt_with_nothing_to_save_leaves_the_program_running(monkeypatc
 # ---- sweeps ----------------------------------------------------------------------------------
 
 
+def planned(env: Any, algo: Any = None, **options: Any) -> sweep.Sweep:
+    choice = api.chosen(env, algo)
+    return sweep.plan(*api.asked_for(choice, options), choice.entries)
+
+
 def test_a_sweep_takes_lists_for_values_and_tuples_for_lists():
-    known = api.registries("point_goal1", ["ppo_lag", PRICED])
-    options = {"cost_limit": [5, 10], "hidden": [(8, 8), (4, 4)], "seed": range(2), "max_parallel": 4}
-    assert api.texts(known, options | {"num_envs": 4}, swept=True) == [
-        "env=point_goal1", "algo=ppo_lag,Priced", "algo.cost_limit=5,10", "algo.hidden=[8,8],[4,4]",
-        "seed=0,1", "max_parallel=4", "num_envs=4",
-    ]  # fmt: skip
-    limits = {"cost_limits": {"hazards": [5, 10], "vases_contact": 25}}
-    assert api.texts(known, limits, swept=True)[2:] == [
-        "algo.cost_limits.hazards=5,10", "algo.cost_limits.vases_contact=25",
-    ]  # fmt: skip
+    found = planned("point_goal1", ["ppo_lag", PRICED], hidden=[(8, 8), (4, 4)], cost_limit=[5, 10])
+    assert [(g.algo_name, g.algo.hidden) for g in found.groups.values()] == [
+        (name, hidden) for name in ("ppo_lag", "Priced") for hidden in ((8, 8), (4, 4))
+    ]
+    assert [c.cost_limit for c in next(iter(found.groups.values())).configs] == [5.0, 10.0]
+    found = planned("point_goal1", seed=range(2), max_parallel=np.int64(4), num_envs=4)
+    assert [g.train.seed for g in found.groups.values()] == [0, 1] and found.max_parallel == 4
+    found = planned("point_goal2", cost_limits={"hazards": [5, 10], "vases_contact": 25})
+    (group,) = found.groups.values()
+    assert found.swept == ["algo.cost_limits.hazards"]
+    assert [c.cost_limits["hazards"] for c in group.configs] == [5.0, 10.0]
+
+
+def test_a_sweep_of_nothing_or_of_unknown_options_is_one_line():
     for options, message in (
         ({"cost_limit": []}, "expected values to sweep"),
         ({"cost_limits": {"hazards": []}}, "cost_limits.hazards=[]: expected values to sweep"),

@@ -3,16 +3,17 @@
 import csv
 import io
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from shell import typed
 
 from jaxsafe import algos, envs
 from jaxsafe.config import ConfigError
-from jaxsafe.report import compare, plots, scores, stats, tables
+from jaxsafe.report import group, plots, read, results, scores, stats, tables
+from jaxsafe.report.published import beside, read_published
 from jaxsafe.run import run_folder
 
 RESULTS = Path(__file__).parent.parent.parent / "docs" / "results"
@@ -49,20 +50,20 @@ def write(
     return folder
 
 
-def read(*paths: Path) -> list[compare.Run]:
-    return compare.read(paths, envs, algos)
+def runs_in(*paths: Path) -> list[read.Run]:
+    return read.read(paths)
 
 
-def compared(*paths: Path, by: tuple[str, ...] = ()) -> list[compare.Group]:
-    runs = read(*paths)
-    return compare.ordered(compare.group(runs, by or compare.telling(runs)))
+def compared(*paths: Path, by: tuple[str, ...] = ()) -> list[group.Group]:
+    runs = runs_in(*paths)
+    return group.ordered(group.group(runs, by or group.telling(runs)))
 
 
 # ---- what is known of a run ------------------------------------------------------------------
 
 
 def test_what_is_known_of_each_seed_by_hand(tmp_path):
-    (run,) = read(write(tmp_path / "a", columns={"train/cost_hazards": [4.0, 6.0]}))
+    (run,) = runs_in(write(tmp_path / "a", columns={"train/cost_hazards": [4.0, 6.0]}))
     ppo = scores.CHARACTERISTIC["point_goal1"]
     expected = {
         "return": [1, 3],
@@ -86,7 +87,7 @@ def test_costs_under_limits_of_their_own_violate_when_one_of_them_does():
         "train/cost_a": np.array([5.0, 5.0]), "train/cost_b": np.array([0.0, 1.0]),
         "train/cost_estimate_a": np.zeros(2),
     }  # fmt: skip
-    values = compare.measured("point_goal1", table, {"a": 5.0, "b": 0.5})
+    values = read.measured("point_goal1", table, {"a": 5.0, "b": 0.5})
     np.testing.assert_array_equal(values["violation rate"], [0, 1])
     assert "cost estimate_a" not in values and "normalised violation" not in values
 
@@ -99,7 +100,7 @@ def test_evaluations_of_each_seed_join_in_where_the_run_has_them(tmp_path):
     np.testing.assert_array_equal(both.values("final return"), [5, 7, np.nan, np.nan])
     (b / "evaluation.json").write_text(json.dumps({"seeds": {"return": [5.0]}}))
     with pytest.raises(ConfigError, match=r"is of 1 seeds, metrics.csv of 2"):
-        read(b)
+        runs_in(b)
 
 
 def test_stretches_of_training_are_means_carried_on_to_the_end_of_each_seed():
@@ -136,7 +137,7 @@ def test_settings_of_an_algorithm_are_told_apart_by_what_differs(tmp_path):
     groups = compared(tmp_path)
     assert [g.name for g in groups] == [f"ppo_lag, algo.cost_limit={x}" for x in (5, 20, 100)]
     assert [g.held for g in groups] == ["no", "unclear", "yes"]
-    assert "**" not in str(compare.results(groups, "return", {}).rows)  # of other limits, none is best
+    assert "**" not in str(results.results(groups, "return", {}).rows)  # of other limits, none is best
 
 
 def test_settings_side_by_side_in_one_run_are_groups_of_their_own(tmp_path):
@@ -152,7 +153,7 @@ def test_averaging_over_a_field_is_asked_for_and_said(tmp_path):
     write(tmp_path / "b", dual_lr=0.2)
     (both,) = compared(tmp_path, by=("algo.name",))
     assert len(both.returns) == 4
-    assert compare.notes([both]) == ["averaged over algo.dual_lr (0.1, 0.2)"]
+    assert results.notes([both]) == ["averaged over algo.dual_lr (0.1, 0.2)"]
 
 
 def test_tasks_stand_apart_and_only_those_of_every_setting_are_compared(tmp_path):
@@ -162,18 +163,18 @@ def test_tasks_stand_apart_and_only_those_of_every_setting_are_compared(tmp_path
     write(tmp_path / "4", "point_run", "cpo", total_steps=400)
     groups = compared(tmp_path)
     assert len(groups) == 4
-    s = compare.suite(groups)
+    s = group.suite(groups)
     assert s.tasks == ["point_goal1"]
-    pairs = compare.improvements(s)
+    pairs = results.improvements(s)
     assert pairs["cpo", "ppo_lag", "return"].mean == 3 / 4  # 10 beats 0, 20 beats both
     assert pairs["cpo", "ppo_lag", "cost"].mean == 1
-    assert compare.notes(groups) == [
+    assert results.notes(groups) == [
         f"unfinished: {tmp_path / '4'}, at 200 of 400 steps",
         "not in comparisons across tasks, as a setting lacks them: car_goal1, point_run",
         "without normalised scores, as there are no published ones: point_run",
     ]
-    cpo = compare.suite([g for g in groups if g.algo == "cpo" and g.env != "point_run"])
-    found = compare.aggregates(cpo)["cpo", "normalised return", "mean"]
+    cpo = group.suite([g for g in groups if g.algo == "cpo" and g.env != "point_run"])
+    found = results.aggregates(cpo)["cpo", "normalised return", "mean"]
     assert found.mean == pytest.approx((6 / 25.49 + 15 / 25.179) / 2)
 
 
@@ -188,14 +189,14 @@ def test_published_figures_stand_below_and_what_lies_beyond_their_spread_is_mark
     path.write_text(
         f"{HEADER}point_goal1,cpo,Peer,12,2.9,30,20,25\npoint_goal1,ppo_lag,Peer,1,2,3,4,10\n"
     )
-    table = compare.results(compared(tmp_path), "return", compare.read_published(path))
+    table = results.results(compared(tmp_path), "return", read_published(path))
     assert table.header == ["", "car_push1", "point_goal1"]
     assert table.rows == [
         ["`cpo`", "**1.50 [1.00, 2.00]**", "**15.00 [10.00, 20.00]** ↑"],
         ["Peer", "-", "12.00 ± 2.90"],
         ["`ppo_lag`", "-", "30.00"],  # published with another limit; the cost is over ours
     ]
-    cost = compare.results(compared(tmp_path), "cost", compare.read_published(path))
+    cost = results.results(compared(tmp_path), "cost", read_published(path))
     assert cost.rows[0][2] == "15.00 [10.00, 20.00]" and cost.rows[1][2] == "30.00 ± 20.00"
 
 
@@ -208,12 +209,12 @@ def test_published_figures_stand_beside_runs_of_the_same_rules_alone(tmp_path):
         config["env"]["rules"] = rules
         run_folder.write_config(folder, config)
         (g,) = compared(tmp_path / rules)
-        known = compare.beside(g, compare.read_published(path))
+        known = beside(g, read_published(path))
         assert (known is not None) == (rules == "safety_gymnasium")
 
 
 def test_the_committed_published_figures_are_whole():
-    found = compare.read_published(RESULTS / "published.csv")
+    found = read_published(RESULTS / "published.csv")
     assert len(found) == 160
     for env, algo in found:
         assert env in envs.ENVS and algo in algos.ALGOS
@@ -236,18 +237,13 @@ def test_the_pareto_front_leaves_out_what_costs_more_and_returns_less():
     assert plots.front(points) == ([1, 2, 2, 5, 5], [2, 2, 5, 5, 6])
 
 
-def command(monkeypatch, *arguments: Any) -> int:
-    monkeypatch.setattr(sys, "argv", ["plot.py", *map(str, arguments)])
-    return compare.main(envs, algos)
-
-
-def test_one_command_writes_every_table_and_figure_the_same_each_time(tmp_path, monkeypatch, capsys):
+def test_one_command_writes_every_table_and_figure_the_same_each_time(tmp_path, capsys):
     for env in ("point_goal1", "car_goal1"):
         for algo in ("cpo", "ppo_lag"):
             write(tmp_path / "runs" / f"{env}-{algo}", env, algo)
     out = tmp_path / "out"
-    arguments = (tmp_path / "runs", "--published", RESULTS / "published.csv", "--out", out)
-    assert command(monkeypatch, *arguments) == 0
+    arguments = [*map(str, (tmp_path / "runs", "--published", RESULTS / "published.csv", "--out", out))]
+    assert typed("plot", *arguments) == 0
     figures = [
         f"{name}.{s}" for name in ("curves", "trade_off", "scores", "profiles") for s in plots.FORMATS
     ]
@@ -262,7 +258,7 @@ def test_one_command_writes_every_table_and_figure_the_same_each_time(tmp_path, 
               and (r["metric"], r["statistic"]) == ("return", "mean")]  # fmt: skip
     assert [float(one[k]) for k in ("seeds", "value", "low", "high")] == [2, 2, 1, 3]
     assert "P(better than ppo_lag)" in {r["statistic"] for r in rows}
-    assert command(monkeypatch, *arguments, "--by", "algo.name") == 0
+    assert typed("plot", *arguments, "--by", "algo.name") == 0
     assert {p.name: p.read_bytes() for p in out.iterdir()} == first
 
 
@@ -309,7 +305,7 @@ def test_bad_input_is_one_line_and_status_2(arguments, tmp_path, monkeypatch, ca
     Path("torn/metrics.csv").write_text("iteration,steps\n1,many\n")
     Path("bad.csv").write_text("task,return\npoint_goal1,3\n")
     Path("words.csv").write_text(f"{HEADER}point_goal1,cpo,Peer,many,1,1,1,25\n")
-    assert command(monkeypatch, *arguments.split()) == 2
+    assert typed("plot", *arguments.split()) == 2
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1 and lines[0].startswith("error: ") and BAD[arguments] in lines[0]
     assert not Path("comparison").exists()

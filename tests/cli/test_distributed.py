@@ -1,29 +1,29 @@
 """Two real processes with a CPU device each, beside one process with two."""
 
-import os
 import shutil
 import signal
 import socket
 import subprocess
-import sys
 import time
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
+import shell
 
 from jaxsafe.config import ConfigError
-from jaxsafe.run import checkpoint, distributed, run_folder, runner
+from jaxsafe.run import checkpoint, distributed, run_folder
+from jaxsafe.run.devices import check_devices
 from jaxsafe.run.distributed import Position
+from jaxsafe.run.settings import TrainConfig
 
 ARGS = (
-    "env=hall", "algo=pg", "num_envs=4", "algo.horizon=16", "algo.minibatches=1",
+    "env=toys:Corridor", "algo=pg", "num_envs=4", "algo.horizon=16", "algo.minibatches=1",
     "algo.critic_epochs=1", "algo.hidden=[8]", "algo.total_iterations=1000", "eval_episodes=0",
     "video=false", "devices=2",
 )  # fmt: skip
 STEPS = 64  # of an update
-SCRIPT = Path(__file__).parent.parent / "toy_train.py"
 
 
 def free_port() -> int:
@@ -32,16 +32,8 @@ def free_port() -> int:
 
 
 def start(cwd: Path, *args: str, devices: int = 1) -> subprocess.Popen:
-    environ = {
-        **os.environ,
-        "JAX_PLATFORMS": "cpu",
-        "JAX_NUM_CPU_DEVICES": str(devices),
-        "XLA_FLAGS": "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true",
-    }
-    return subprocess.Popen(
-        [sys.executable, str(SCRIPT), *ARGS, *args],
-        cwd=cwd, env=environ, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-    )  # fmt: skip
+    here = {"JAX_NUM_CPU_DEVICES": str(devices), "XLA_FLAGS": shell.FAST_XLA}
+    return shell.start("train", *ARGS, *args, cwd=cwd, **here)
 
 
 def start_pair(cwd: Path, *args: str) -> list[subprocess.Popen]:
@@ -59,11 +51,7 @@ def ends(*processes: subprocess.Popen) -> list[tuple[int, str, str]]:
 
 
 def wait_for_rows(run: Path, processes: list[subprocess.Popen]) -> None:
-    end = time.monotonic() + 200
-    while not run_folder.read_metrics(run).get("steps", np.zeros(0)).size:
-        assert all(p.poll() is None for p in processes), ends(*processes)
-        assert time.monotonic() < end, "waited too long"
-        time.sleep(0.01)
+    shell.wait_for(lambda: run_folder.read_metrics(run).get("steps", np.zeros(0)).size > 0, *processes)
 
 
 def reached(run: Path) -> int:
@@ -189,4 +177,4 @@ def test_more_devices_than_the_processes_have_are_refused(monkeypatch):
     monkeypatch.setattr(jax, "process_count", lambda: 2)
     with pytest.raises(ConfigError, match="devices=1: expected"):
         monkeypatch.setattr(jax, "device_count", lambda: 2)
-        runner.check_devices(runner.TrainConfig(devices=1))
+        check_devices(TrainConfig(devices=1))

@@ -1,4 +1,4 @@
-"""Environments from outside the package, in Python and on the command line."""
+"""Environments and algorithms from outside the package, in Python and on the command line."""
 
 import dataclasses
 import sys
@@ -7,24 +7,20 @@ from typing import Any
 
 import jax.numpy as jnp
 import pytest
+import shell
 from toys import Clock, Corridor
 
 from jaxsafe import algos, envs
 from jaxsafe.config import ConfigError
 from jaxsafe.envs.check import check_env
 from jaxsafe.envs.safety_gym.suite import ROBOTS, TASKS
-from jaxsafe.run import command, viewing
-
-MAINS = {
-    "train": command.train_main,
-    "evaluate": command.evaluate_main,
-    "render": viewing.render_main,
-}
+from jaxsafe.run.arguments import compose
 
 
 @pytest.fixture(autouse=True)
 def registry(monkeypatch):
-    """The registry as it was, and no module of an earlier test."""
+    """The registries as they were, and no module of an earlier test."""
+    monkeypatch.setattr(algos, "ALGOS", {**algos.ALGOS})
     monkeypatch.setattr(sys, "path", [*sys.path])
     monkeypatch.delitem(sys.modules, "mine", raising=False)
     known = {**envs.ENVS}
@@ -139,14 +135,16 @@ def test_a_member_that_is_missing_or_odd_is_one_line():
 MINE = """
 from pathlib import Path
 from toys import Corridor
+from jaxsafe.algos import ALGOS
 from jaxsafe.envs.safety_gym.suite import ROBOTS, TASKS
 
 Path("imported").touch()
 maze1 = TASKS["goal1"] | ROBOTS["point"]
+priced = ALGOS["ppo_penalty"]
 number = 3
 """
 SMALL = (
-    "algo=ppo_lag", "num_envs=4", "algo.horizon=16", "algo.minibatches=2", "algo.epochs=2",
+    "num_envs=4", "algo.horizon=16", "algo.minibatches=2", "algo.epochs=2",
     "algo.critic_epochs=2", "algo.hidden=[8,8]", "eval_episodes=2",
 )  # fmt: skip
 
@@ -158,45 +156,42 @@ def call(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
 
     def call(script: str, *args: str) -> tuple[int | str | None, str, str]:
-        monkeypatch.setattr(sys, "argv", [f"{script}.py", *args])
-        try:
-            status = MAINS[script](envs, algos)
-        except SystemExit as stop:
-            status = stop.code
-        return status, *capsys.readouterr()
+        return shell.typed(script, *args), *capsys.readouterr()
 
     return call
 
 
 def forget():
     """As in a new process."""
-    del envs.ENVS["mine:Corridor"], sys.modules["mine"]
+    del envs.ENVS["mine:Corridor"], algos.ALGOS["mine:priced"], sys.modules["mine"]
 
 
-def test_a_run_on_it_trains_resumes_and_evaluates_once_it_is_named(call, tmp_path):
-    own = "env=mine:Corridor"
-    status, out, err = call(
-        "train", own, "env.half_width=0.3", *SMALL, "total_steps=128", "run_dir=run"
-    )
+def test_a_run_on_ones_own_code_trains_resumes_and_evaluates_once_that_is_named(call, tmp_path):
+    code = ("env=mine:Corridor", "algo=mine:priced")
+    options = ("env.half_width=0.3", "algo.clip=0.3", *SMALL, "total_steps=128", "run_dir=run")
+    status, out, err = call("train", *code, *options)
     assert status == 0, err
-    assert "mine:Corridor | ppo_lag" in out and "engine" not in out
+    assert "mine:Corridor | mine:priced" in out and "engine" not in out
     assert "no video: only Safety Gym's environments can be drawn, not a Corridor" in out
     config = (tmp_path / "run" / "config.yaml").read_text()
-    assert "name: mine:Corridor\n  half_width: 0.3\n" in config
+    assert "name: mine:Corridor\n  half_width: 0.3\n" in config and "name: mine:priced\n" in config
     forget()
     (tmp_path / "imported").unlink()
     for line in (("evaluate", "run"), ("render", "run"), ("train", "resume=run", "total_steps=256")):
         status, out, err = call(*line)
         assert status == 2 and "mine:Corridor is code" in err and "add env=mine:Corridor" in err
         assert err.count("\n") == 1 and not (tmp_path / "imported").exists()
+    for line in (("evaluate", "run", code[0]), ("train", "resume=run", code[0])):
+        status, _, err = call(*line)
+        assert status == 2 and "mine:priced is code" in err and "add algo=mine:priced" in err
     status, _, err = call("evaluate", "run", "env=mine:maze1")
     assert status == 2 and "run was trained with env=mine:Corridor" in err
-    status, out, err = call("evaluate", "run", own)
+    status, out, err = call("evaluate", "run", *code)
     assert status == 0 and "violation rate" in out, err
-    status, _, err = call("render", "run", own)
+    status, _, err = call("render", "run", *code)
     assert status == 2 and "only Safety Gym's environments can be drawn" in err
     forget()
-    status, out, err = call("train", "resume=run", own, "total_steps=256")
+    status, out, err = call("train", "resume=run", *code, "total_steps=256")
     assert status == 0 and "resuming at 128 steps" in out, err
 
 
@@ -216,6 +211,20 @@ def test_what_is_no_environment_is_one_line(arguments, call):
     assert status == 2 and err.count("\n") == 1 and BAD[arguments] in err
 
 
+@pytest.mark.parametrize(
+    "name, message",
+    [
+        ("mine:prised", "mine has no 'prised'; did you mean 'priced'?"),
+        ("mime:priced", "no module 'mime' in"),
+        ("mine:", "expected module:name"),
+        ("mine:number", "algo=mine:number"),
+    ],
+)
+def test_what_is_no_algorithm_is_one_line(name, message, call):
+    status, _, err = call("train", f"algo={name}")
+    assert status == 2 and err.count("\n") == 1 and message in err
+
+
 def test_a_fault_inside_the_module_is_its_own(call, tmp_path):
     (tmp_path / "mine.py").write_text("import nothing_like_this")
     with pytest.raises(ModuleNotFoundError, match="nothing_like_this"):
@@ -223,5 +232,5 @@ def test_a_fault_inside_the_module_is_its_own(call, tmp_path):
 
 
 def test_the_folder_of_its_runs_has_a_name_for_every_system(call):
-    settings = command.compose(["env=mine:maze1", "algo=cpo"], envs, algos)
+    settings = compose(["env=mine:maze1", "algo=cpo"])
     assert settings.env_name == "mine:maze1" and settings.label == "mine.maze1-cpo"

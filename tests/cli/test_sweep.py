@@ -1,56 +1,57 @@
-"""Sweeps of a toy environment in this process, and the command line on the real registries."""
+"""Sweeps of a toy environment, all in this process."""
 
 import csv
 import functools
 import json
-import subprocess
-import sys
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import jax
 import numpy as np
 import pytest
+import shell
 from tasks import FAST
 from toys import FIRST, Corridor
 
-from jaxsafe import algos, envs
+from jaxsafe import algos
 from jaxsafe.config import ConfigError, float_fields
 from jaxsafe.report import plots
-from jaxsafe.run import checkpoint, command, run_folder, runner, sweeps
+from jaxsafe.report.evaluation import evaluate
+from jaxsafe.report.finish import finish
+from jaxsafe.report.sweep_summary import rows_of, summarise
+from jaxsafe.run import arguments, checkpoint, loop, memory, run_folder, session, spread, sweep
+from jaxsafe.run.arguments import compose
+from jaxsafe.run.evaluate import run_episodes
+from jaxsafe.run.policies import open_run
 from jaxsafe.run.progress import Report
+from jaxsafe.run.session import Session
+from jaxsafe.run.settings import TrainConfig, settle
+from jaxsafe.run.spread import build, members
 
-
-@dataclass(frozen=True)
-class Hall(Corridor):
-    engine: str = "jax"
-
-
-TOYS: Any = SimpleNamespace(
-    ENVS={"hall": Hall},
-    canonical=lambda name: name,
-    env_defaults=lambda name: {"half_width": 0.01},
-    make=lambda name, **options: Hall(**{"half_width": 0.01, **options}),
-)
 SMALL = [
-    "env=hall", "algo=ppo_lag", "num_envs=4", "algo.horizon=8", "algo.minibatches=2", "algo.epochs=2",
-    "algo.critic_epochs=2", "algo.hidden=[8,8]", "total_steps=192", "eval_episodes=0", "video=false",
+    "env=toys:Corridor", "env.half_width=0.01", "algo=ppo_lag", "num_envs=4", "algo.horizon=8",
+    "algo.minibatches=2", "algo.epochs=2", "algo.critic_epochs=2", "algo.hidden=[8,8]",
+    "total_steps=192", "eval_episodes=0", "video=false",
 ]  # fmt: skip
 GRID = ["algo.cost_limit=0.5,5", "algo.dual_lr=0.01,1", "num_seeds=2"]
 
 
+def planned(*texts: str) -> sweep.Sweep:
+    given = arguments.read_values([*texts])
+    return sweep.plan(given.options, given.several)
+
+
 def train(folder: Path, *texts: str) -> None:
-    asked = sweeps.read([*SMALL, *texts, f"run_dir={folder}"], TOYS, algos)
-    assert sweeps.train(asked, TOYS, algos, "again", Report()) == 0
+    asked = planned(*SMALL, *texts, f"run_dir={folder}")
+    assert sweep.train(asked, "again", Report(), sweep.After(finish, summarise)) == 0
 
 
 def tables(folder: Path) -> dict[tuple, dict[str, np.ndarray]]:
     """metrics.csv of each setting and seed of a sweep, wherever it was trained."""
     found = {}
     for path in sorted(folder.glob("*/config.yaml")):
-        saved = command.settle(run_folder.read_config(path.parent), TOYS, algos)
+        saved = settle(run_folder.read_config(path.parent))
         parts = run_folder.by_setting(run_folder.read_metrics(path.parent)).values()
         for cfg, part in zip(saved.configs, parts, strict=True):
             for seed in saved.train.seed + np.arange(saved.train.num_seeds):
@@ -75,11 +76,11 @@ def compiled_quickly():
     def compiled(update: Any) -> Any:
         return jax.jit(update, donate_argnums=0, compiler_options=FAST)
 
-    def quick(program: runner.Program, ts: Any) -> Any:
+    def quick(program: spread.Program, ts: Any) -> Any:
         return compiled(program.update).lower(ts, FIRST).compile()
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(runner, "compiled", quick)
+        patch.setattr(spread, "compiled", quick)
         yield
 
 
@@ -92,10 +93,9 @@ def finished(tmp_path_factory) -> Path:
 
 
 def test_a_grid_is_floats_side_by_side_and_a_group_of_each_other_value():
-    asked = sweeps.read(
-        ["env=point_goal1", "algo=ppo_lag,cppo_pid", "algo.hidden=[8,8],[4]", "algo.clip=0.1,0.2",
-         "algo.cost_limit=5,10,25", "num_seeds=3", "seed=7"],
-        envs, algos,
+    asked = planned(
+        "env=point_goal1", "algo=ppo_lag,cppo_pid", "algo.hidden=[8,8],[4]", "algo.clip=0.1,0.2",
+        "algo.cost_limit=5,10,25", "num_seeds=3", "seed=7",
     )  # fmt: skip
     assert [(s.algo_name, s.algo.hidden) for s in asked.groups.values()] == [
         (name, hidden) for name in ("ppo_lag", "cppo_pid") for hidden in ((8, 8), (4,))
@@ -103,9 +103,9 @@ def test_a_grid_is_floats_side_by_side_and_a_group_of_each_other_value():
     for settings in asked.groups.values():
         pairs = [(c.clip, c.cost_limit) for c in settings.configs]
         assert pairs == [(clip, limit) for clip in (0.1, 0.2) for limit in (5.0, 10.0, 25.0)]
-        members = runner.members(settings.configs, settings.train)
-        assert [m.seed for m in members] == [7, 8, 9] * 6
-        assert members[4].swept == {"algo.clip": 0.1, "algo.cost_limit": 10.0}
+        run = members(settings.configs, settings.train)
+        assert [m.seed for m in run] == [7, 8, 9] * 6
+        assert run[4].swept == {"algo.clip": 0.1, "algo.cost_limit": 10.0}
     assert asked.swept == ["algo.name", "algo.hidden", "algo.clip", "algo.cost_limit"]
     names = list(asked.groups)
     assert names[1] == "001-point_goal1-ppo_lag-algo.hidden=_4_" and len({*names}) == 4
@@ -113,9 +113,7 @@ def test_a_grid_is_floats_side_by_side_and_a_group_of_each_other_value():
 
 def test_a_grid_over_named_limits_is_side_by_side_too():
     limits = ["algo.cost_limits.vases_contact=25", "algo.cost_limits.hazards=5,10"]
-    asked = sweeps.read(
-        ["env=point_goal2", "algo=ppo_lag", "algo.clip=0.1,0.2", *limits, "num_seeds=2"], envs, algos
-    )
+    asked = planned("env=point_goal2", "algo=ppo_lag", "algo.clip=0.1,0.2", *limits, "num_seeds=2")
     ((name, settings),) = asked.groups.items()
     assert name == "000-point_goal2-ppo_lag"
     assert asked.swept == ["algo.clip", "algo.cost_limits.hazards"]
@@ -124,15 +122,13 @@ def test_a_grid_over_named_limits_is_side_by_side_too():
         for clip in (0.1, 0.2)
         for limit in (5.0, 10.0)
     ]
-    members = runner.members(settings.configs, settings.train)
-    assert members[2].setting == "algo.clip=0.1, algo.cost_limits.hazards=10"
+    run = members(settings.configs, settings.train)
+    assert run[2].setting == "algo.clip=0.1, algo.cost_limits.hazards=10"
     plain = settings.plain()
     assert plain["algo"]["cost_limits"] == {"hazards": [5.0, 10.0, 5.0, 10.0], "vases_contact": 25.0}
-    assert command.settle(plain, envs, algos) == settings
-    one = command.compose(
-        ["env=point_goal2", "algo.cost_limits.hazards=5", "algo.cost_limits={vases_contact: 3}"],
-        envs,
-        algos,
+    assert settle(plain)._replace(env=settings.env) == settings
+    one = compose(
+        ["env=point_goal2", "algo.cost_limits.hazards=5", "algo.cost_limits={vases_contact: 3}"]
     )
     assert one.algo.cost_limits == {"hazards": 5.0, "vases_contact": 3.0}
 
@@ -147,7 +143,7 @@ def test_a_sweep_over_a_named_limit_from_training_to_summary(tmp_path, capsys):
     assert [*tables] == ["algo.cost_limits.wall=0.5", "algo.cost_limits.wall=50"]
     tight, loose = (table["train/lam_wall"][-2:] for table in tables.values())
     assert (tight > loose).all()
-    rows = sweeps.rows_of(folder, TOYS, algos)
+    rows = rows_of(folder)
     assert [r.limits for r in rows] == [{"wall": 0.5}, {"wall": 50.0}]
     assert [r.held for r in rows] == ["no", "yes"]
     text = (folder / "summary.md").read_text().splitlines()
@@ -157,16 +153,12 @@ def test_a_sweep_over_a_named_limit_from_training_to_summary(tmp_path, capsys):
     assert text[2].startswith("| 0.5 | 2 | 192 |") and text[2].endswith("| wall 0.5 | no |")
     with (folder / "summary.csv").open() as file:
         assert [row["cost_limit_wall"] for row in csv.DictReader(file)] == ["0.5", "50.0"]
-    settings = command.settle(run_folder.read_config(run), TOYS, algos)
-    algo, ts = command.policy_of(settings, command.make_env(settings, TOYS), algos, run)
-    found = command.evaluate(settings, algo, ts, 2, 0, run)
+    found = evaluate(open_run(run), 2, 0)
     assert [s.limits for s in found] == [{"wall": 0.5}, {"wall": 50.0}]
     assert "wall over 50" in found[1].rows
     for other in (["algo.clip=0.1,0.2", "num_seeds=2"], ["algo.cost_limits.wall=1,50", "num_seeds=2"]):
         with pytest.raises(ConfigError, match="belongs to another sweep: algo"):
-            sweeps.open_folder(
-                sweeps.read([*SMALL, *other, "eval_episodes=2", f"run_dir={folder}"], TOYS, algos)
-            )
+            sweep.open_folder(planned(*SMALL, *other, "eval_episodes=2", f"run_dir={folder}"))
 
 
 def test_limits_of_named_costs_swept_have_lines_of_their_own(tmp_path, monkeypatch):
@@ -184,20 +176,20 @@ def test_limits_of_named_costs_swept_have_lines_of_their_own(tmp_path, monkeypat
 
 
 def test_parts_are_whole_settings_or_seeds_of_one_and_of_equal_size():
-    asked = sweeps.read(["algo.cost_limit=1,2,3,4", "num_seeds=8"], envs, algos)
+    asked = planned("algo.cost_limit=1,2,3,4", "num_seeds=8")
     (settings,) = asked.groups.values()
 
     def shapes(parallel: int) -> list[tuple]:
         return [
             ([c.cost_limit for c in p.configs], p.train.seed, p.train.num_seeds)
-            for p in sweeps.parts(settings, parallel)
+            for p in sweep.parts(settings, parallel)
         ]
 
     assert shapes(32) == [([1, 2, 3, 4], 0, 8)]
     assert shapes(31) == shapes(16) == [([1, 2], 0, 8), ([3, 4], 0, 8)]
     assert shapes(5) == [([limit], seed, 4) for limit in (1, 2, 3, 4) for seed in (0, 4)]
     assert len(shapes(1)) == 32
-    assert sweeps.slices(7, 3) == [slice(0, 2), slice(2, 4), slice(4, 7)]
+    assert sweep.slices(7, 3) == [slice(0, 2), slice(2, 4), slice(4, 7)]
 
 
 @pytest.mark.parametrize("name", sorted(algos.ALGOS))
@@ -205,9 +197,7 @@ def test_every_float_of_every_algorithm_may_differ_between_members(name):
     kind = algos.ALGOS[name].config
     cfg = kind(num_envs=2, horizon=4, minibatches=1, hidden=(4,))
     other = replace(cfg, **{field: 0.25 for field in float_fields(kind)})
-    program = runner.build(
-        Hall(), algos.ALGOS[name].make, (cfg, other), runner.TrainConfig(num_seeds=2)
-    )
+    program = build(Corridor(), algos.ALGOS[name].make, (cfg, other), TrainConfig(num_seeds=2))
     ts = jax.eval_shape(program.init, program.start, FIRST)
     assert all(x.shape == (4,) for x in jax.tree.leaves(ts.config))
     assert jax.tree.leaves(program.start[1])[0].dtype == np.float32
@@ -215,9 +205,9 @@ def test_every_float_of_every_algorithm_may_differ_between_members(name):
 
 def test_a_member_is_the_lone_run_of_its_setting_and_seed(finished, tmp_path):
     lone = ["algo.cost_limit=0.5", "algo.dual_lr=1", "seed=1", f"run_dir={tmp_path / 'lone'}"]
-    settings = command.compose([*SMALL, *lone], TOYS, algos)
-    env, program = command.prepare(settings, TOYS, algos)
-    assert command.run(settings, env, program, tmp_path / "lone", TOYS, algos, Report(), "again") == 0
+    settings = compose([*SMALL, *lone])
+    lone_run = Session(settings, tmp_path / "lone", *session.prepare(settings), "again")
+    assert session.run(lone_run, Report(), finish) == 0
     together, alone = tables(finished), tables(tmp_path)
     assert len(together) == 8 and [*alone] == [(0.5, 1.0, 1)]
     assert_close({member: together[member] for member in alone}, alone)
@@ -235,7 +225,7 @@ def test_parts_give_what_all_at_once_give(finished, tmp_path):
     train(tmp_path / "sweep", *GRID, "max_parallel=1")
     assert len(list(tmp_path.glob("sweep/*.part*"))) == 8
     assert_close(tables(tmp_path / "sweep"), tables(finished))
-    rows, expected = (sweeps.rows_of(f, TOYS, algos) for f in (tmp_path / "sweep", finished))
+    rows, expected = (rows_of(f) for f in (tmp_path / "sweep", finished))
     for a, b in zip(rows, expected, strict=True):
         assert (a.by, a.cost_limit, a.steps) == (b.by, b.cost_limit, b.steps)
         np.testing.assert_allclose([a.costs, a.returns], [b.costs, b.returns], rtol=1e-3, atol=1e-4)
@@ -249,7 +239,7 @@ def test_an_interrupted_sweep_goes_on_and_ends_bit_for_bit_as_if_uninterrupted(t
     def killed(*arguments):
         path = save(*arguments)
         saved.append(path)
-        if len(saved) == 4:  # the first part has three checkpoints
+        if len(saved) == 7:  # the first part has three checkpoints, each with its policies
             raise KeyboardInterrupt
         return path
 
@@ -271,51 +261,49 @@ def test_an_interrupted_sweep_goes_on_and_ends_bit_for_bit_as_if_uninterrupted(t
 
 
 def test_the_memory_decides_how_many_members_run_at_once(monkeypatch):
-    asked = sweeps.read([*SMALL, *GRID], TOYS, algos)
+    asked = planned(*SMALL, *GRID)
     (settings,) = asked.groups.values()
-    parallel, program = sweeps.fitting(settings, None, TOYS, algos)
+    parallel, program = sweep.fitting(settings, None)
     assert parallel == len(program.members) == 8
     like = jax.eval_shape(program.init, program.start, FIRST)
-    used = runner.compiled(program, like).memory_analysis()
+    used = spread.compiled(program, like).memory_analysis()
     need = used.temp_size_in_bytes + used.output_size_in_bytes  # arguments are reused for the output
-    monkeypatch.setattr(runner, "device_memory", lambda: (need * 0.5 / runner.ROOM, "this machine"))
-    assert 3 <= runner.capacity(program) <= 4
-    monkeypatch.setattr(runner, "device_memory", lambda: (1.0, "this machine"))
+    monkeypatch.setattr(memory, "device_memory", lambda: (need * 0.5 / memory.ROOM, "this machine"))
+    assert 3 <= memory.capacity(program) <= 4
+    monkeypatch.setattr(memory, "device_memory", lambda: (1.0, "this machine"))
     with pytest.raises(ConfigError, match="this machine has"):
-        sweeps.fitting(settings, None, TOYS, algos)
+        sweep.fitting(settings, None)
 
 
 def test_a_folder_of_another_sweep_is_refused_and_a_longer_one_is_not(finished, tmp_path):
     def opened(*texts: str) -> dict[str, int]:
-        asked = sweeps.read([*SMALL, *texts, f"run_dir={finished}"], TOYS, algos)
-        return sweeps.open_folder(asked)
+        asked = planned(*SMALL, *texts, f"run_dir={finished}")
+        return sweep.open_folder(asked)
 
     assert [*opened(*GRID, "total_steps=1e6").values()] == [8]
     with pytest.raises(ConfigError, match=r"another sweep: seed is 0 there, 3 here"):
         opened(*GRID, "seed=3")
     with pytest.raises(ConfigError, match=r"algo.cost_limit is \[0.5, 0.5, 5.0, 5.0\] there, \[0.5, "):
         opened(*GRID, "algo.clip=0.1,0.3")
-    with pytest.raises(ConfigError, match=r"another sweep, of 000-hall-ppo_lag;"):
+    with pytest.raises(ConfigError, match=r"another sweep, of 000-toys.Corridor-ppo_lag;"):
         opened(*GRID, "algo.epochs=1,2")
     (tmp_path / "config.yaml").touch()
     with pytest.raises(ConfigError, match="holds something else than a sweep"):
-        sweeps.open_folder(sweeps.read([*SMALL, *GRID, f"run_dir={tmp_path}"], TOYS, algos))
+        sweep.open_folder(planned(*SMALL, *GRID, f"run_dir={tmp_path}"))
 
 
 def test_the_policies_of_a_group_are_evaluated_setting_by_setting(finished):
     (folder,) = finished.glob("0*")
-    settings = command.settle(run_folder.read_config(folder), TOYS, algos)
-    env = command.make_env(settings, TOYS)
-    algo, ts = command.policy_of(settings, env, algos, folder)
-    found = command.evaluate(settings, algo, ts, 3, 0, folder)
+    run = open_run(folder)
+    found = evaluate(run, 3, 0)
     assert [(s.name, s.limits, s.episodes) for s in found] == [
         (f"algo.cost_limit={limit:g}, algo.dual_lr={rate:g}", {"": limit}, 6)
         for limit in (0.5, 5.0)
         for rate in (0.01, 1.0)
     ]
     for i, s in enumerate(found):
-        own = jax.tree.map(lambda x, i=i: x[2 * i : 2 * i + 2], ts)
-        alone = command.evaluation.run_episodes(algo, own, 3, 0)
+        own = jax.tree.map(lambda x, i=i: x[2 * i : 2 * i + 2], run.params)
+        alone = run_episodes(run.algo, own, 3, 0)
         assert s.rows["return"].mean == pytest.approx(alone.ret.mean(), rel=1e-5)
 
 
@@ -334,8 +322,8 @@ def write(folder: Path, configs: dict[str, Any], table: list[tuple]) -> None:
 
 
 def test_the_summary_is_the_last_tenth_of_training_over_the_seeds_of_each_setting(tmp_path):
-    asked = sweeps.read([*SMALL, "algo.cost_limit=2,4,8,16", f"run_dir={tmp_path}"], TOYS, algos)
-    sweeps.write_folder(asked, {})
+    asked = planned(*SMALL, "algo.cost_limit=2,4,8,16", f"run_dir={tmp_path}")
+    sweep.write_folder(asked, {})
     ((name, settings),) = asked.groups.items()
     plain: Any = settings.plain() | {"num_seeds": 2}
     three = plain | {"algo": plain["algo"] | {"cost_limit": [2.0, 4.0, 8.0]}}
@@ -344,7 +332,7 @@ def test_the_summary_is_the_last_tenth_of_training_over_the_seeds_of_each_settin
     for seed in range(2):  # a setting whose seeds were trained apart
         alone = plain | {"algo": plain["algo"] | {"cost_limit": 16.0}, "seed": seed, "num_seeds": 1}
         write(tmp_path / f"{name}.part{seed + 1}", alone, [(seed, None, 1.0, np.nan)])
-    assert sweeps.summarise(tmp_path, TOYS, algos) == (
+    assert summarise(tmp_path) == (
         "| algo.cost_limit | seeds | steps | return | cost | limit | limit held |\n"
         "| --- | ---: | ---: | ---: | ---: | ---: | ---: |\n"
         "| 2 | 2 | 200 | 2 [1, 3] | 2 [1, 3] | 2 | yes |\n"
@@ -379,7 +367,7 @@ BAD = {
     "algo.cost_limit=5,": "cannot read 'algo.cost_limit=5,'",
     "algo.cost_limit=5,5": "algo.cost_limit=5 occurs twice",
     "algo.cost_limit=5,5.0": "occurs twice",
-    "algo.cost_limit=": "nothing to sweep",
+    "algo.cost_limit=": "algo.cost_limit='': expected a number",
     "algo.cost_limit=5": "nothing to sweep",
     "algo.hidden=[8,8]": "nothing to sweep",
     "env=point_goal2 algo.cost_limits.hazard=5,10": "unknown cost 'hazard'; did you mean 'hazards'?",
@@ -401,22 +389,18 @@ BAD = {
 @pytest.mark.parametrize("arguments", BAD)
 def test_a_bad_sweep_is_one_line_and_status_2(arguments, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["sweep.py", *arguments.split()])
-    monkeypatch.setattr(runner, "train", lambda *a, **k: pytest.fail("it went on to train"))
-    assert sweeps.main(envs, algos) == 2
+    monkeypatch.setattr(loop, "train", lambda *a, **k: pytest.fail("it went on to train"))
+    assert shell.typed("sweep", *arguments.split()) == 2
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1 and lines[0].startswith("error: ") and BAD[arguments] in lines[0]
     assert not list(tmp_path.glob("runs/*"))
 
 
-def test_the_script_rewrites_the_summary_of_a_sweep_at_any_time(tmp_path):
-    asked = sweeps.read(["env=point_goal0", "algo.cost_limit=2,4", f"run_dir={tmp_path}"], envs, algos)
-    sweeps.write_folder(asked, {})
+def test_the_command_rewrites_the_summary_of_a_sweep_at_any_time(tmp_path, capsys):
+    asked = planned("env=point_goal0", "algo.cost_limit=2,4", f"run_dir={tmp_path}")
+    sweep.write_folder(asked, {})
     ((name, settings),) = asked.groups.items()
     write(tmp_path / name, settings.plain(), [(0, 2.0, 1.0, 1.0), (0, 4.0, 1.0, 1.0)])
-    script = Path(__file__).parent.parent.parent / "scripts" / "sweep.py"
-    done = subprocess.run(
-        [sys.executable, str(script), "--summary", str(tmp_path)], capture_output=True, text=True
-    )
-    assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout == (tmp_path / "summary.md").read_text() and "| 4 | 1 | 200 |" in done.stdout
+    assert shell.typed("sweep", "--summary", str(tmp_path)) == 0
+    out, err = capsys.readouterr()
+    assert out == (tmp_path / "summary.md").read_text() and "| 4 | 1 | 200 |" in out and err == ""

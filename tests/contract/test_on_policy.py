@@ -17,7 +17,7 @@ from jaxsafe.algos import ALGOS
 from jaxsafe.config import ConfigError
 from jaxsafe.learn.on_policy import learned
 from jaxsafe.learn.returns import Window
-from jaxsafe.run import compat, evaluation
+from jaxsafe.run import compat, evaluate
 
 NAMES = sorted(ALGOS)
 TINY: dict[str, Any] = {"num_envs": 8, "horizon": 25, "minibatches": 2, "hidden": (8,)}
@@ -448,7 +448,7 @@ def test_constrained_algorithms_earn_what_the_limit_allows(name):
 def test_a_budget_or_an_early_end_holds_the_limit_in_every_episode(name):
     """Up to 1 in 50: the policy is a smooth function, and is paid to come near the limit."""
     algo, ts, metrics = train_on_levers(name, AUGMENTED[name])
-    whole = evaluation.run_episodes(algo, ts, 200, seed=0)
+    whole = evaluate.run_episodes(algo, ts, 200, seed=0)
     assert (whole.length == 10).all()
     assert (whole.cost > 2.5).mean() < 0.02
     assert (whole.ret.mean(1) > 0.9 * 14.375).all()  # the best within the limit

@@ -10,8 +10,9 @@ from pathlib import Path
 import jax
 import pytest
 
-from jaxsafe import algos, envs
-from jaxsafe.run import command
+from jaxsafe import envs
+from jaxsafe.run.arguments import compose
+from jaxsafe.run.settings import make_env
 
 ROOT = Path(__file__).parent.parent.parent
 PAGES = sorted((ROOT / "docs" / "howto").glob("*.md"), key=lambda p: p.name)
@@ -69,7 +70,7 @@ def test_the_python_of_a_page_runs(page, capsys):
 def test_the_runs_of_a_page_could_start(page):
     for line in commands(page):
         if line[1] == "scripts/train.py" and not any(word.startswith("resume=") for word in line):
-            env = command.make_env(command.compose(line[2:], envs, algos), envs)
+            env = make_env(compose(line[2:]))
             assert jax.eval_shape(env.reset, jax.random.key(0)).obs.shape == (env.obs_size,)
 
 

@@ -24,7 +24,7 @@ from jaxsafe.envs.engines.jax import engine as jax_engine
 from jaxsafe.envs.engines.jax import solver as jax_solver
 from jaxsafe.envs.safety_gym import recording, scene
 from jaxsafe.envs.safety_gym.config import read as read_config
-from jaxsafe.learn.rollout import collect, init_rollout
+from jaxsafe.learn.rollout import collect, init_rollout, memoryless
 
 DATA = Path(__file__).parent.parent / "data"
 
@@ -302,7 +302,7 @@ def rollout():
         return jax.random.uniform(key, (obs.shape[0], 2), minval=-1), jnp.zeros(obs.shape[0])
 
     begin = init_rollout(env, jax.random.key(0), 3, False)
-    end, traj = jax.jit(partial(collect, env, push, horizon=17), compiler_options=FAST)(
+    end, traj = jax.jit(partial(collect, env, memoryless(push), horizon=17), compiler_options=FAST)(
         begin, key=jax.random.key(1)
     )
     return env, begin, end, jax.tree.map(np.asarray, traj)

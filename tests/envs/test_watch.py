@@ -19,12 +19,14 @@ import mujoco
 import numpy as np
 import pytest
 
-from jaxsafe import algos, envs
+from jaxsafe import envs
+from jaxsafe.commands import render as render_command
+from jaxsafe.commands import watch as watch_command
 from jaxsafe.config import ConfigError
 from jaxsafe.envs.view import watch
 from jaxsafe.envs.view.driving import FRONT, drive, robot_of
 from jaxsafe.learn.acting import reflex
-from jaxsafe.run import viewing
+from jaxsafe.report import film
 
 ROOT = Path(__file__).parent.parent.parent
 
@@ -151,7 +153,7 @@ def test_pictures_are_sent_as_jpeg():
 def said(monkeypatch, capsys, main, *args: str) -> str:
     """The one line of an error with status 2."""
     monkeypatch.setattr(sys, "argv", ["script", *args])
-    assert main(envs, algos) == 2
+    assert main() == 2
     (line,) = capsys.readouterr().err.splitlines()
     return line.removeprefix("error: ")
 
@@ -172,7 +174,7 @@ BAD = {
 @pytest.mark.parametrize("args", BAD, ids=" ".join)
 def test_watch_refuses_in_one_line(monkeypatch, capsys, args):
     monkeypatch.setattr(watch, "has_display", lambda: False)
-    assert BAD[args] in said(monkeypatch, capsys, viewing.watch_main, *args)
+    assert BAD[args] in said(monkeypatch, capsys, watch_command.main, *args)
 
 
 def test_without_a_display_a_page_needs_its_package_a_port_and_a_browser_to_open(monkeypatch, capsys):
@@ -181,7 +183,7 @@ def test_without_a_display_a_page_needs_its_package_a_port_and_a_browser_to_open
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        line = said(monkeypatch, capsys, viewing.watch_main, "env=point_goal0", "--port", str(port))
+        line = said(monkeypatch, capsys, watch_command.main, "env=point_goal0", "--port", str(port))
     assert re.fullmatch(rf"--port {port} is in use; --port \d+ is free", line)
 
     def none() -> Any:
@@ -189,20 +191,20 @@ def test_without_a_display_a_page_needs_its_package_a_port_and_a_browser_to_open
 
     monkeypatch.setattr(webbrowser, "get", none)
     line = said(
-        monkeypatch, capsys, viewing.watch_main, "env=point_goal0", "--port", str(port), "--open"
+        monkeypatch, capsys, watch_command.main, "env=point_goal0", "--port", str(port), "--open"
     )
     assert line.startswith("--open: no browser on this machine")
     monkeypatch.setitem(sys.modules, "nicegui", None)
-    line = said(monkeypatch, capsys, viewing.watch_main, "env=point_goal0", "--port", str(port))
+    line = said(monkeypatch, capsys, watch_command.main, "env=point_goal0", "--port", str(port))
     assert line == "the page for a browser needs the package nicegui: pip install 'jaxsafe[watch]'"
 
 
 def test_render_refuses_in_one_line(monkeypatch, capsys):
-    assert "not a run folder" in said(monkeypatch, capsys, viewing.render_main, "nowhere", "elsewhere")
+    assert "not a run folder" in said(monkeypatch, capsys, render_command.main, "nowhere", "elsewhere")
     assert "a.avi: expected a name that ends in" in said(
-        monkeypatch, capsys, viewing.render_main, "nowhere", "--out", "a.avi"
+        monkeypatch, capsys, render_command.main, "nowhere", "--out", "a.avi"
     )
-    assert "expected a run folder" in said(monkeypatch, capsys, viewing.render_main, "env=a:b")
+    assert "expected a run folder" in said(monkeypatch, capsys, render_command.main, "env=a:b")
 
 
 def test_runs_of_different_tasks_do_not_stand_side_by_side():
@@ -214,18 +216,18 @@ def test_runs_of_different_tasks_do_not_stand_side_by_side():
         actor("point_goal1", hazards_num=8, engine="c"),
         actor("point_goal1", hazards_num=8, engine="warp"),
     )
-    viewing.check_one_task(folders, [one, same])
+    film.check_one_task(folders, [one, same])
     with pytest.raises(ConfigError, match=r"env=point_goal1 in a, car_goal1 in b"):
-        viewing.check_one_task(folders, [one, actor("car_goal1", hazards_num=8)])
+        film.check_one_task(folders, [one, actor("car_goal1", hazards_num=8)])
     with pytest.raises(ConfigError, match=r"env\.hazards_num=8 in a, 4 in b"):
-        viewing.check_one_task(folders, [one, actor("point_goal1", hazards_num=4)])
+        film.check_one_task(folders, [one, actor("point_goal1", hazards_num=4)])
 
 
 def test_panels_are_labelled_with_what_tells_them_apart():
     folders = [Path("/runs/x/1"), Path("/runs/y/1")]
-    assert viewing.labels(folders, ["cpo", "ppo_lag"]) == ["cpo", "ppo_lag"]
-    assert viewing.labels(folders, ["cpo", "cpo"]) == ["cpo, x/1", "cpo, y/1"]
-    assert viewing.labels([folders[0]] * 2, ["cpo", "cpo"]) == ["cpo, 1", "cpo, 1"]
+    assert film.labels(folders, ["cpo", "ppo_lag"]) == ["cpo", "ppo_lag"]
+    assert film.labels(folders, ["cpo", "cpo"]) == ["cpo, x/1", "cpo, y/1"]
+    assert film.labels([folders[0]] * 2, ["cpo", "cpo"]) == ["cpo, 1", "cpo, 1"]
 
 
 # The page --------------------------------------------------------------------------------------------

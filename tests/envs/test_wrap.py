@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from toys import Clock, Corridor
 
-from jaxsafe import algos, envs
+from jaxsafe import envs
 from jaxsafe.config import ConfigError
 from jaxsafe.envs.check import check_env
 from jaxsafe.envs.wrap import (
@@ -21,7 +21,9 @@ from jaxsafe.envs.wrap import (
     raw_steps,
 )
 from jaxsafe.learn.rollout import collect, init_rollout
-from jaxsafe.run import command
+from jaxsafe.run.arguments import compose
+from jaxsafe.run.settings import make_env, settle
+from jaxsafe.run.spread import build
 from jaxsafe.types import Env, State
 
 
@@ -96,7 +98,10 @@ def test_pixels_are_stacked_by_channel():
 def test_a_time_limit_truncates_and_frames_do_not_leak_into_the_next_episode():
     env = FrameStack(TimeLimit(Clock(), 3), 2)
     rollout = init_rollout(env, jax.random.key(0), 2, False)
-    act = lambda obs, key: (jnp.zeros((2, 1)), jnp.zeros(2))  # noqa: E731
+
+    def act(carry: Any, obs: jax.Array, first: jax.Array, key: jax.Array) -> Any:
+        return jnp.zeros((2, 1)), jnp.zeros(2), carry
+
     _, traj = jax.jit(lambda r: collect(env, act, r, jax.random.key(1), 7))(rollout)
     np.testing.assert_array_equal(np.flatnonzero(traj.truncated[:, 0]), [2, 5])
     assert not traj.terminated.any()
@@ -153,16 +158,16 @@ def test_every_environment_has_wrappers_as_options(hall):
 
 def test_wrappers_are_set_on_the_command_line(hall):
     texts = ["env=hall", "algo=ppo", "env.wrap.time_limit=10", "env.wrap.frame_stack=2"]
-    made = command.make_env(command.compose(texts, envs, algos), envs)
+    made = make_env(compose(texts))
     assert made == FrameStack(TimeLimit(Corridor(), 10), 2)
     with pytest.raises(ConfigError, match=r"did you mean 'wrap\.frame_stack'"):
-        command.compose([*texts, "env.wrap.frame_stak=2"], envs, algos)
+        compose([*texts, "env.wrap.frame_stak=2"])
 
 
 def test_settings_of_a_run_that_knew_no_wrappers_are_read(hall):
-    saved = command.compose(["env=hall", "algo=ppo"], envs, algos).plain()
+    saved = compose(["env=hall", "algo=ppo"]).plain()
     del saved["env"]["wrap"]
-    assert command.make_env(command.settle(saved, envs, algos), envs) == Corridor()
+    assert make_env(settle(saved)) == Corridor()
 
 
 @pytest.mark.parametrize(
@@ -192,3 +197,11 @@ def test_bounds_for_other_actions_and_an_option_called_wrap_are_refused():
     with pytest.raises(ConfigError, match="every environment has: rename"):
         envs.env_defaults("odd")
     del envs.ENVS["odd"]
+
+
+def test_steps_of_a_run_are_raw_steps(hall):
+    """Two environments, eight rows an update, three raw steps a row."""
+    texts = ["env=hall", "algo=ppo", "num_envs=2", "algo.horizon=8", "env.wrap.action_repeat=3"]
+    settings = compose(texts)
+    program = build(make_env(settings), settings.row.make, settings.configs, settings.train)
+    assert program.clocks.steps == 2 * 8 * 3

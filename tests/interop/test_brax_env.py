@@ -18,7 +18,7 @@ from jaxsafe import algos, envs
 from jaxsafe.config import ConfigError
 from jaxsafe.envs.check import check_env
 from jaxsafe.interop.brax import from_brax, mend_brax, to_brax, to_playground
-from jaxsafe.learn.rollout import collect, init_rollout
+from jaxsafe.learn.rollout import collect, init_rollout, memoryless
 
 
 class Fast(brax.envs.fast.Fast):
@@ -110,7 +110,9 @@ def test_a_foreign_environment_rolls_out_with_its_costs():
     rollout = init_rollout(env, jax.random.key(0), 2, stagger=False)
     assert not rollout.state.cost.any() and not rollout.pool.reward.any()
     wide = jnp.full((2, env.action_size), 9.0)  # clipped to 1
-    run = jax.jit(lambda r: collect(env, lambda obs, key: (wide, obs[:, 0]), r, jax.random.key(1), 4))
+    run = jax.jit(
+        lambda r: collect(env, memoryless(lambda obs, key: (wide, obs[:, 0])), r, jax.random.key(1), 4)
+    )
     _, traj = run(rollout)
     np.testing.assert_array_equal(traj.costs[:, 0], [[1, 1], [2, 1], [3, 1], [1, 1]])
     np.testing.assert_array_equal(traj.cost, traj.costs.sum(-1))

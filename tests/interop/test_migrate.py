@@ -2,15 +2,15 @@
 
 import dataclasses
 import json
-import sys
 from typing import Any
 
 import pytest
+from shell import typed
 
 from jaxsafe import algos, envs
 from jaxsafe.config import ConfigError
 from jaxsafe.interop import migrate
-from jaxsafe.run import command
+from jaxsafe.run import arguments
 
 # What OmniSafe 0.5.0 and later takes where nothing is said: PPOLag, and what is other of TRPO.
 PPO_LAG: dict[str, Any] = {
@@ -81,8 +81,8 @@ PLAIN = ["env=point_goal1", "env.rules=safety_gymnasium"]
 
 
 def migrated(config: dict[str, Any], algo: str) -> migrate.Migrated:
-    found = migrate.omnisafe(config, envs, algos, algo, "SafetyPointGoal1-v0")
-    command.read_arguments(found.argv, envs, algos)  # train.py takes it
+    found = migrate.omnisafe(config, algo, "SafetyPointGoal1-v0")
+    arguments.read(found.argv)  # train.py takes it
     return found
 
 
@@ -202,13 +202,13 @@ def test_every_option_that_a_key_becomes_exists():
 )
 def test_bad_input_is_one_line(config, algo, env, message):
     with pytest.raises(ConfigError, match=message) as error:
-        migrate.omnisafe(config, envs, algos, algo, env)
+        migrate.omnisafe(config, algo, env)
     assert "\n" not in str(error.value)
 
 
 def test_the_options_of_every_registered_environment_are_its_name():
     for name, options in envs.ENVS.items():
-        assert migrate.safety_gym(options, envs).argv == [f"env={name}"]
+        assert migrate.safety_gym(options).argv == [f"env={name}"]
 
 
 def test_an_engine_dict_is_the_nearest_environment_and_the_rest():
@@ -220,23 +220,22 @@ def test_an_engine_dict_is_the_nearest_environment_and_the_rest():
         "constrain_indicator": False,
         "vision_size": [60, 40],
     }
-    found = migrate.safety_gym(config, envs)
+    found = migrate.safety_gym(config)
     expected = ["env.hazards_num=3", "env.hazards_locations=[[1.0,1.0],[-1.0,0.5]]"]
     assert sorted(found.argv) == sorted(["env=point_push1", *expected, "env.constrain_indicator=false"])
     assert {line.key for line in found.lines} == set(config)
-    request = command.read_arguments(found.argv, envs, algos)
+    request = arguments.read(found.argv)
     assert expected[1] in request.argv
     for name, message in (("hazard_num", "did you mean 'hazards_num'"), ("awake", "of Engine")):
         with pytest.raises(ConfigError, match=message):
-            migrate.safety_gym({name: 3}, envs)
-    assert lost(migrate.safety_gym({"observe_vision": True}, envs)) == ["observe_vision"]
+            migrate.safety_gym({name: 3})
+    assert lost(migrate.safety_gym({"observe_vision": True})) == ["observe_vision"]
 
 
-def test_the_script_prints_a_command_and_refuses_in_a_line(tmp_path, monkeypatch, capsys):
+def test_the_script_prints_a_command_and_refuses_in_a_line(tmp_path, capsys):
     path = tmp_path / "config.json"
     path.write_text(json.dumps(PPO_LAG | {"algo": "PPOLag", "env_id": "SafetyCarPush2-v0", "seed": 3}))
-    monkeypatch.setattr(sys, "argv", ["migrate.py", "omnisafe", str(path)])
-    assert migrate.main(envs, algos) == 0
+    assert typed("migrate", "omnisafe", str(path)) == 0
     out, err = capsys.readouterr()
     rules = "env=car_push2 env.rules=safety_gymnasium"
     assert (
@@ -249,6 +248,6 @@ def test_the_script_prints_a_command_and_refuses_in_a_line(tmp_path, monkeypatch
         (None, "cannot read"),
     ):
         path.unlink() if text is None else path.write_text(text)
-        assert migrate.main(envs, algos) == 2
+        assert typed("migrate", "omnisafe", str(path)) == 2
         error = capsys.readouterr().err
         assert message in error and error.count("\n") == 1

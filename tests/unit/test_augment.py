@@ -15,7 +15,7 @@ from jaxsafe.learn.augment import Budget, control_budget, full_budget, init_sche
 from jaxsafe.learn.normalise import normalise
 from jaxsafe.learn.on_policy import see
 from jaxsafe.learn.rollout import collect, init_rollout
-from jaxsafe.run import checkpoint, compat, evaluation
+from jaxsafe.run import checkpoint, compat, evaluate
 from jaxsafe.types import Policy
 
 TINY: dict[str, Any] = {
@@ -249,7 +249,7 @@ def test_evaluation_shows_what_is_left_of_the_scheduled_budget():
     algo = ALGOS["ppo_simmer_pid"].make(Lever())._replace(policy=Policy(lambda params: (), spend))
     cfg = ALGOS["ppo_simmer_pid"].config(**TINY, cost_limit=1e6, budget_init=0.2)
     ts = jax.tree.map(lambda x: x[None], algo.init(jax.random.key(0), cfg, FIRST))
-    cost = evaluation.run_episodes(algo, ts, 50, seed=0).cost  # 10 steps of 0.4 or 0.6
+    cost = evaluate.run_episodes(algo, ts, 50, seed=0).cost  # 10 steps of 0.4 or 0.6
     assert cost.min() > 3.99 and cost.max() < 6.01 and cost.std() > 0.1
 
 
@@ -307,7 +307,7 @@ def test_training_episodes_end_early_and_others_do_not():
     ts, m = update(start("ppo_early_terminated", env, cost_limit=5.0))
     assert (m["train/episode_length"], m["train/cost"], m["train/return"]) == (3, 6, 3)
     assert algo.task(ts) is env
-    whole = evaluation.run_episodes(algo, jax.tree.map(lambda x: x[None], ts), 2, seed=0)
+    whole = evaluate.run_episodes(algo, jax.tree.map(lambda x: x[None], ts), 2, seed=0)
     np.testing.assert_array_equal(whole.length, 5)
     np.testing.assert_array_equal(whole.cost, 10)
 

@@ -12,17 +12,17 @@ from scipy.optimize import linprog, minimize
 from tasks import FAST
 from toys import FIRST, Clock, Corridor, updated
 
-from jaxsafe import algos, envs
 from jaxsafe.algos import ALGOS, cpo, pcpo
 from jaxsafe.algos.cppo_pid import CPPOPIDConfig
 from jaxsafe.algos.ppo_lag import PPOLagConfig
+from jaxsafe.commands import train
 from jaxsafe.config import ConfigError
 from jaxsafe.learn.constraints import spread
 from jaxsafe.learn.halfspaces import furthest_point, nearest_point
 from jaxsafe.learn.normalise import normalise
 from jaxsafe.learn.treatments import lagrangian, pid
 from jaxsafe.nn.networks import value
-from jaxsafe.run import command, runner
+from jaxsafe.run import loop
 from jaxsafe.types import State
 
 SEVERAL = [name for name in ALGOS if "cost_limits" in ALGOS[name].config.__dataclass_fields__]
@@ -379,9 +379,9 @@ def test_bad_limits_are_one_line_and_status_2(arguments, tmp_path, monkeypatch, 
     monkeypatch.chdir(tmp_path)
     head, option, value = arguments.rpartition("algo.c")
     monkeypatch.setattr(sys, "argv", ["train.py", *head.split(), option + value])
-    monkeypatch.setattr(runner, "train", lambda *a, **k: pytest.fail("it went on to train"))
+    monkeypatch.setattr(loop, "train", lambda *a, **k: pytest.fail("it went on to train"))
     try:
-        status = command.train_main(envs, algos)
+        status = train.main()
     except SystemExit as stop:
         status = stop.code
     lines = capsys.readouterr().err.splitlines()

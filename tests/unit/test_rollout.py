@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from toys import Clock, Corridor
 
-from jaxsafe.learn.rollout import collect, init_rollout
+from jaxsafe.learn.rollout import collect, init_rollout, memoryless
 
 
 def idle(obs, key):
@@ -19,7 +19,7 @@ def idle(obs, key):
 def run(env, num_envs, horizon, stagger=False, seed=0, chunks=1):
     """The trajectories of `chunks` rollouts, end to end."""
     rollout = init_rollout(env, jax.random.key(seed), num_envs, stagger)
-    step = jax.jit(partial(collect, env, idle, horizon=horizon))
+    step = jax.jit(partial(collect, env, memoryless(idle), horizon=horizon))
     trajs = []
     for i in range(chunks):
         rollout, traj = step(rollout, key=jax.random.fold_in(jax.random.key(seed + 1), i))
@@ -96,7 +96,7 @@ def test_no_reset_runs_until_the_pool_runs_out(seeds):
         return init_rollout(env, key, 4, False)
 
     def go_on(rollout, key):
-        return collect(env, idle, rollout, key, 20)[0]
+        return collect(env, memoryless(idle), rollout, key, 20)[0]
 
     keys = jax.random.key(0)
     if seeds:
@@ -141,7 +141,7 @@ def test_seeds_side_by_side_are_the_lone_seeds():
 
     def one(key):
         rollout = init_rollout(env, key, 5, True)
-        return collect(env, idle, rollout, jax.random.fold_in(key, 1), 40)
+        return collect(env, memoryless(idle), rollout, jax.random.fold_in(key, 1), 40)
 
     keys = jax.random.split(jax.random.key(3), 3)
     together = jax.jit(jax.vmap(one))(keys)[1]
@@ -157,6 +157,6 @@ def test_the_policy_sees_the_observations_it_is_recorded_with():
         return obs[:, :2], obs.sum(-1)
 
     rollout = init_rollout(env, jax.random.key(0), 3, False)
-    _, traj = collect(env, copy, rollout, jax.random.key(1), 30)
+    _, traj = collect(env, memoryless(copy), rollout, jax.random.key(1), 30)
     np.testing.assert_array_equal(traj.action, traj.obs[..., :2])
     np.testing.assert_array_equal(traj.log_prob, traj.obs.sum(-1))

@@ -10,8 +10,8 @@ from toys import Clock
 
 from jaxsafe.config import ConfigError
 from jaxsafe.learn.acting import reflex
-from jaxsafe.report import plots, scores
-from jaxsafe.run import evaluation, run_folder
+from jaxsafe.report import evaluation, plots, scores
+from jaxsafe.run import evaluate, run_folder
 from jaxsafe.run.run_folder import Metrics, read_config, read_metrics
 
 
@@ -109,13 +109,13 @@ def test_an_interval_is_over_seeds_and_of_one_seed_over_its_episodes():
 
 def test_discounted_sums_and_named_costs_of_an_episode_by_hand():
     player = reflex(lambda obs: obs[:1], Clock(lives=(3, 3)))
-    three = evaluation.episode(player, jax.random.key(0), 0.5, 0.1)
+    three = evaluate.episode(player, jax.random.key(0), 0.5, 0.1)
     assert (three.ret, three.length) == (3, 3) and three.cost == 6  # 1 and 2 a step
     np.testing.assert_allclose(three.discounted_ret, 1 + 0.5 + 0.25)
     np.testing.assert_allclose(three.discounted_cost, 2 * (1 + 0.1 + 0.01), rtol=1e-6)
-    own = evaluation.Episodes(*(np.asarray(x)[None, None] for x in three))
+    own = evaluate.Episodes(*(np.asarray(x)[None, None] for x in three))
     a, b = own.costs[0, 0]
-    found = evaluation.measures(own, ("a", "b"), {"a": a - 0.5, "b": b})
+    found = evaluate.measures(own, ("a", "b"), {"a": a - 0.5, "b": b})
     assert [found[f"cost {name}"].item() for name in "ab"] == [a, b]
     assert [found[k].item() for k in (f"a over {a - 0.5:g}", f"b over {b:g}")] == [True, False]
     assert found["violation rate"].item() and "cost wall" not in found
@@ -142,7 +142,7 @@ def test_progress_reads_the_newest_manifest(tmp_path):
 
 
 def test_the_command_of_a_run_is_recorded_as_it_was_typed(tmp_path, monkeypatch):
-    # `command.read_arguments` puts ++ before a named limit, which the command line does not take
+    # `arguments.read` puts ++ before a named limit, which the command line does not take
     monkeypatch.setattr(sys, "argv", ["train.py", "algo=cpo", "++algo.cost_limits.hazards=5"])
     run_folder.append_versions(tmp_path, "cpu", None)
     (start,) = json.loads((tmp_path / "versions.json").read_text())

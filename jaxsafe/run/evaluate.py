@@ -1,7 +1,6 @@
-"""Fresh episodes of a trained policy, and what Safety Gym reports about them."""
+"""Fresh episodes of a trained policy, and what is measured of each."""
 
-import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import jax
@@ -9,8 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsafe.learn.acting import Player
-from jaxsafe.report import scores, stats
-from jaxsafe.report.stats import Estimate
 from jaxsafe.types import Algorithm, PyTree
 
 
@@ -68,25 +65,6 @@ def run_episodes(algo: Algorithm, params: PyTree, num_episodes: int, seed: int) 
     return jax.tree.map(np.asarray, jax.jit(jax.vmap(one_seed))(params))
 
 
-def estimate(values: np.ndarray) -> Estimate:
-    """Mean of `values` [S, N] and its interval over seeds, whose means hold the spread of episodes too.
-
-    With one seed the interval covers the episodes alone, not what another seed would give.
-    """
-    return stats.estimate(values.mean(1) if len(values) > 1 else values[0])
-
-
-def cost_rate(metrics: dict[str, np.ndarray]) -> np.ndarray | None:
-    """Safety Gym's cost rate, [S]: total training cost over total training steps; None if unknown.
-
-    `metrics` are the columns of metrics.csv.
-    """
-    if "train/cost_rate" not in metrics or not len(metrics["seed"]):
-        return None
-    rates = metrics["train/cost_rate"]  # of one iteration; all have the same number of steps
-    return np.array([np.nanmean(rates[metrics["seed"] == seed]) for seed in np.unique(metrics["seed"])])
-
-
 def measures(
     episodes: Episodes, cost_names: Sequence[str], limits: Mapping[str, float]
 ) -> dict[str, np.ndarray]:
@@ -110,42 +88,3 @@ def measures(
         "discounted cost": episodes.discounted_cost,
         "episode length": episodes.length,
     }
-
-
-def summary(
-    env_name: str,
-    found: Mapping[str, np.ndarray],
-    cost_limit: float,
-    metrics: dict[str, np.ndarray],
-) -> dict[str, Estimate]:
-    """The rows of the table: `measures`, then the cost rate of training and normalised scores."""
-    rows = {name: estimate(values) for name, values in found.items()}
-    rate = cost_rate(metrics)
-    if rate is not None:
-        rows["cost rate (training)"] = stats.estimate(rate)
-    if env_name in scores.CHARACTERISTIC:
-
-        def scaled(score: Callable, of: Estimate, *args: float) -> Estimate:
-            return Estimate(*(float(score(env_name, x, *args)) for x in of))
-
-        rows["normalised return"] = scaled(scores.normalized_return, rows["return"])
-        rows["normalised violation"] = scaled(scores.normalized_violation, rows["cost"], cost_limit)
-        if rate is not None:
-            rows["normalised cost rate"] = scaled(
-                scores.normalized_cost_rate, rows["cost rate (training)"]
-            )
-    return rows
-
-
-def table(rows: dict[str, Estimate]) -> str:
-    """Aligned plain text: a row each, mean and interval. A single number has no interval."""
-
-    def line(name: str, e: Estimate) -> str:
-        interval = "" if e.low == e.high == e.mean else f"[{e.low:10.4g}, {e.high:10.4g} ]"
-        return f"{name:<22}{e.mean:>10.4g}   {interval}".rstrip()
-
-    return "\n".join([f"{'':<22}{'mean':>10}   95 % interval", *(line(n, e) for n, e in rows.items())])
-
-
-def as_json(rows: dict[str, Estimate]) -> dict[str, list[float | None]]:
-    return {name: [x if math.isfinite(x) else None for x in e] for name, e in rows.items()}

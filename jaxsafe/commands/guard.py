@@ -1,0 +1,41 @@
+"""What every command shares: an error that the user can mend is one line and an exit status."""
+
+import errno
+import sys
+from collections.abc import Callable
+
+import jax
+
+from jaxsafe.config import ConfigError, one_line
+from jaxsafe.report.film import NoVideo
+from jaxsafe.run import arguments, checkpoint
+
+BAD_DISK = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO)
+
+
+def guarded(command: Callable[[], int]) -> int:
+    """Run `command`; what the user can mend becomes one line on stderr and an exit status."""
+    try:
+        return command()
+    except (ConfigError, *arguments.ERRORS) as error:
+        return complain(one_line(error), 2)
+    except (checkpoint.CheckpointError, NoVideo) as error:
+        return complain(one_line(error), 1)
+    except KeyboardInterrupt:
+        return complain("stopped; what was saved stays", 130)
+    except OSError as error:
+        if error.errno not in BAD_DISK:
+            raise
+        where = f" ({error.filename})" if error.filename else ""
+        return complain(f"{error.strerror}{where}; what was saved stays", 1)
+    except jax.errors.JaxRuntimeError as error:
+        if "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        return complain(
+            "the device is out of memory; use fewer num_envs, num_seeds or a shorter horizon", 1
+        )
+
+
+def complain(line: str, status: int) -> int:
+    print(f"error: {line}", file=sys.stderr)
+    return status

@@ -1,0 +1,60 @@
+"""Runs and sweeps compared by any field of their configs, in tables and figures.
+
+    python scripts/plot.py RUNS... [--by FIELD ...] [--published CSV] [--out DIR]
+
+    OUT/results.md, .tex    return and cost, a row a setting, a column a task; what else is known
+    OUT/results.csv         every estimate, a row each
+    OUT/curves.png, .svg    return, cost and cost rate over training, mean and 95 % interval
+    OUT/trade_off.png, .svg return against cost, with the limit and the Pareto front
+    OUT/scores.png, .svg    Safety Gym's normalised scores over all tasks, mean and IQM
+    OUT/profiles.png, .svg  the share of seeds beyond each normalised return and cost
+
+The figures of a seed are those of the last 10 % of its training. Its cost rate is of all its training.
+Tasks stand apart. Only normalised scores, and comparisons within a task, are averaged over tasks.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+from jaxsafe.commands.guard import guarded
+from jaxsafe.config import ConfigError
+from jaxsafe.report.group import group, ordered, telling
+from jaxsafe.report.published import read_published
+from jaxsafe.report.read import read
+from jaxsafe.report.write import write
+from jaxsafe.run.arguments import fail
+
+
+def main() -> int:
+    """Exit status: 2 for bad input, 1 for a failed disk."""
+    return guarded(command)
+
+
+def command() -> int:
+    parser = argparse.ArgumentParser(
+        description=(__doc__ or "").partition("\n")[0],
+        epilog=(__doc__ or "").partition("\n\n")[2],
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.error = fail  # type: ignore[method-assign]
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUNS")
+    parser.add_argument(
+        "--by", nargs="+", metavar="FIELD", default=[],
+        help="what tells settings apart, as algo.name or algo.cost_limit; runs that agree in it "
+        "are averaged (default: the algorithm, and whatever else they differ in)",
+    )  # fmt: skip
+    parser.add_argument("--published", type=Path, metavar="CSV", help="figures to set beside")
+    parser.add_argument("--out", type=Path, default=Path("comparison"), metavar="DIR")
+    args = parser.parse_args()
+    published = read_published(args.published) if args.published else {}
+    runs = read(args.runs)
+    by = [name for name in args.by if name != "env.name"] or telling(runs)
+    groups = ordered(group(runs, by))
+    try:
+        args.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"--out {args.out}: {error.strerror}") from error
+    print(f"{len(runs)} run{'s' * (len(runs) > 1)} by {', '.join(by)}", file=sys.stderr)
+    print(write(groups, args.out, published) + f"written: {args.out}")
+    return 0

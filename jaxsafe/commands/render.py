@@ -1,0 +1,37 @@
+"""scripts/render.py: film the policies of runs."""
+
+from pathlib import Path
+
+from jaxsafe.commands import viewing
+from jaxsafe.commands.guard import guarded
+from jaxsafe.config import ConfigError
+from jaxsafe.report.film import check_one_task, check_video, film, labels
+
+
+def main() -> int:
+    """Exit status: 2 for bad input, 1 where nothing can be rendered."""
+    return guarded(command)
+
+
+def command() -> int:
+    parser = viewing.parser_of(
+        "Film one episode of the policy of a run, or of several runs side by side in one layout.",
+        "RUN",
+        "run folders; and env=MODULE:NAME or algo=MODULE:NAME, where that is code of yours",
+    )
+    parser.add_argument(
+        "--out", type=Path, help="an .mp4 or .gif (default RUN/video.mp4; of several compared.mp4)"
+    )
+    args, what = viewing.parse(parser)
+    folders = what.folders
+    if not folders:
+        raise ConfigError(f"{what.options[0]}: expected a run folder too")
+    several = len(folders) > 1
+    out = args.out or (Path("compared.mp4") if several else folders[0] / "video.mp4")
+    check_video(out)
+    actors = what.actors(args.index)
+    check_one_task(folders, actors)
+    names = labels(folders, [actor.settings.algo_name for actor in actors]) if several else None
+    film(actors, out, args.seed, names)
+    print(out)
+    return 0

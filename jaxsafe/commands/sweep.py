@@ -1,0 +1,47 @@
+"""scripts/sweep.py: train a grid of settings, and summarise it."""
+
+import argparse
+import shlex
+import sys
+from pathlib import Path
+
+from jaxsafe.commands.guard import guarded
+from jaxsafe.report.finish import finish
+from jaxsafe.report.sweep_summary import summarise
+from jaxsafe.run import sweep
+from jaxsafe.run.arguments import fail, read_values
+from jaxsafe.run.progress import Report
+
+EPILOG = """\
+Options are those of train.py (python scripts/train.py --help), and
+
+  max_parallel=N   members (settings x seeds) trained at once; default: what the memory holds
+  run_dir=FOLDER   the sweep's folder; default: runs/sweep-<env>-<algo>-<a hash of the settings>
+
+The same command again goes on where it was stopped."""
+
+
+def main() -> int:
+    """Exit status as of train.py."""
+    return guarded(command)
+
+
+def command() -> int:
+    parser = argparse.ArgumentParser(
+        description="Train a grid: python scripts/sweep.py algo=ppo_lag algo.cost_limit=5,10,25",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.error = fail  # type: ignore[method-assign]
+    parser.add_argument("options", nargs="*", metavar="key=value[,value...]")
+    parser.add_argument("--summary", type=Path, metavar="SWEEP", help="only rewrite its summary")
+    args = parser.parse_args()
+    given = read_values(args.options)  # this imports what is the user's code
+    if args.summary:
+        print(summarise(args.summary), end="")
+        return 0
+    asked = sweep.plan(given.options, given.several)
+    again = f"python scripts/sweep.py {shlex.join(sys.argv[1:])}"
+    status = sweep.train(asked, again, Report(), sweep.After(finish, summarise))
+    print(summarise(asked.folder) + f"sweep folder: {asked.folder}")
+    return status

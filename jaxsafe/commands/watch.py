@@ -1,0 +1,56 @@
+"""scripts/watch.py: watch a policy as it acts, or drive a robot."""
+
+import contextlib
+
+from jaxsafe.commands import viewing
+from jaxsafe.commands.guard import guarded
+from jaxsafe.config import ConfigError, one_line
+from jaxsafe.envs.view import watch
+from jaxsafe.report.film import NoVideo
+from jaxsafe.run.arguments import compose
+from jaxsafe.run.settings import make_env
+
+
+def main() -> int:
+    """Exit status as of render.py; Ctrl-C is its proper end, with status 0."""
+    return guarded(command)
+
+
+def command() -> int:
+    parser = viewing.parser_of(
+        "Watch the policy of a run as it acts, or drive a robot with the arrow keys.",
+        "RUN or env=NAME",
+        "a run folder; or a task to drive, and options of it: env=car_goal1 env.vases_num=5",
+    )
+    parser.add_argument("--page", action="store_true", help="a page, though there is a display")
+    parser.add_argument("--port", type=int, default=8080, help="of the page (default 8080)")
+    parser.add_argument("--open", action="store_true", help="open the page in a browser here")
+    args, what = viewing.parse(parser)
+    if len(what.folders) > 1:
+        raise ConfigError(
+            f"{what.folders[1]}: expected one run, or env=NAME; side by side: python scripts/render.py"
+        )
+    page = args.page or args.open or not watch.has_display()
+    if page:
+        watch.check_page(args.port, args.open)
+    if what.folders:
+        (actor,) = what.actors(args.index)
+        title = f"{actor.settings.env_name}, {actor.settings.algo_name}"
+        env, player = actor.env, actor.player
+    else:
+        settings = compose(what.options)
+        if settings.env_options.get("engine") == "auto":  # one environment gains from no other
+            settings = settings._replace(env_options=settings.env_options | {"engine": "c"})
+        title, env, player = settings.env_name, make_env(settings), None
+    print(f"{title}: compiling a step ...", flush=True)
+    try:
+        with contextlib.suppress(KeyboardInterrupt):  # the page's server may have taken it
+            session = watch.Session(env, player, args.seed)  # type: ignore[arg-type]
+            if page:
+                watch.serve_page(session, title, args.port, args.open)
+            else:
+                watch.open_window(session)
+        print("closed")
+    except watch.render.NoDisplay as error:
+        raise NoVideo(one_line(error)) from error
+    return 0

@@ -1,0 +1,104 @@
+"""What evaluation says of a run: estimates over its seeds, in a table and in evaluation.json."""
+
+import math
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from jaxsafe.learn.constraints import limits_of
+from jaxsafe.report import scores, stats
+from jaxsafe.report.stats import Estimate
+from jaxsafe.run import run_folder
+from jaxsafe.run.evaluate import Episodes, measures, run_episodes
+from jaxsafe.run.policies import Opened
+from jaxsafe.run.spread import members
+
+
+class Scores(NamedTuple):
+    """What evaluation found for one setting."""
+
+    name: str  # '' where there is but one
+    limits: dict[str, float]  # of named costs, where those have their own; else of '', the cost
+    episodes: int  # of all its seeds
+    rows: dict[str, Estimate]
+    seeds: dict[str, list[float]]  # the mean over the episodes of each
+
+    def __str__(self) -> str:
+        return table(self.rows)
+
+
+def evaluate(run: Opened, num: int, seed: int) -> list[Scores]:
+    """`num` fresh episodes of each seed in each setting."""
+    settings = run.settings
+    episodes = run_episodes(run.algo, run.params, num, seed)
+    tables = list(run_folder.by_setting(run_folder.read_metrics(run.folder)).values())
+    cost_names = run.algo.task(jax.tree.map(lambda x: x[0], run.params)).cost_names
+    seeds, scores = settings.train.num_seeds, []
+    for i, member in enumerate(members(settings.configs, settings.train)[::seeds]):
+        own = Episodes(*(x[i * seeds : (i + 1) * seeds] for x in episodes))
+        limits, metrics = limits_of(member.algo), tables[i] if i < len(tables) else {}
+        found = measures(own, cost_names, limits)
+        rows = summary(settings.env_name, found, float(member.algo.cost_limit), metrics)
+        by_seed = {name: values.mean(1).tolist() for name, values in found.items()}
+        scores.append(Scores(member.setting, limits, own.ret.size, rows, by_seed))
+    return scores
+
+
+def summary(
+    env_name: str,
+    found: Mapping[str, np.ndarray],
+    cost_limit: float,
+    metrics: dict[str, np.ndarray],
+) -> dict[str, Estimate]:
+    """The rows of the table: `measures`, then the cost rate of training and normalised scores."""
+    rows = {name: estimate(values) for name, values in found.items()}
+    rate = cost_rate(metrics)
+    if rate is not None:
+        rows["cost rate (training)"] = stats.estimate(rate)
+    if env_name in scores.CHARACTERISTIC:
+
+        def scaled(score: Callable, of: Estimate, *args: float) -> Estimate:
+            return Estimate(*(float(score(env_name, x, *args)) for x in of))
+
+        rows["normalised return"] = scaled(scores.normalized_return, rows["return"])
+        rows["normalised violation"] = scaled(scores.normalized_violation, rows["cost"], cost_limit)
+        if rate is not None:
+            rows["normalised cost rate"] = scaled(
+                scores.normalized_cost_rate, rows["cost rate (training)"]
+            )
+    return rows
+
+
+def estimate(values: np.ndarray) -> Estimate:
+    """Mean of `values` [S, N] and its interval over seeds, whose means hold the spread of episodes too.
+
+    With one seed the interval covers the episodes alone, not what another seed would give.
+    """
+    return stats.estimate(values.mean(1) if len(values) > 1 else values[0])
+
+
+def cost_rate(metrics: dict[str, np.ndarray]) -> np.ndarray | None:
+    """Safety Gym's cost rate, [S]: total training cost over total training steps; None if unknown.
+
+    `metrics` are the columns of metrics.csv.
+    """
+    if "train/cost_rate" not in metrics or not len(metrics["seed"]):
+        return None
+    rates = metrics["train/cost_rate"]  # of one iteration; all have the same number of steps
+    return np.array([np.nanmean(rates[metrics["seed"] == seed]) for seed in np.unique(metrics["seed"])])
+
+
+def table(rows: dict[str, Estimate]) -> str:
+    """Aligned plain text: a row each, mean and interval. A single number has no interval."""
+
+    def line(name: str, e: Estimate) -> str:
+        interval = "" if e.low == e.high == e.mean else f"[{e.low:10.4g}, {e.high:10.4g} ]"
+        return f"{name:<22}{e.mean:>10.4g}   {interval}".rstrip()
+
+    return "\n".join([f"{'':<22}{'mean':>10}   95 % interval", *(line(n, e) for n, e in rows.items())])
+
+
+def as_json(rows: dict[str, Estimate]) -> dict[str, list[float | None]]:
+    return {name: [x if math.isfinite(x) else None for x in e] for name, e in rows.items()}

@@ -1,0 +1,65 @@
+"""Films of policies as they act."""
+
+from pathlib import Path
+
+import jax
+
+from jaxsafe.config import ConfigError, one_line
+from jaxsafe.envs.view import render
+from jaxsafe.run.policies import Actor
+
+OF_PHYSICS = ("engine", "awake")  # options that leave a task what it is
+
+
+class NoVideo(RuntimeError):
+    """Nothing to render with. The message is one line for the user."""
+
+
+def check_video(path: Path) -> None:
+    if path.suffix not in (".mp4", ".gif"):
+        raise ConfigError(f"{path}: expected a name that ends in .mp4 or .gif")
+
+
+def film(actors: list[Actor], path: Path, seed: int, labels: list[str] | None = None) -> None:
+    """Write one episode of each deterministic policy as a video, side by side in labelled panels.
+
+    Raises:
+        NoVideo: this machine has neither EGL nor OSMesa.
+    """
+    key = jax.random.fold_in(jax.random.key(seed), 0x66696C6D)
+    try:
+        films = [
+            render.render_episode(a.env, a.player, key, label=label)  # type: ignore[arg-type]
+            for a, label in zip(actors, labels or [None] * len(actors), strict=True)
+        ]
+    except render.NoDisplay as error:
+        raise NoVideo(one_line(error)) from error
+    render.write_video(render.side_by_side(films), path, fps=30)
+
+
+def check_one_task(folders: list[Path], actors: list[Actor]) -> None:
+    """Raise ConfigError where layouts would differ."""
+    tasks = [
+        {"env": a.settings.env_name}
+        | {f"env.{k}": v for k, v in a.settings.env_options.items() if k not in OF_PHYSICS}
+        for a in actors
+    ]
+    for folder, task in zip(folders, tasks, strict=True):
+        for name, value in tasks[0].items():
+            if task[name] != value:
+                raise ConfigError(
+                    f"side by side, expected runs of one task: {name}={value} in {folders[0]}, "
+                    f"{task[name]} in {folder}"
+                )
+
+
+def labels(folders: list[Path], algos: list[str]) -> list[str]:
+    """The algorithms' names; where two are the same, with the end of each folder that tells."""
+    if len({*algos}) == len(algos):
+        return algos
+    places = [folder.resolve().parts for folder in folders]
+    for n in range(1, max(map(len, places)) + 1):
+        tails = [Path(*parts[-n:]) for parts in places]
+        if len({*tails}) == len({*places}):
+            break
+    return [f"{algo}, {tail}" for algo, tail in zip(algos, tails, strict=True)]

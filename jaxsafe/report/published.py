@@ -1,0 +1,58 @@
+"""Published figures, to set beside one's own."""
+
+import csv
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+from jaxsafe.config import ConfigError, one_line
+from jaxsafe.report.group import Group
+
+PUBLISHED = ("task", "algo", "source", "return", "return_std", "cost", "cost_std", "cost_limit")
+
+
+class Published(NamedTuple):
+    """A mean with its spread, of return and of cost."""
+
+    ret: tuple[float, float]
+    cost: tuple[float, float]
+    cost_limit: float
+    source: str
+    rules: str  # `env.rules` that it holds for, or '' where all are the same
+
+    def holds_for(self, rules: str) -> bool:
+        return self.rules in ("", rules)
+
+
+def read_published(path: Path) -> dict[tuple[str, str], Published]:
+    """Published figures by task and algorithm, from a CSV with the columns of `PUBLISHED`, and `rules`
+    where a task has others in `env.rules=safety_gym` and `safety_gymnasium`."""
+    try:
+        with path.open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        missing = [name for name in PUBLISHED if not rows or name not in rows[0]]
+        if missing:
+            raise ConfigError(f"{path} has no column {missing[0]}; expected {', '.join(PUBLISHED)}")
+        found = {}
+        for row in rows:
+            ret, ret_std, cost, cost_std, limit = (float(row[name]) for name in PUBLISHED[3:])
+            figures = Published(
+                (ret, ret_std), (cost, cost_std), limit, row["source"], row.get("rules") or ""
+            )
+            found[row["task"], row["algo"]] = figures
+    except ConfigError:
+        raise
+    except (OSError, ValueError, TypeError) as error:
+        raise ConfigError(f"{path} cannot be read: {one_line(error)}") from error
+    return found
+
+
+def beside(g: Group, published: Mapping[tuple[str, str], Published]) -> Published | None:
+    """What was published for this task, its rules, algorithm and limit."""
+    found = published.get((g.env, g.algo or ""))
+    if found is None or found.cost_limit != g.cost_limit:
+        return None
+    rules = (
+        run.config.get("env.rules", "safety_gym") for run in g.runs
+    )  # none before they were an option
+    return found if all(map(found.holds_for, rules)) else None

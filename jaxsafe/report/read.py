@@ -1,0 +1,156 @@
+"""Runs read from their folders, for comparison."""
+
+import functools
+import json
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import jaxsafe
+from jaxsafe.config import ConfigError, flat
+from jaxsafe.learn.constraints import limits_of, written
+from jaxsafe.report import scores
+from jaxsafe.report.evaluation import cost_rate
+from jaxsafe.run import run_folder
+from jaxsafe.run.settings import NOT_COMPARED, REGISTERED, Entries, settle
+from jaxsafe.run.spread import members
+
+# Fields that do not make another setting.
+NOT_A_SETTING = {"seed", "num_seeds", "num_envs", "devices", *NOT_COMPARED} - {"total_steps"}
+
+NEEDED = ("iteration", "steps", "seed", "train/return", "train/cost")  # columns
+
+
+class Run(NamedTuple):
+    """One setting of a run folder, over the seeds that were trained in it."""
+
+    folder: Path
+    env: str
+    config: dict[str, Any]  # {'env.name': ..., 'algo.clip': ...}, and the folder as 'run_dir'
+    limits: dict[str, float]  # by the name of a cost; '' is their sum
+    table: dict[str, np.ndarray]  # the columns of metrics.csv
+    seeds: np.ndarray  # [S]
+    values: dict[str, np.ndarray]  # [S] by name; NaN for a seed without complete episodes
+
+    @property
+    def setting(self) -> dict[str, Any]:
+        return {k: v for k, v in self.config.items() if k not in NOT_A_SETTING}
+
+    @property
+    def steps(self) -> int:
+        return int(self.table["steps"].max())
+
+
+def read(paths: Iterable[Path]) -> list[Run]:
+    """Every setting that has begun, of run folders, sweeps, and folders that hold them.
+
+    Raises:
+        ConfigError: no run; one that this version cannot read; or the same run twice.
+    """
+    folders = {folder.resolve(): folder for path in paths for folder in find(path)}
+    runs = [run for folder in folders.values() for run in read_one(folder)]
+    if not runs:
+        raise ConfigError(f"no run has begun in {', '.join(map(str, folders.values()))}")
+    owners: dict[tuple, Path] = {}
+    for run in runs:
+        for seed in run.seeds:
+            key = (json.dumps(run.setting, sort_keys=True), seed)
+            if (other := owners.setdefault(key, run.folder)) != run.folder:
+                raise ConfigError(
+                    f"{other} and {run.folder} are the same run of seed {seed:g}; give one"
+                )
+    return runs
+
+
+def find(path: Path) -> list[Path]:
+    """The run folders at or under `path`."""
+    path = path.expanduser()
+    if not path.is_dir():
+        raise ConfigError(f"{path} is not a folder")
+    found = []
+    for folder, inside, files in os.walk(path):
+        inside.sort()
+        if "config.yaml" in files:
+            found.append(Path(folder))
+            inside.clear()
+        inside[:] = [name for name in inside if not name.startswith(".")]
+    if not found:
+        raise ConfigError(f"{path} holds no run: neither it nor a folder in it has a config.yaml")
+    return found
+
+
+def read_one(folder: Path, entries: Entries = REGISTERED) -> list[Run]:
+    """The settings of a run folder; none if it has no iteration yet."""
+    plain = run_folder.read_config(folder)
+    try:
+        saved = settle(plain, entries)
+    except ConfigError as error:
+        by = run_folder.trained_by(folder)
+        raise ConfigError(
+            f"{folder}, trained by jaxsafe {by}, does not fit jaxsafe {jaxsafe.__version__}: {error}"
+        ) from error
+    metrics = run_folder.read_metrics(folder)
+    if not len(metrics.get("iteration", ())):
+        return []
+    for name in NEEDED:
+        if name not in metrics:
+            raise ConfigError(f"{run_folder.metrics_file(folder)} has no column {name}")
+    runs = []
+    parts = run_folder.by_setting(metrics).values()
+    names = [m.setting for m in members(saved.configs, saved.train)[:: saved.train.num_seeds]]
+    for cfg, name, table in zip(saved.configs, names, parts, strict=False):
+        limits = limits_of(cfg)
+        fields = flat(saved._replace(configs=(cfg,)).plain()) | {"run_dir": str(folder)}
+        values, seeds = measured(saved.env_name, table, limits), np.unique(table["seed"])
+        for what, final in run_folder.read_evaluation(folder, name).items():
+            if len(final) != len(seeds):
+                raise ConfigError(
+                    f"{folder}: evaluation.json is of {len(final)} seeds, metrics.csv of {len(seeds)}"
+                )
+            values[f"final {what}"] = final
+        runs.append(Run(folder, saved.env_name, fields, limits, table, seeds, values))
+    return runs
+
+
+def measured(
+    env: str, table: Mapping[str, np.ndarray], limits: Mapping[str, float]
+) -> dict[str, np.ndarray]:
+    """What is known of each seed, [S], from the columns of metrics.csv.
+
+    Args:
+        env: the task, for its characteristic scores.
+        table: the columns.
+        limits: by the name of a cost; '' is their sum.
+    """
+    columns = dict(table)
+    over = [table[f"train/cost_{k}" if k else "train/cost"] - limit for k, limit in limits.items()]
+    worst = np.max(over, axis=0)
+    columns["over"] = np.where(np.isnan(worst), np.nan, worst > 0)
+    late = functools.partial(run_folder.last_tenth, columns)
+    values = {
+        "return": late("train/return"),
+        "cost": late("train/cost"),
+        "violation rate": late("over"),
+    }
+    if (rate := cost_rate(columns)) is not None:
+        values["cost rate"] = rate
+    for name in cost_names(table):
+        values[written(name)] = late(f"train/cost_{name}")
+    if env in scores.CHARACTERISTIC:
+        values["normalised return"] = scores.normalized_return(env, values["return"])
+        if "" in limits:
+            excess = scores.normalized_violation(env, values["cost"], limits[""])
+            values["normalised violation"] = excess
+        if rate is not None:
+            values["normalised cost rate"] = scores.normalized_cost_rate(env, rate)
+    return values
+
+
+def cost_names(columns: Iterable[str]) -> list[str]:
+    """The costs that an environment tells apart, by the columns of metrics.csv."""
+    own = ("train/cost_estimate", "train/cost_rate")  # of the sum, or of each under its own limit
+    found = [name for name in columns if name.startswith("train/cost_") and not name.startswith(own)]
+    return [name.removeprefix("train/cost_") for name in found]

@@ -1,0 +1,217 @@
+"""The tables of a comparison.
+
+Figures of a seed are those of the last 10 % of its training, but for the cost rate, which is of all of
+it. Tasks stand apart; across them only normalised scores, and comparisons within a task, are averaged.
+"""
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from jaxsafe.learn.constraints import in_words
+from jaxsafe.report import scores, stats, tables
+from jaxsafe.report.group import Group, Suite, differing, suite, tasks_of
+from jaxsafe.report.published import Published, beside
+from jaxsafe.report.stats import Estimate
+from jaxsafe.report.tables import Table
+
+FINAL = (
+    "final return", "final cost", "final violation rate", "final discounted return",
+    "final discounted cost",
+)  # fmt: skip
+
+SCORES = ("normalised return", "normalised violation", "normalised cost rate")
+
+
+def results(
+    groups: Sequence[Group], metric: str, published: Mapping[tuple[str, str], Published]
+) -> Table:
+    """Return or cost: a row a setting, with what was published below it, and a column a task."""
+    envs = tasks_of(groups)
+    at = {(g.name, g.env): g for g in groups}
+    limits = {in_words(g.limits) for g in groups}
+    safe = [g for g in groups if g.held == "yes" and not np.isnan(g.ret.mean) and len(limits) == 1]
+    best = {env: max((g.ret.mean for g in safe if g.env == env), default=None) for env in envs}
+    rows = []
+    for name in dict.fromkeys(g.name for g in groups):
+        ours, theirs, source = [f"`{name}`"], [], ""
+        for env in envs:
+            g = at.get((name, env))
+            e = g.estimate(metric) if g else Estimate(np.nan, np.nan, np.nan)
+            text, beyond, known = tables.cell(e, ".2f"), "", None
+            if g and metric == "return" and g in safe and e.mean == best[env]:
+                text = f"**{text}**"
+            if g and (known := beside(g, published)):
+                mean, spread = known.ret if metric == "return" else known.cost
+                beyond = " ↑" * (e.mean > mean + spread) + " ↓" * (e.mean < mean - spread)
+                theirs.append(f"{mean:.2f} ± {spread:.2f}")
+                source = known.source
+            else:
+                theirs.append("-")
+            ours.append(text + beyond)
+        rows.append(ours)
+        if source:
+            rows.append([source, *theirs])
+    what = "Return" if metric == "return" else "Cost"
+    caption = f"{what} of an episode, last 10% of training: mean and 95% interval over seeds."
+    if len(limits) == 1 and (words := next(iter(limits))) != "-":
+        caption += f" Cost limit {words}."
+    if metric == "return" and safe:
+        caption += " Bold: the highest return of a task whose mean cost is within the limit."
+    if published:
+        caption += " ↑ ↓: the mean lies above or below the published spread."
+    return Table(caption, ["", *envs], rows)
+
+
+def details(groups: Sequence[Group]) -> list[Table]:
+    """What else is known of each setting on each task."""
+    groups = sorted(groups, key=lambda g: g.env)
+    known = [m for m in ("violation rate", "cost rate") if any(known_of(g, m) for g in groups)]
+    header = ["task", "setting", "seeds", "steps", "return, IQM", "cost, IQM", "limit", "held", *known]
+    rows = [
+        [
+            f"`{g.env}`", f"`{g.name}`", str(len(g.costs)), f"{g.steps:,}",
+            *(tables.cell(g.estimate(m, stats.iqm)) for m in ("return", "cost")),
+            in_words(g.limits), g.held,
+            *(tables.cell(g.estimate(m), ".3g") for m in known),
+        ]
+        for g in groups
+    ]  # fmt: skip
+    caption = (
+        "Each task. IQM: interquartile mean over seeds. Held: whether the mean cost is within the "
+        "limit; unclear where it is not but its interval is. Violation rate: the share of iterations, "
+        "in the last 10%, whose mean cost of an episode is over the limit. Cost rate: total cost over "
+        "total steps of training."
+    )
+    out = [Table(caption, header, rows, left=2)]
+    scored = [g for g in groups if known_of(g, SCORES[0])]
+    if scored:
+        rows = [
+            [f"`{g.env}`", f"`{g.name}`", *(tables.cell(g.estimate(m), ".3g") for m in SCORES)]
+            for g in scored
+        ]
+        caption = "Safety Gym's normalised scores: 1 is unconstrained PPO, a violation of 0 the limit."
+        out.append(Table(caption, ["task", "setting", *(m.split(" ", 1)[1] for m in SCORES)], rows, 2))
+    every = dict.fromkeys(m for g in groups for run in g.runs for m in run.values)
+    costs = [m for m in every if m.startswith("cost ") and m != "cost rate"]
+    if len(costs) > 1:
+        rows = [
+            [f"`{g.env}`", f"`{g.name}`", *(tables.cell(g.estimate(m)) for m in costs)] for g in groups
+        ]
+        caption = "Each cost of an episode, last 10% of training."
+        out.append(Table(caption, ["task", "setting", *(m.split(" ", 1)[1] for m in costs)], rows, 2))
+    evaluated = [g for g in groups if known_of(g, "final return")]
+    if evaluated:
+        header = ["task", "setting", *(m.removeprefix("final ") for m in FINAL)]
+        rows = [
+            [f"`{g.env}`", f"`{g.name}`", *(tables.cell(g.estimate(m)) for m in FINAL)]
+            for g in evaluated
+        ]
+        caption = (
+            "The final policy: the mean action, over fresh episodes of each seed. Violation rate: the "
+            "share of episodes whose cost is over the limit. Discounted: by the learner's factors."
+        )
+        out.append(Table(caption, header, rows, 2))
+    return out
+
+
+def known_of(g: Group, metric: str) -> bool:
+    return any(metric in run.values for run in g.runs)
+
+
+def aggregates(s: Suite) -> dict[tuple[str, str, str], Estimate]:
+    """Mean and IQM of each score over tasks and seeds, by setting, score and statistic."""
+    return {
+        (name, metric, kind): stats.estimate(*s.samples(name, metric), statistic=statistic)
+        for name in s.groups
+        for metric in SCORES
+        for kind, statistic in (("mean", stats.mean), ("IQM", stats.iqm))
+    }
+
+
+def improvements(s: Suite) -> dict[tuple[str, str, str], Estimate]:
+    """P(a seed of one setting beats one of another), in return (higher) and in cost (lower)."""
+    names, found = list(s.groups), {}
+    for i, a in enumerate(names):
+        for b in names[i + 1 :]:
+            more = [s.samples(name, "return") for name in (a, b)]
+            less = [s.samples(name, "cost") for name in (b, a)]
+            found[a, b, "return"] = stats.probability_of_improvement(more[0], more[1])
+            found[a, b, "cost"] = stats.probability_of_improvement(less[0], less[1])
+    return found
+
+
+def across(s: Suite, found: Mapping, pairs: Mapping) -> list[Table]:
+    out = []
+    of = f"{len(s.tasks)} tasks ({', '.join(s.tasks)})" if len(s.tasks) > 1 else s.tasks[0]
+    if found:
+        header = [
+            "setting",
+            *(f"{m.split(' ', 1)[1]}, {kind}" for m in SCORES for kind in ("mean", "IQM")),
+        ]
+        rows = [
+            [
+                f"`{n}`",
+                *(tables.cell(found[n, m, kind], ".3g") for m in SCORES for kind in ("mean", "IQM")),
+            ]
+            for n in s.groups
+        ]
+        caption = f"Normalised scores over {of}: mean and interquartile mean, stratified 95% intervals."
+        out.append(Table(caption, header, rows))
+    if pairs:
+        rows = [
+            [f"`{a}`", f"`{b}`", *(tables.cell(pairs[a, b, m], ".2f") for m in ("return", "cost"))]
+            for a, b, metric in pairs
+            if metric == "return"
+        ]
+        caption = (
+            f"Probability of improvement over {of}: that a seed of X has the higher return, or the "
+            "lower cost, than one of Y."
+        )
+        out.append(Table(caption, ["X", "Y", "higher return", "lower cost"], rows, 2))
+    return out
+
+
+def notes(groups: Sequence[Group]) -> list[str]:
+    """What a reader of the figures should know."""
+    lines = []
+    for name, values in differing(groups).items():
+        lines.append(f"averaged over {name} ({', '.join(map(str, values))})")
+    for run in (run for g in groups for run in g.runs):
+        if run.steps < run.config["total_steps"]:
+            total = run.config["total_steps"]
+            lines.append(f"unfinished: {run.folder}, at {run.steps:,} of {total:,} steps")
+    envs = tasks_of(groups)
+    if left := [env for env in envs if env not in suite(groups).tasks]:
+        lines.append(f"not in comparisons across tasks, as a setting lacks them: {', '.join(left)}")
+    if unscored := [env for env in envs if env not in scores.CHARACTERISTIC]:
+        lines.append(
+            f"without normalised scores, as there are no published ones: {', '.join(unscored)}"
+        )
+    return list(dict.fromkeys(lines))
+
+
+def as_csv(groups: Sequence[Group], s: Suite, found: Mapping, pairs: Mapping) -> str:
+    """Every estimate, a row each."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    by = list(groups[0].by)
+    writer.writerow(["task", *by, "seeds", "metric", "statistic", "value", "low", "high"])
+    kinds = (("mean", stats.mean), ("IQM", stats.iqm))
+    for g in groups:
+        for metric in dict.fromkeys(m for run in g.runs for m in run.values):
+            for kind, statistic in kinds:
+                e = g.estimate(metric, statistic)
+                writer.writerow([g.env, *g.by.values(), len(g.costs), metric, kind, *e])
+    tasks = " ".join(s.tasks)
+    for (name, metric, kind), e in found.items():
+        values = s.groups[name][0].by.values()
+        seeds = sum(len(g.costs) for g in s.groups[name])
+        writer.writerow([tasks, *values, seeds, metric, kind, *e])
+    for (a, b, metric), e in pairs.items():
+        values = s.groups[a][0].by.values()
+        seeds = sum(len(g.costs) for g in s.groups[a])
+        writer.writerow([tasks, *values, seeds, metric, f"P(better than {b})", *e])
+    return out.getvalue()

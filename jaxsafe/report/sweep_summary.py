@@ -1,0 +1,72 @@
+"""The summary of a sweep: a row a setting, as text, as CSV and as a figure."""
+
+import csv
+import io
+import math
+from pathlib import Path
+
+from jaxsafe.learn.constraints import in_words, written
+from jaxsafe.report import plots, tables
+from jaxsafe.report.group import Group, group
+from jaxsafe.report.read import read_one
+from jaxsafe.report.tables import Table
+from jaxsafe.run import run_folder
+from jaxsafe.run.settings import REGISTERED, Entries
+from jaxsafe.run.sweep import read_folder
+
+
+def rows_of(folder: Path, entries: Entries = REGISTERED) -> list[Group]:
+    """A row for each setting that has begun."""
+    swept = read_folder(folder)["swept"]
+    paths = sorted(folder.glob("*/config.yaml"))
+    runs = [run for path in paths for run in read_one(path.parent, entries)]
+    return group(runs, swept) if runs else []
+
+
+def summarise(folder: Path, entries: Entries = REGISTERED) -> str:
+    """Write summary.md, .csv and .png of a sweep; returns the table."""
+    rows = rows_of(folder, entries)
+    text = markdown(rows)
+    run_folder.replace_text(folder / "summary.md", text)
+    run_folder.replace_text(folder / "summary.csv", as_csv(rows))
+    title = "last 10 % of training, mean and 95 % interval"
+    plots.save(plots.trade_off(rows, title), folder / "summary", ["png"])
+    return text
+
+
+def columns(rows: list[Group]) -> list[str]:
+    return [name.removesuffix(".name") for name in rows[0].by] if rows else []
+
+
+def limited(rows: list[Group]) -> list[str]:
+    """The cost, as '', and those that have limits of their own."""
+    return sorted({"", *(name for r in rows for name in r.limits)})
+
+
+def markdown(rows: list[Group]) -> str:
+    costs = limited(rows)
+    header = [*columns(rows), "seeds", "steps", "return", *map(written, costs), "limit", "limit held"]
+    lines = [
+        [
+            *(tables.number(v) if isinstance(v, float) else str(v) for v in r.by.values()),
+            str(len(r.costs)), f"{r.steps:,}", tables.cell(r.ret),
+            *(tables.cell(r.estimate(written(name))) for name in costs), in_words(r.limits), r.held,
+        ]
+        for r in rows
+    ]  # fmt: skip
+    return tables.markdown(Table("", header, lines))
+
+
+def as_csv(rows: list[Group]) -> str:
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    costs = limited(rows)
+    measured = ["return", *map(written, costs)]
+    bounds = [f"{m.replace(' ', '_')}{end}" for m in measured for end in ("", "_low", "_high")]
+    limits = [f"cost_limit_{name}" if name else "cost_limit" for name in costs]
+    writer.writerow([*columns(rows), "seeds", "steps", *bounds, *limits, "held"])
+    for r in rows:
+        head = [*r.by.values(), len(r.costs), r.steps]
+        found = [x for m in measured for x in r.estimate(m)]
+        writer.writerow([*head, *found, *(r.limits.get(name, math.nan) for name in costs), r.held])
+    return out.getvalue()

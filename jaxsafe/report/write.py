@@ -1,0 +1,52 @@
+"""Every table and figure of a comparison, as files."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from jaxsafe.report import plots, tables
+from jaxsafe.report.group import Group, suite
+from jaxsafe.report.published import Published, beside
+from jaxsafe.report.results import (
+    SCORES,
+    across,
+    aggregates,
+    as_csv,
+    details,
+    improvements,
+    known_of,
+    notes,
+    results,
+)
+from jaxsafe.run import run_folder
+
+
+def write(
+    groups: Sequence[Group], out: Path, published: Mapping[tuple[str, str], Published] | None = None
+) -> str:
+    """Write every table and figure into `out`; returns the tables of return and of cost as text."""
+    published = published or {}
+    both = suite(groups)
+    scored = suite([g for g in groups if g.env in both.tasks and known_of(g, SCORES[0])])
+    found = aggregates(scored) if scored.tasks else {}
+    pairs = improvements(both) if both.tasks else {}
+    main = [results(groups, metric, published) for metric in ("return", "cost")]
+    rest = [*details(groups), *(across(scored, found, {}) if len(scored.tasks) > 1 else [])]
+    rest += across(both, {}, pairs) if pairs else []
+    remarks = notes(groups)
+    parts = [f"{t.caption}\n\n{tables.markdown(t)}" for t in (*main, *rest)]
+    text = "\n".join([*parts, *([f"Notes: {'; '.join(remarks)}.\n"] if remarks else [])])
+    out.mkdir(parents=True, exist_ok=True)
+    run_folder.replace_text(out / "results.md", text)
+    latex = [f"% {line}\n" for line in remarks] + [tables.latex(t) for t in (*main, *rest)]
+    run_folder.replace_text(out / "results.tex", "\n".join(latex))
+    run_folder.replace_text(out / "results.csv", as_csv(groups, both, found, pairs))
+    plots.save(plots.learning(groups), out / "curves")
+    known = {(g.env, g.name): beside(g, published) for g in groups}
+    plots.save(plots.trade_off(groups, "last 10 % of training", known), out / "trade_off")
+    for name in ("scores", "profiles"):
+        for suffix in plots.FORMATS:
+            (out / f"{name}.{suffix}").unlink(missing_ok=True)
+    if found:
+        plots.save(plots.normalised(list(scored.groups), SCORES, found), out / "scores")
+        plots.save(plots.profiles(scored), out / "profiles")
+    return "\n".join([*parts[:2], *(f"{line}\n" for line in remarks)])

@@ -1,0 +1,106 @@
+"""Where the metrics of training go: metrics.csv, TensorBoard and the progress report."""
+
+import time
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from jaxsafe.run import run_folder
+from jaxsafe.run.progress import Report
+from jaxsafe.run.spread import Member
+
+OVERFLOW = "train/overflow"  # steps of an episode in which engine warp ran out of room
+
+
+class Log:
+    """Metrics to metrics.csv, TensorBoard and the progress report, the files by a thread.
+
+    What goes wrong in the thread is raised by the next call.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        names: list[str],
+        members: list[Member],
+        iteration: int,
+        per_update: int,
+        report: Report,
+    ):
+        self.seeds, self.per_update, self.warned = [m.seed for m in members], per_update, False
+        self.report = report
+        self.swept = {name: np.array([m.swept[name] for m in members]) for name in members[0].swept}
+        self.csv = run_folder.Metrics(folder, [*self.swept, *names], iteration)
+        self.begun = time.perf_counter() - self.csv.seconds
+        self.boards = [
+            run_folder.Board(
+                folder / "tensorboard" / m.setting.replace(", ", "-") / f"seed{m.seed}",
+                iteration * per_update,
+            )
+            for m in members
+        ]
+        self.thread = ThreadPoolExecutor(1)
+        self.writing: Future[tuple[int, dict[str, np.ndarray]]] | None = None
+
+    def __enter__(self) -> "Log":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.thread.shutdown()
+        self.csv.close()
+        for board in self.boards:
+            board.close()
+
+    def append(self, iteration: int, metrics: dict[str, jax.Array]) -> None:
+        """Begin to write the metrics of an iteration, once those of the last one are written."""
+        self._finish()
+        self.writing = self.thread.submit(self._write, iteration, metrics)
+
+    def sync(self) -> None:
+        """Put all that was appended on the disk."""
+        self._finish()
+        self.csv.sync()
+        for board in self.boards:
+            board.flush()
+
+    def _write(
+        self, iteration: int, metrics: dict[str, jax.Array]
+    ) -> tuple[int, dict[str, np.ndarray]]:
+        values = {k: np.asarray(v, np.float32) for k, v in jax.device_get(metrics).items()}
+        steps, seconds = iteration * self.per_update, time.perf_counter() - self.begun
+        self.csv.append(iteration, steps, self.seeds, seconds, values | self.swept)
+        for s, board in enumerate(self.boards):
+            board.append(steps, {name: float(value[s]) for name, value in values.items()})
+        return steps, values
+
+    def _finish(self) -> None:
+        if not self.writing:
+            return
+        writing, self.writing = self.writing, None
+        steps, values = writing.result()
+        if not self.warned and (values.get(OVERFLOW, np.zeros(())) > 0).any():  # NaN: nothing ended
+            self.warned = True
+            self.report.line(
+                f"warning: contacts found no room in some steps ({OVERFLOW} in metrics.csv); "
+                "raise env.contact_room"
+            )
+        self.report.update(
+            steps,
+            len(self.seeds),
+            **{
+                short: mean(values[name]) if name in values else float("nan")
+                for short, name in (
+                    ("ret", "train/return_estimate"),
+                    ("cost", "train/cost_estimate"),
+                    ("lam", "train/lam"),
+                )
+            },
+        )
+
+
+def mean(values: np.ndarray) -> float:
+    """Over the seeds that have a value."""
+    finite = values[np.isfinite(values)]
+    return float(finite.mean()) if len(finite) else float("nan")

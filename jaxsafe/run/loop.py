@@ -1,0 +1,130 @@
+"""The training loop: compile once, call `update`, log, checkpoint, stop when asked.
+
+The loop stays one update ahead of what is logged, in a thread, so the device does not wait for files.
+"""
+
+import contextlib
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from jaxsafe.learn.constraints import own_limits
+from jaxsafe.run import checkpoint, distributed, spread
+from jaxsafe.run.interrupts import Interrupts
+from jaxsafe.run.log import Log
+from jaxsafe.run.progress import Report
+from jaxsafe.run.settings import TrainConfig
+from jaxsafe.run.spread import Program
+from jaxsafe.types import PyTree, Shared
+
+
+class Outcome(NamedTuple):
+    ts: PyTree
+    iteration: int
+    steps: int
+    interrupted: bool
+
+
+def train(
+    program: Program,
+    settings: TrainConfig,
+    folder: Path,
+    report: Report,
+    resume_command: str,
+    adapt: Callable[[PyTree], PyTree] | None = None,
+) -> Outcome:
+    """Train to `settings.total_steps`, from the newest checkpoint in `folder` if there is one.
+
+    Args:
+        program: from `build`.
+        settings: those it was built with.
+        folder: the run folder; gets metrics.csv, tensorboard/ and checkpoints/.
+        report: where progress goes.
+        resume_command: printed when the run is stopped early.
+        adapt: changes a fresh train state (start from another policy); not used on resumption.
+    Returns:
+        The train state, with its leading axis, and how far it is.
+    Raises:
+        checkpoint.CheckpointError, OSError: the disk failed; the last good checkpoint stays.
+    """
+    per_update = program.clocks.steps
+    iterations = -(-settings.total_steps // per_update)
+    store = folder / "checkpoints"
+    resuming = bool(distributed.first(np.array(bool(checkpoint.checkpoints(store)))))
+    with report, Interrupts(report.line, report.hosted) as stop:
+        stop.nothing_to_save = (
+            f"stopped before the first update; {resume_command if resuming else 'nothing to save'}"
+        )
+        begun = time.perf_counter()
+        iteration = 0
+        if resuming:
+            like = jax.eval_shape(program.init, program.start, Shared(np.int32(0)))
+            ts, iteration = restored(store, like, report)
+            ts = distributed.place(ts, program.sharding)
+            report.line(f"resuming at {iteration * per_update:,} steps")
+        else:
+            start = distributed.place(program.start, program.sharding)
+            ts = jax.jit(program.init)(start, Shared(np.int32(0)))
+            ts = distributed.place(adapt(ts), program.sharding) if adapt else ts
+        if iteration >= iterations:
+            report.line("nothing left to train")
+            return Outcome(ts, iteration, iteration * per_update, False)
+        names = sorted(jax.eval_shape(program.update, ts, Shared(np.int32(0)))[1])
+        update = spread.compiled(program, ts)
+        report.line(f"compiled in {time.perf_counter() - begun:.1f} s")
+        stop.nothing_to_save = ""
+
+        vote = distributed.Vote(program.sharding)
+        with (
+            Log(folder, names, program.members, iteration, per_update, report)
+            if distributed.leads()
+            else contextlib.nullcontext()
+        ) as log:
+            limits = [m.algo.cost_limit for m in program.members if not own_limits(m.algo)]
+            report.start(iterations * per_update, iteration * per_update, limits)
+            saved_at = time.perf_counter()
+            while iteration < iterations:
+                ts, metrics = update(ts, Shared(np.int32(iteration)))
+                metrics, iteration = distributed.whole(metrics), iteration + 1
+                if log:
+                    log.append(iteration, metrics)
+                by_count = (
+                    settings.checkpoint_iterations and iteration % settings.checkpoint_iterations == 0
+                )
+                late = time.perf_counter() - saved_at >= settings.checkpoint_every
+                stopping, by_time = vote(stop.requested, late)
+                if stopping or by_count or by_time or iteration == iterations:
+                    state = distributed.whole(ts)
+                    if log:
+                        log.sync()
+                        checkpoint.save(store, state, iteration, iteration * per_update)
+                        acting = jax.tree.map(
+                            lambda x: x[: len(program.members)], program.params(state)
+                        )
+                        checkpoint.save(folder / "policy", acting, iteration, iteration * per_update)
+                    saved_at = time.perf_counter()
+                if stopping:
+                    break
+        report.stop()
+        interrupted = iteration < iterations
+        if interrupted:
+            report.line(f"stopped at {iteration * per_update:,} steps; continue with: {resume_command}")
+    return Outcome(ts, iteration, iteration * per_update, interrupted)
+
+
+def restored(store: Path, like: PyTree, report: Report) -> tuple[PyTree, int]:
+    """The train state of the newest sound checkpoint that process 0 finds, and its iteration."""
+    if jax.process_count() == 1:
+        ts, manifest = checkpoint.restore(store, like, report.line)
+        return ts, manifest.iteration
+    arrays = {name: np.zeros(x.shape, x.dtype) for name, x in checkpoint.as_data(like).items()}
+    iteration = 0
+    if distributed.leads():
+        ts, manifest = checkpoint.restore(store, like, report.line)
+        arrays, iteration = checkpoint.to_arrays(ts), manifest.iteration
+    arrays, known = distributed.first((arrays, np.array(iteration)))
+    return checkpoint.from_arrays(like, arrays), int(known)

@@ -1,0 +1,79 @@
+"""Whether a run fits the memory: lower bounds before anything compiles, and then the program itself."""
+
+import contextlib
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxsafe.config import ConfigError
+from jaxsafe.run import checkpoint, spread
+from jaxsafe.run.settings import TrainConfig
+from jaxsafe.run.spread import Program
+from jaxsafe.types import Env, Shared
+
+ROOM = 0.8  # of the memory that a program may take by `capacity`
+
+
+class TooLarge(ConfigError):
+    """What was asked cannot fit the memory."""
+
+
+def check_memory(env: Env, algo_config: Any, num_members: int, devices: int) -> None:
+    """Refuse, before anything compiles, a trajectory that cannot fit the device.
+
+    A lower bound: observations before and after each step, actions and a few scalars.
+    """
+    limit, what = device_memory()
+    step = 4 * (2 * env.obs_size + env.action_size + 8 + len(env.cost_names))  # bytes
+    need = step * algo_config.num_envs * algo_config.horizon * num_members // devices
+    if need > limit:
+        raise TooLarge(
+            f"num_envs={algo_config.num_envs} x horizon={algo_config.horizon} x "
+            f"{num_members} seeds needs at least {need / 2**30:,.1f} GiB a device, "
+            f"{what} has {limit / 2**30:,.1f}; use fewer num_envs"
+        )
+
+
+def check_state_memory(program: Program, settings: TrainConfig) -> None:
+    """Like `check_memory`, for the train state itself (old and new), known once it is traced."""
+    limit, what = device_memory()
+    leaves = jax.tree.leaves(jax.eval_shape(program.init, program.start, Shared(np.int32(0))))
+    need = (
+        2
+        * sum(x.size * (8 if checkpoint.is_key(x) else x.dtype.itemsize) for x in leaves)
+        // settings.devices
+    )
+    if need > limit:
+        raise TooLarge(
+            f"the train state needs {need / 2**30:,.1f} GiB a device, {what} has {limit / 2**30:,.1f}; "
+            "use fewer num_envs or num_seeds"
+        )
+
+
+def capacity(program: Program) -> int:
+    """How many of its members fit the memory at once, by the compiled update's own account."""
+    like = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=program.sharding),
+        jax.eval_shape(program.init, program.start, Shared(np.int32(0))),
+    )
+    used: Any = spread.compiled(program, like).memory_analysis()
+    need = used.temp_size_in_bytes + used.argument_size_in_bytes + used.output_size_in_bytes
+    share = ROOM * device_memory()[0] / (need - used.alias_size_in_bytes)  # of the members
+    return max(1, int(min(1.0, share) * len(program.members)))
+
+
+def device_memory() -> tuple[float, str]:
+    """Bytes that the first device can hold, and what to call them; infinite where unknown."""
+    stats = jax.local_devices()[0].memory_stats() if jax.default_backend() != "cpu" else None
+    if stats and "bytes_limit" in stats:
+        return float(stats["bytes_limit"]), "the device"
+    limits = [float("inf")]
+    with contextlib.suppress(OSError, ValueError):
+        rows = dict(line.split(":", 1) for line in Path("/proc/meminfo").read_text().splitlines())
+        limits.append(float(rows["MemAvailable"].split()[0]) * 1024)
+    for path in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
+        with contextlib.suppress(OSError, ValueError):
+            limits.append(float(Path(path).read_text()))
+    return min(limits), "this machine"

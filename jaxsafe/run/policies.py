@@ -1,0 +1,229 @@
+"""The policies of a run folder: to act with, and to start another run from.
+
+A policy is what acts: networks, normaliser, config. It has a file of its own beside the checkpoints.
+Nothing in the folder is executed.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsafe.config import ConfigError, flat
+from jaxsafe.learn.acting import Player
+from jaxsafe.run import checkpoint, run_folder
+from jaxsafe.run.settings import DEFAULT, REGISTERED, Entries, Settings, load, make_env, settle
+from jaxsafe.run.spread import Program, members
+from jaxsafe.types import Algorithm, Env, PyTree, Shared
+
+POLICY = ("params", "normaliser")  # the parts of what acts that another run can start from
+
+
+class Opened(NamedTuple):
+    """The policies of a run folder, ready to act. `params` is what acts, with a leading axis over them:
+    every seed of the first setting, then of the next."""
+
+    folder: Path
+    settings: Settings
+    env: Env
+    algo: Algorithm
+    params: PyTree
+
+    def actor(self, index: int) -> "Actor":
+        """One of the policies.
+
+        Raises:
+            ConfigError: the run has fewer.
+        """
+        count = len(self.settings.configs) * self.settings.train.num_seeds
+        if not 0 <= index < count:
+            raise ConfigError(f"index {index}: the run has {count} policies, from 0, in {self.folder}")
+        params = jax.tree.map(lambda x: x[index], self.params)
+        return Actor(self.settings, self.env, self.algo, params)
+
+
+def open_run(folder: Path, code: Sequence[str] = (), entries: Entries = REGISTERED) -> Opened:
+    """The newest policies of a run folder. Executes nothing from it.
+
+    Args:
+        folder: the run folder.
+        code: 'env=module:name' and 'algo=module:name', where the run was trained with the user's code.
+            They are imported.
+        entries: the caller's environment and algorithm, where the run was trained with objects.
+    Raises:
+        ConfigError: no run folder, one without a checkpoint, or one of another environment.
+    """
+    saved = run_folder.read_config(folder)
+    for text in code:
+        kind, _, name = text.partition("=")
+        if kind not in DEFAULT:
+            raise ConfigError(f"{text}: expected env=MODULE:NAME or algo=MODULE:NAME")
+        if name != saved[kind]["name"]:
+            raise ConfigError(f"{text}: {folder} was trained with {kind}={saved[kind]['name']}")
+        load(kind, name)
+    settings = settle(saved, entries)
+    if not checkpoint.checkpoints(policy_folder(folder)):
+        raise ConfigError(f"{folder} holds no checkpoint")
+    env = make_env(settings)
+    return Opened(folder, settings, env, *policy_of(settings, env, folder))
+
+
+class Actor(NamedTuple):
+    """One policy of a run, ready to act. `params` is what acts of that member alone."""
+
+    settings: Settings
+    env: Env
+    algo: Algorithm
+    params: PyTree
+
+    @property
+    def player(self) -> Player:
+        return Player(self.algo.policy, self.params, self.algo.task(self.params))
+
+
+def policy_of(settings: Settings, env: Env, folder: Path) -> tuple[Algorithm, PyTree]:
+    """The algorithm, and what acts of the newest policy of each member, [S, ...]."""
+    algo = settings.row.make(env, None)
+
+    def one_step(cfg: Any) -> Any:
+        return dataclasses.replace(cfg, num_envs=1, horizon=1, minibatches=1)
+
+    def first(cfg: Any) -> PyTree:
+        return algo.params(algo.init(jax.random.key(0), cfg, Shared(np.int32(0))))
+
+    run = members(settings.configs, settings.train)
+    floats = jax.tree.map(lambda *x: np.array(x, np.float32), *[one_step(m.algo) for m in run])
+    like = jax.eval_shape(first, jax.tree.map(lambda x: x[0], floats))
+    arrays = read_policy(folder, len(run))
+    return algo, acting(like, arrays, floats, folder)
+
+
+def policy_folder(folder: Path) -> Path:
+    """Where the policies of a run lie: beside its checkpoints or, in runs before 0.2, in them."""
+    alone = folder / "policy"
+    return alone if checkpoint.checkpoints(alone) else folder / "checkpoints"
+
+
+def read_policy(
+    folder: Path,
+    rows: int,
+    warn: Callable[[str], None] | None = None,
+) -> dict[str, np.ndarray]:
+    """The newest policies of a run folder by leaf name, [rows, ...], with whatever else lies there.
+
+    Rows beyond the run's members are the copies on the other devices of a split one.
+    """
+    arrays, _ = checkpoint.load(policy_folder(folder), warn)
+    policy = {name: x[:rows] for name, x in arrays.items()}
+    if any(len(x) != rows for x in policy.values()):
+        raise ConfigError(f"{folder} holds fewer than the {rows} policies of its config.yaml")
+    return policy
+
+
+def acting(like: PyTree, policy: dict[str, np.ndarray], configs: PyTree, source: Path) -> PyTree:
+    """What acts of each of S policies, [S, ...].
+
+    Args:
+        like: of one, without that axis.
+        policy: from `read_policy`.
+        configs: the algorithm's, floats [S], from config.yaml.
+        source: the run folder, for messages.
+    Raises:
+        ConfigError: the policies are of other networks.
+    """
+    rows = len(jax.tree.leaves(configs)[0])
+    like = jax.tree.map(lambda x: jax.ShapeDtypeStruct((rows, *x.shape), x.dtype), like)
+    check_policy(like, policy, source)
+    arrays = policy | checkpoint.to_arrays({"config": configs})
+    for name in checkpoint.leaf_names(like):
+        if name not in arrays:
+            raise ConfigError(f"the policy of {source} does not fit: {name} is absent")
+    return checkpoint.from_arrays(like, arrays)
+
+
+def check_policy(like: PyTree, policy: dict[str, np.ndarray], source: Path, why: str = "") -> None:
+    """Raise ConfigError unless `policy` has the networks of `like`, whatever its rows."""
+
+    def networks(named: dict[str, Any]) -> dict[str, Any]:
+        return {k: v for k, v in named.items() if k.split(".")[0] in POLICY}
+
+    expected = dict(zip(checkpoint.leaf_names(like), jax.tree.leaves(like), strict=True))
+    expected, policy = networks(expected), networks(policy)
+    for name in sorted({*expected, *policy}):
+        have, want = (
+            str(list(x[name].shape[1:])) if name in x else "absent" for x in (policy, expected)
+        )
+        if have != want:
+            raise ConfigError(
+                f"the policy of {source} does not fit: {name} is {have}, expected {want}{why}"
+            )
+
+
+def warm_start(
+    settings: Settings, program: Program, say: Callable[[str], None]
+) -> Callable[[PyTree], PyTree]:
+    """What gives a fresh train state the parameters and normalisers of the run `init_from`.
+
+    A seed starts from the same seed there, or, where there is none, from the one it equals modulo
+    their number; of settings trained side by side there, the first counts.
+
+    Raises:
+        ConfigError: no run, or one whose networks have other shapes.
+    """
+    source = Path(settings.train.init_from or "").expanduser()
+    saved = settle(run_folder.read_config(source), settings.entries)
+    if not checkpoint.checkpoints(policy_folder(source)):
+        raise ConfigError(f"init_from={source} holds no checkpoint")
+    first, count = saved.train.seed, saved.train.num_seeds
+    policy = read_policy(source, count, say)
+    there, here = flat(saved.plain()), flat(settings.plain())
+    options = [k for k in here if k.startswith("env.") and saved.env_name == settings.env_name]
+    differ = [
+        f"{name} is {there.get(name)} there, {here[name]} here"
+        for name in (
+            "env.name",
+            "algo.hidden",
+            "algo.trunk",
+            "algo.std",
+            "algo.obs_normalize",
+            *options,
+        )
+        if there.get(name) != here[name]
+    ]
+    like = jax.eval_shape(program.init, program.start, Shared(np.int32(0)))
+    check_policy(like, policy, source, why="; ".join(["", *differ[:3]]))
+    units = [plain.get("algo.activation") for plain in (there, here)]  # no shape tells them apart
+    if units[0] != units[1]:
+        raise ConfigError(
+            f"the policy of {source} does not fit: "
+            f"algo.activation is {units[0]} there, {units[1]} here; expected the same"
+        )
+    rows = [(m.seed - first) % count for m in program.members]
+    pairs = {m.seed: first + row for m, row in zip(program.members, rows, strict=True)}
+    of = f" of its setting {members(saved.configs, saved.train)[0].setting}"
+    say(
+        f"starting from {source}: seed "
+        + ", ".join(f"{seed} from its seed {old}" for seed, old in pairs.items())
+        + of * (len(saved.configs) > 1)
+    )
+    return lambda ts: with_policy(ts, policy, rows)
+
+
+def with_policy(ts: PyTree, policy: dict[str, np.ndarray], rows: Sequence[int]) -> PyTree:
+    """`ts` with the networks and normaliser of `policy`: row `rows[i]` of it for member i.
+
+    The copies of a member on several devices share its row.
+    """
+    leaves, treedef = jax.tree.flatten(ts)
+    picks = np.resize(rows, len(leaves[0]))
+
+    def start(name: str, x: jax.Array) -> jax.Array:
+        taken = name in policy and name.split(".")[0] in POLICY
+        return jnp.asarray(policy[name][picks], x.dtype) if taken else x
+
+    named = zip(checkpoint.leaf_names(ts), leaves, strict=True)
+    return treedef.unflatten([start(name, x) for name, x in named])

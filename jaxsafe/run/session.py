@@ -1,0 +1,169 @@
+"""A run from its settings to its folder: where it trains, that it fits, and the training itself."""
+
+import datetime
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+import jaxsafe
+from jaxsafe.config import ConfigError, flat
+from jaxsafe.envs.wrap import innermost
+from jaxsafe.run import checkpoint, distributed, loop, run_folder
+from jaxsafe.run.devices import check_devices, device_name, use_compilation_cache
+from jaxsafe.run.interrupts import Interrupts
+from jaxsafe.run.memory import check_memory, check_state_memory
+from jaxsafe.run.policies import warm_start
+from jaxsafe.run.progress import Report
+from jaxsafe.run.settings import NOT_COMPARED, Settings, differences, make_env, settle
+from jaxsafe.run.spread import Program, build
+from jaxsafe.types import Env
+
+
+class Session(NamedTuple):
+    """A run that can start."""
+
+    settings: Settings
+    folder: Path
+    env: Env
+    program: Program
+    again: str  # the command that continues it
+
+
+Finish = Callable[[Session, Report, Interrupts], None]  # what follows training
+
+
+def choose_folder(settings: Settings, job: int | None, say: Callable[[str], None]) -> Path:
+    """The folder to train in. `job` is the number of a multirun's job.
+
+    Raises:
+        ConfigError: it holds another run, or this one and `resume` is not set.
+    """
+    train = settings.train
+    if isinstance(train.resume, str):
+        folder = Path(train.resume).expanduser()
+        compare(settings, folder)
+        return folder
+    home = Path("runs") / settings.label
+    if train.run_dir is None:
+        if train.resume:
+            for folder in sorted((p.parent for p in home.glob("*/config.yaml")), reverse=True):
+                done = run_folder.progress(folder)
+                if (done is None or done[1] < train.total_steps) and same(settings, folder):
+                    return folder
+            say(f"no unfinished run of this command in {home}: starting one")
+        name = f"{datetime.datetime.now():%Y%m%d-%H%M%S}-seed{train.seed}"
+        taken = (home / (f"{name}-{i}" if i else name) for i in range(10**6))
+        return next(path for path in taken if not path.exists())
+    folder = Path(train.run_dir).expanduser()
+    if job is not None:
+        folder = folder / str(job)
+    if folder.exists() and not folder.is_dir():
+        raise ConfigError(f"run_dir={folder} is not a folder")
+    if (folder / "config.yaml").exists() and train.resume:
+        compare(settings, folder)
+    elif checkpoint.checkpoints(folder / "checkpoints"):
+        raise ConfigError(
+            f"{folder} already holds a run: continue it with resume=true, or choose another run_dir"
+        )
+    elif train.resume:
+        say(f"nothing to resume in {folder}: starting there")
+    return folder
+
+
+def agree_on_folder(settings: Settings, job: int | None, say: Callable[[str], None]) -> Path:
+    """`choose_folder` of process 0, for all processes.
+
+    Raises:
+        ConfigError: as there, or this process has other settings than process 0.
+    """
+    if jax.process_count() == 1:
+        return choose_folder(settings, job, say)
+    mine = flat(settings.plain())
+    folder = choose_folder(settings, job, say) if distributed.leads() else ""
+    folder, theirs = json.loads(distributed.first_text(json.dumps([str(folder), mine])))
+    for name, (here, there) in differences(mine, theirs).items():
+        raise ConfigError(f"{name}={here} in this process, {there} in process 0")
+    return Path(folder)
+
+
+def compare(settings: Settings, folder: Path) -> None:
+    """Raise ConfigError if the run in `folder` has other settings than these."""
+    saved = flat(settle(run_folder.read_config(folder), settings.entries).plain())
+    free = {*NOT_COMPARED}
+    if len(settings.configs) * settings.train.num_seeds > 1:
+        free.add("devices")  # each member is whole on one of them
+    for name, (here, there) in differences(flat(settings.plain()), saved).items():
+        if name not in free:
+            raise ConfigError(
+                f"{name}={here} but {folder} was trained with {there}; "
+                f"for a new run from its policy use init_from={folder}"
+            )
+
+
+def same(settings: Settings, folder: Path) -> bool:
+    try:
+        compare(settings, folder)
+    except ConfigError:
+        return False
+    return True
+
+
+def prepare(settings: Settings) -> tuple[Env, Program]:
+    """The environment and the program to train, not yet compiled.
+
+    Raises:
+        ConfigError: sizes that do not fit each other, the devices or, as memory.TooLarge, the memory.
+    """
+    train = settings.train
+    use_compilation_cache()
+    check_devices(train)
+    env = make_env(settings)
+    check_memory(env, settings.algo, len(settings.configs) * train.num_seeds, train.devices)
+    program = build(env, settings.row.make, settings.configs, train)
+    check_state_memory(program, train)
+    return env, program
+
+
+def run(session: Session, report: Report, finish: Finish) -> int:
+    """Train, then `finish`. Returns the exit status: 0, or 130 if the user stopped it."""
+    settings, folder, env, program, again = session
+    train, cfg = settings.train, settings.algo
+    adapt = None
+    begun = distributed.first(np.array(run_folder.progress(folder) is not None))
+    if train.init_from is not None and not begun:
+        adapt = warm_start(settings, program, report.line)
+    engine = getattr(innermost(env), "engine", None)  # Safety Gym's environments have one
+    try:
+        if distributed.leads():
+            folder.mkdir(parents=True, exist_ok=True)
+            run_folder.write_config(folder, settings.plain())
+            run_folder.append_versions(folder, device_name(), engine)
+    except OSError as error:
+        raise checkpoint.CheckpointError(f"cannot write to {folder}: {error.strerror}") from error
+    several = f"{len(settings.configs)} settings x " if len(settings.configs) > 1 else ""
+    seeds = f"{train.num_seeds} seed{'s' if train.num_seeds > 1 else ''} x {cfg.num_envs} envs"
+    where = device_name() + (f" x {train.devices}" if train.devices > 1 else "")
+    if jax.process_count() > 1:
+        where += f" in {jax.process_count()} processes"
+    where += f", engine {engine}" if engine else ""
+    kernels = ", and a minute of Warp's kernels the first time" * (engine == "warp")
+    report.line(
+        f"jaxsafe {jaxsafe.__version__} | {settings.env_name} | {settings.algo_name} | "
+        f"{several}{seeds} | {where} | compiling rollout and update{kernels} ..."
+    )
+    outcome = loop.train(program, train, folder, report, again, adapt)
+    distributed.leave()
+    if outcome.interrupted:
+        return 130
+    if not distributed.leads():
+        return 0
+    with Interrupts(report.line, report.hosted) as stop:
+        if not report.hosted:
+            stop.nothing_to_save = f"stopped; the training is saved, and for what is left {again}"
+        finish(session, report, stop)
+    report.line(f"run folder: {folder}")
+    return 0

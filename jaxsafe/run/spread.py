@@ -1,0 +1,148 @@
+"""One algorithm over settings, seeds and devices.
+
+Every array of the train state carries a leading axis here: over members (each setting of the
+algorithm's floats with each seed), or over the devices that share the environments of a lone one.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import AxisType, NamedSharding, PartitionSpec
+
+from jaxsafe.config import ConfigError, flat
+from jaxsafe.envs.wrap import raw_steps
+from jaxsafe.run import checkpoint, run_folder
+from jaxsafe.run.settings import TrainConfig
+from jaxsafe.types import Algorithm, Clocks, Env, PyTree, Shared
+
+AXIS = "devices"
+
+
+class Member(NamedTuple):
+    """One of the runs that train side by side: a setting of the algorithm with a seed."""
+
+    algo: Any  # its config
+    seed: int
+    swept: dict[str, float]  # those of its floats in which the settings differ, as algo.<field>
+
+    @property
+    def setting(self) -> str:
+        return run_folder.setting_name(self.swept)
+
+
+def members(configs: Sequence[Any], settings: TrainConfig) -> list[Member]:
+    """Every setting with every seed, seeds fastest."""
+    plain = [flat({"algo": dataclasses.asdict(c)}) for c in configs]
+    swept = [name for name, value in plain[0].items() if any(c[name] != value for c in plain)]
+    return [
+        Member(cfg, settings.seed + i, {name: values[name] for name in swept})
+        for cfg, values in zip(configs, plain, strict=True)
+        for i in range(settings.num_seeds)
+    ]
+
+
+class Program(NamedTuple):
+    """`init(start, shared) -> ts` and `update(ts, shared) -> (ts, metrics)` over the leading axis, not
+    yet compiled. `params(ts)` is what acts, on the same axis; `clocks` are those of one seed."""
+
+    init: Callable[[PyTree, Shared], PyTree]
+    update: Callable[[PyTree, Shared], tuple[PyTree, dict[str, jax.Array]]]
+    params: Callable[[PyTree], PyTree]
+    clocks: Clocks
+    start: PyTree  # (keys, config): [M], or [devices] for one split member
+    members: list[Member]
+    sharding: jax.sharding.Sharding
+
+
+def build(env: Env, make: Callable, configs: Sequence[Any], settings: TrainConfig) -> Program:
+    """Spread one algorithm over settings, seeds and devices.
+
+    Args:
+        env: the environment.
+        make: `make(env, axis_name) -> Algorithm` of the algorithm.
+        configs: its config in each setting; they differ in floats alone.
+        settings: seeds and devices.
+    Raises:
+        ConfigError: the members, or the environments of a lone one, do not split over the devices.
+    """
+    devices, run = settings.devices, members(configs, settings)
+    share = devices if len(run) == 1 else 1  # devices among which the environments of one are split
+    if len(run) % devices and share == 1:
+        raise ConfigError(
+            f"{len(run)} seeds do not split over devices={devices}: "
+            f"expected a multiple of {devices}, or 1"
+        )
+    if configs[0].num_envs % share:
+        raise ConfigError(f"num_envs={configs[0].num_envs} does not split over devices={devices}")
+
+    algo: Algorithm = make(env, AXIS if share > 1 else None)
+    clocks = algo.clocks(configs[0])
+    clocks = clocks._replace(steps=clocks.steps * raw_steps(env))
+
+    def settled(cfg: Any) -> Any:
+        ends = cfg.total_iterations
+        if math.isinf(ends):
+            ends = float(-(-settings.total_steps // clocks.steps))
+        return dataclasses.replace(cfg, num_envs=cfg.num_envs // share, total_iterations=ends)
+
+    # A split seed has one key for all its devices: the algorithm folds the device's index in.
+    keys = jax.vmap(jax.random.key)(np.array([m.seed for m in run] * share, np.uint32))
+    floats = jax.tree.map(lambda *x: np.array(x, np.float32), *[settled(m.algo) for m in run * share])
+    rows = max(1, len(run) // devices)  # on each device
+    init = over_rows(lambda start, shared: algo.init(start[0], start[1], shared), rows)
+    update = over_rows(algo.update, rows)
+    if devices == 1:
+        one = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
+        return Program(init, update, algo.params, clocks, (keys, floats), run, one)
+    mesh = jax.make_mesh(
+        (devices,), (AXIS,), devices=jax.devices()[:devices], axis_types=(AxisType.Auto,)
+    )
+    spec = PartitionSpec(AXIS)
+
+    def split(fn: Callable) -> Callable:
+        def parted(tree: PyTree, shared: Shared) -> PyTree:
+            leaves, treedef = jax.tree.flatten(tree)
+
+            def own_part(full: list[jax.Array], shared: Shared) -> PyTree:
+                given = iter(full)
+                tree = treedef.unflatten([next(given) if x.size else empty(x) for x in leaves])
+                return fn(tree, shared)
+
+            # arrays without elements stay outside: jax 0.11 crashes on them as inputs
+            full = [x for x in leaves if x.size]
+            specs = {"in_specs": (spec, PartitionSpec()), "out_specs": spec}
+            return jax.shard_map(own_part, mesh=mesh, **specs, check_vma=False)(full, shared)
+
+        return parted
+
+    def empty(x: jax.Array) -> jax.Array:
+        return jnp.zeros((x.shape[0] // devices, *x.shape[1:]), x.dtype)
+
+    sharding = NamedSharding(mesh, spec)
+    return Program(split(init), split(update), algo.params, clocks, (keys, floats), run, sharding)
+
+
+def over_rows(fn: Callable[[PyTree, Shared], PyTree], rows: int) -> Callable[[PyTree, Shared], PyTree]:
+    """`fn` over a leading axis of `rows`. One row is no vmap, which would run both sides of a cond."""
+
+    def strong(tree: PyTree) -> PyTree:  # no weak types, so that a restored state is the same program
+        return jax.tree.map(lambda x: x if checkpoint.is_key(x) else jnp.asarray(x, x.dtype), tree)
+
+    def alone(tree: PyTree, shared: Shared) -> PyTree:
+        out = fn(jax.tree.map(lambda x: x[0], tree), shared)
+        return strong(jax.tree.map(lambda x: x[None], out))
+
+    def together(tree: PyTree, shared: Shared) -> PyTree:
+        return strong(jax.vmap(fn, in_axes=(0, None))(tree, shared))
+
+    return together if rows > 1 else alone
+
+
+def compiled(program: Program, ts: PyTree) -> Any:
+    """The update for a train state of these shapes; JAX remembers it."""
+    return jax.jit(program.update, donate_argnums=0).lower(ts, Shared(np.int32(0))).compile()

@@ -1,0 +1,276 @@
+"""A grid of settings, trained side by side where one compiled program can hold them.
+
+Floats of the algorithm are arrays to the program, so their grid and the seeds are the members of one.
+Any other option with several values makes a group, and so a program, of each value. A group that does
+not fit the memory is split into equal parts: of whole settings or, where the seeds of one setting are
+too many, of seeds.
+
+    SWEEP/sweep.yaml                   what was asked; how many members of a group run at once
+    SWEEP/000-<env>-<algo>...[.part0]/ a run folder as of train.py, of a group or a part of one
+    SWEEP/summary.md, .csv, .png       a row a setting, rewritten after each run folder
+"""
+
+import hashlib
+import itertools
+import json
+import re
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import yaml
+
+from jaxsafe.config import ConfigError, flat, is_float, one_line
+from jaxsafe.learn import on_policy
+from jaxsafe.run import checkpoint, distributed, memory, run_folder, session
+from jaxsafe.run.interrupts import Interrupts
+from jaxsafe.run.policies import warm_start
+from jaxsafe.run.progress import Report
+from jaxsafe.run.session import Finish, Session
+from jaxsafe.run.settings import (
+    DEFAULT,
+    NOT_COMPARED,
+    REGISTERED,
+    Entries,
+    Settings,
+    as_text,
+    ask,
+    differences,
+    find_algo,
+    make_env,
+    merged,
+    nested,
+)
+from jaxsafe.run.spread import Program
+
+
+class Sweep(NamedTuple):
+    """What is to be trained."""
+
+    swept: list[str]  # the options with several values, as `flat` names them
+    groups: dict[str, Settings]  # by the name of their folders
+    folder: Path
+    max_parallel: int | None
+
+
+class After(NamedTuple):
+    """What follows the training of a run folder of a sweep."""
+
+    finish: Finish
+    summarise: Callable[[Path], object]  # of the sweep's folder
+
+
+# ---- from options to groups ------------------------------------------------------------------
+
+
+def plan(given: dict[str, Any], several: dict[str, list[Any]], entries: Entries = REGISTERED) -> Sweep:
+    """The groups of a sweep, every one of them checked.
+
+    Args:
+        given: the options with one value, as `settings.ask` takes them, and `max_parallel`.
+        several: those with several values, by name: 'env', 'seed', 'algo.clip'.
+        entries: environments and algorithms beside the registered ones.
+    Raises:
+        ConfigError: an option that no run could use, or nothing to sweep.
+    """
+    given = dict(given)
+    most, folder = given.pop("max_parallel", None), given.pop("run_dir", None)
+    for name in {**given, **several}:
+        if name == "resume":
+            raise ConfigError("resume: a sweep goes on when the same command is given again")
+        if name in distributed.OPTIONS:
+            raise ConfigError(f"{name}: a sweep is one process")
+    for name in ("max_parallel", "run_dir"):
+        if name in several:
+            raise ConfigError(f"{name}: expected one value")
+    if most is not None and (isinstance(most, bool) or not isinstance(most, int) or most < 1):
+        raise ConfigError(f"max_parallel={most}: expected a whole number of at least 1")
+    if not several:
+        ask(given, entries)  # what is wrong with an option comes first
+        raise ConfigError(
+            "nothing to sweep: give an option several values, as in algo.cost_limit=5,10,25, "
+            "or train one setting with scripts/train.py"
+        )
+    for name, values in several.items():
+        for value in values:
+            if values.count(value) > 1:
+                raise ConfigError(f"{name}={as_text(value)} occurs twice")
+    first = several.get("algo") or [given.get("algo", {}).get("name", DEFAULT["algo"])]
+    kind = find_algo(first[0], entries).config
+    floats = {k: v for k, v in several.items() if k.startswith("algo.") and is_float(kind, k[5:])}
+    grid = list(zip(*itertools.product(*floats.values()), strict=True))
+    side_by_side = {name: list(values) for name, values in zip(floats, grid, strict=True)}
+    apart = {name: values for name, values in several.items() if name not in floats}
+    groups = {}
+    for i, values in enumerate(itertools.product(*apart.values())):
+        chosen = dict(zip(apart, values, strict=True))
+        settings = ask(merged(given, nested(side_by_side | chosen)), entries)
+        make_env(settings)
+        on_policy.check(settings.algo)
+        rest = [f"{k}={as_text(v)}" for k, v in chosen.items() if k not in DEFAULT]
+        name = "-".join([f"{i:03d}", settings.label, *rest])
+        groups[re.sub(r"[^\w.=+-]+", "_", name)[:100]] = settings
+    swept = [f"{k}.name" if k in DEFAULT else k for k in several]
+    where = Path(folder).expanduser() if folder else default_folder(groups)
+    return Sweep(swept, groups, where, most)
+
+
+def identity(settings: Settings) -> dict[str, Any]:
+    """What a sweep's folder must agree on."""
+    return {k: v for k, v in flat(settings.plain()).items() if k not in NOT_COMPARED}
+
+
+def default_folder(groups: dict[str, Settings]) -> Path:
+    first = next(iter(groups.values()))
+    text = json.dumps([identity(s) for s in groups.values()], sort_keys=True)
+    digest = hashlib.sha256(text.encode()).hexdigest()[:8]
+    return Path("runs") / f"sweep-{first.label}-{digest}"
+
+
+# ---- the folder ------------------------------------------------------------------------------
+
+
+def open_folder(sweep: Sweep) -> dict[str, int]:
+    """How many members of each group run at once, as far as the folder's sweep knows already.
+
+    Raises:
+        ConfigError: the folder holds something else.
+    """
+    asked = {name: identity(settings) for name, settings in sweep.groups.items()}
+    if not (sweep.folder / "sweep.yaml").exists():
+        if sweep.folder.exists() and (not sweep.folder.is_dir() or any(sweep.folder.iterdir())):
+            raise ConfigError(f"run_dir={sweep.folder} holds something else than a sweep")
+        return {}
+    saved = read_folder(sweep.folder)
+    other = f"{sweep.folder} belongs to another sweep"
+    if [*asked] != [*saved["groups"]]:
+        raise ConfigError(f"{other}, of {', '.join(saved['groups'])}; choose another run_dir")
+    for name, settings in asked.items():
+        for key, (here, there) in differences(settings, flat(saved["groups"][name])).items():
+            raise ConfigError(f"{other}: {key} is {there} there, {here} here; choose another run_dir")
+    return saved["parallel"]
+
+
+def read_folder(folder: Path) -> dict[str, Any]:
+    path = folder / "sweep.yaml"
+    if not path.is_file():
+        raise ConfigError(f"{folder} is not a sweep's folder: it has no sweep.yaml")
+    try:
+        saved = yaml.safe_load(path.read_text())
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} cannot be read: {one_line(error)}") from error
+    if not isinstance(saved, dict) or not {"swept", "groups", "parallel"} <= saved.keys():
+        raise ConfigError(f"{path} does not describe a sweep")
+    return saved
+
+
+def write_folder(sweep: Sweep, parallel: dict[str, int]) -> None:
+    asked = {name: identity(settings) for name, settings in sweep.groups.items()}
+    saved = {"swept": sweep.swept, "parallel": parallel, "groups": asked}
+    try:
+        sweep.folder.mkdir(parents=True, exist_ok=True)
+        run_folder.replace_text(sweep.folder / "sweep.yaml", yaml.safe_dump(saved, sort_keys=False))
+    except OSError as error:
+        raise checkpoint.CheckpointError(f"cannot write to {sweep.folder}: {error.strerror}") from error
+
+
+# ---- training --------------------------------------------------------------------------------
+
+
+def parts(settings: Settings, parallel: int) -> list[Settings]:
+    """`settings` in parts of at most `parallel` members, whose sizes differ by one at most."""
+    train, configs = settings.train, settings.configs
+    if train.num_seeds <= parallel:
+        return [
+            settings._replace(configs=configs[piece])
+            for piece in slices(len(configs), parallel // train.num_seeds)
+        ]
+    seeds = [
+        replace(train, seed=train.seed + piece.start, num_seeds=piece.stop - piece.start)
+        for piece in slices(train.num_seeds, parallel)
+    ]
+    return [settings._replace(configs=(c,), train=t) for c in configs for t in seeds]
+
+
+def slices(count: int, most: int) -> list[slice]:
+    """Of 0 .. count, as few as hold at most `most` each, whose sizes differ by one at most."""
+    number = -(-count // most)
+    ends = [count * i // number for i in range(number + 1)]
+    return [slice(a, b) for a, b in itertools.pairwise(ends)]
+
+
+def fitting(settings: Settings, most: int | None) -> tuple[int, Program]:
+    """How many members run at once, `most` or what the memory holds; and the first part's program."""
+    members = len(settings.configs) * settings.train.num_seeds
+    parallel = min(members, most or members)
+    while True:
+        part = parts(settings, parallel)[0]
+        try:
+            _, program = session.prepare(part)
+        except memory.TooLarge:
+            if parallel == 1 or most:
+                raise
+            parallel = -(-parallel // 2)
+            continue
+        if part.train.init_from:  # what is wrong with it shows before anything compiles
+            warm_start(part, program, lambda line: None)
+        held = parallel if parallel == 1 or most else memory.capacity(program)
+        return (held if held < len(program.members) else parallel), program
+
+
+def train(sweep: Sweep, again: str, report: Report, after: After) -> int:
+    """Train every group that is not finished.
+
+    Args:
+        sweep: from `plan`.
+        again: the command that continues it.
+        report: where progress goes.
+        after: what follows the training of each run folder.
+    Returns:
+        The exit status: 0, or 130 if the user stopped it.
+    """
+    known = open_folder(sweep)
+    sizes = [len(s.configs) for s in sweep.groups.values()]
+    report.line(
+        f"sweep: {sum(sizes)} settings in {len(sizes)} group{'s' * (len(sizes) > 1)}, in {sweep.folder}"
+    )
+    for name, settings in sweep.groups.items():
+        members = len(settings.configs) * settings.train.num_seeds
+        programs: dict[int, Program] = {}  # by the number of their members
+        begun = list(sweep.folder.glob(f"{name}*"))
+        if not any(checkpoint.checkpoints(f / "checkpoints") for f in begun):
+            for leftover in begun:  # stopped before a first checkpoint, perhaps in other parts
+                shutil.rmtree(leftover)
+            with Interrupts(report.line, report.hosted) as stop:
+                stop.nothing_to_save = f"stopped before the first update; {again}"
+                known[name], program = fitting(settings, sweep.max_parallel)
+            programs[len(program.members)] = program
+            write_folder(sweep, known)
+        elif sweep.max_parallel not in (None, known[name]) and known[name] < members:
+            report.line(f"{name} goes on as it began, {known[name]} members at once")
+        pieces = parts(settings, known[name])
+        if len(pieces) > 1:
+            report.line(f"{name}: {members} members in {len(pieces)} parts, one after the other")
+        for i, piece in enumerate(pieces):
+            folder = sweep.folder / (name if len(pieces) == 1 else f"{name}.part{i:03d}")
+            if finished(piece, folder):
+                report.line(f"finished already: {folder}")
+                continue
+            piece = piece._replace(train=replace(piece.train, run_dir=str(folder), resume=True))
+            env, program = session.prepare(piece)
+            # what differs between parts of one size is data, so they share what is compiled
+            same = programs.setdefault(len(program.members), program)
+            program = program._replace(init=same.init, update=same.update)
+            status = session.run(Session(piece, folder, env, program, again), report, after.finish)
+            after.summarise(sweep.folder)
+            if status:
+                return status
+    return 0
+
+
+def finished(settings: Settings, folder: Path) -> bool:
+    done, train = run_folder.progress(folder), settings.train
+    evaluated = (folder / "evaluation.json").exists() or not train.eval_episodes
+    return done is not None and done[1] >= train.total_steps and evaluated
