@@ -21,11 +21,11 @@ def widths(model: mujoco.MjModel, simulation: Simulation) -> tuple[dict[str, int
     out = state | {"sensordata": model.nsensordata}
     for name in simulation.fields:
         count, shape = FIELDS[name]
-        out[name] = vars_of(model, count) * math.prod(shape)
+        out[name] = count_of(model, count) * math.prod(shape)
     return into, out
 
 
-def vars_of(model: mujoco.MjModel, count: str) -> int:
+def count_of(model: mujoco.MjModel, count: str) -> int:
     return {"nbody": model.nbody, "ngeom": model.ngeom, "nsite": model.nsite}[count]
 
 
