@@ -26,6 +26,7 @@ from jaxsafe.algos import (
     ppo_saute,
     ppo_simmer_pid,
     rcpo,
+    sac,
     trpo,
     trpo_early_terminated,
     trpo_lag,
@@ -117,6 +118,7 @@ ALGOS: dict[str, Entry] = {
         "natural policy gradient with an adaptive price on cost",
         rcpo.PUBLISHED,
     ),
+    "sac": Entry(sac.SACConfig, sac.make, "soft actor-critic, no constraint", sac.PUBLISHED),
     "trpo": Entry(trpo.TRPOConfig, trpo.make, "trust-region steps, no constraint", trpo.PUBLISHED),
     "trpo_early_terminated": Entry(
         trpo_early_terminated.TRPOEarlyTerminatedConfig,
