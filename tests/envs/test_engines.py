@@ -372,7 +372,7 @@ def test_the_jax_engine_refuses_what_it_cannot_solve(option, tmp_path):
     robot = tmp_path / "mine.xml"
     robot.write_text(text.replace("<option ", f"<option {option} "))
     assert option in robot.read_text()
-    with pytest.raises(ConfigError, match="integrator Euler or implicitfast, pyramidal"):
+    with pytest.raises(ConfigError, match="integrator Euler or implicitfast and pyramidal"):
         envs.make("point_goal0", engine="jax", robot_base=str(robot))
 
 
