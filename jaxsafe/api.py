@@ -21,7 +21,7 @@ from jaxsafe.algos import Row
 from jaxsafe.config import ConfigError, flat, nearest
 from jaxsafe.envs import SafetyGym, SafetyGymConfig
 from jaxsafe.envs.check import check_env
-from jaxsafe.envs.engines.physics import default_engine
+from jaxsafe.envs.engines import default_engine
 from jaxsafe.learn.acting import Player
 from jaxsafe.report import evaluation, film, sweep_summary
 from jaxsafe.report.evaluation import Scores

@@ -15,6 +15,7 @@ import numpy as np
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
 from jaxsafe.config import ConfigError, flat
+from jaxsafe.envs.wrap import raw_steps
 from jaxsafe.run import checkpoint, run_folder
 from jaxsafe.run.settings import TrainConfig
 from jaxsafe.types import Algorithm, Clocks, Env, PyTree, Shared
@@ -81,6 +82,7 @@ def build(env: Env, make: Callable, configs: Sequence[Any], settings: TrainConfi
 
     algo: Algorithm = make(env, AXIS if share > 1 else None)
     clocks = algo.clocks(configs[0])
+    clocks = clocks._replace(steps=clocks.steps * raw_steps(env))
 
     def settled(cfg: Any) -> Any:
         ends = cfg.total_iterations

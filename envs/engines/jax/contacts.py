@@ -1,10 +1,10 @@
-"""Engine `jax`: MJX in plain JAX, with contacts as MuJoCo's in C where MJX has others.
+"""Contacts for engine `jax`: as MuJoCo's in C, where MJX has others.
 
 MJX has no collision of a cylinder with a box, misses most of a box with an upright capsule, and is
 centimetres off where a cylinder meets a sphere or a capsule. Of a plane with an upright capsule its
 contact frame is another, of a box with a plane or a box its points are. Our collisions are registered
-with MJX when this module is imported, which is by the engine itself only, and hold for every user of
-MJX in the process. The solver is ours, too (`solver_jax.py`), and is the engine's alone.
+with MJX when this module is imported. Only engine `jax` imports it. From then on they hold for every
+user of MJX in the process.
 """
 
 from typing import Any
@@ -13,22 +13,11 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from mujoco import mjx
-from mujoco.mjx._src import collision_driver, collision_primitive, forward, math, sensor
+from mujoco.mjx._src import collision_driver, collision_primitive, math
 from mujoco.mjx._src.types import GeomType
 
-from jaxsafe.config import ConfigError
-from jaxsafe.envs.engines.physics import STATE, Physics, Readings, Run, mocap_at
-from jaxsafe.envs.engines.solver_jax import solve
-from jaxsafe.envs.safety_gym.scene import Scene
-
 collider: Any = collision_primitive.collider  # (pose and size of each) -> contacts, for MJX
-State = dict[str, jax.Array]  # of a world between two substeps
 Collision = tuple[jax.Array, jax.Array, jax.Array]  # distance (m), position [3], frame [3, 3]
-INTEGRATORS = {
-    mujoco.mjtIntegrator.mjINT_EULER: forward.euler,
-    mujoco.mjtIntegrator.mjINT_IMPLICITFAST: forward.implicit,
-}
 FLAT = 0.02  # rad between normal and side (or end) within which it lies flat
 PROJECTIONS = 8  # between cylinder and box, towards their closest points
 HALVINGS = 24  # of a capsule's axis
@@ -341,82 +330,3 @@ collision_driver._COLLISION_FUNC[GeomType.CAPSULE, GeomType.CYLINDER] = capsule_
 collision_driver._COLLISION_FUNC[GeomType.CYLINDER, GeomType.BOX] = cylinder_box
 collision_driver._COLLISION_FUNC[GeomType.CAPSULE, GeomType.BOX] = capsule_box
 collision_driver._COLLISION_FUNC[GeomType.BOX, GeomType.BOX] = box_box
-
-
-def forward_pass(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """`data` with what follows from its positions and velocities, to the accelerations."""
-    data = forward.fwd_velocity(model, forward.fwd_position(model, data))
-    data = forward.fwd_acceleration(model, forward.fwd_actuation(model, data))
-    return solve(model, data)
-
-
-def jax_engine(scene: Scene, max_substeps: int, outputs: tuple[str, ...]) -> Run:
-    option = scene.model.opt
-    integrate = INTEGRATORS.get(option.integrator)
-    if integrate is None or option.cone != mujoco.mjtCone.mjCONE_PYRAMIDAL or scene.model.na:
-        raise ConfigError(
-            "env.engine='jax': expected a robot with integrator Euler or implicitfast, pyramidal "
-            "friction cones and motors without state; c and warp take other integrators and cones"
-        )
-    with jax.ensure_compile_time_eval():
-        model = mjx.put_model(scene.model, impl="jax")
-        template = mjx.make_data(scene.model, impl="jax")
-    robot, watched = map(jnp.asarray, contact_geoms(scene))
-    timestep = scene.model.opt.timestep
-
-    def readings(data: mjx.Data) -> Readings:
-        for sense in (sensor.sensor_pos, sensor.sensor_vel, sensor.sensor_acc):
-            data = sense(model, data)
-        contact = data._impl.contact  # type: ignore[union-attr]
-        first, second = contact.geom[:, 0], contact.geom[:, 1]
-        met = robot[first][:, None] & watched[second] | robot[second][:, None] & watched[first]
-        contacts = (met & (contact.dist <= 0)[:, None]).sum(0).astype(jnp.float32)
-        poses = {
-            name: getattr(data, name) if name in outputs else jnp.zeros((0,))
-            for name in ("geom_xpos", "geom_xmat", "xquat")
-        }
-        sensors = jnp.concatenate([data.sensordata, contacts])
-        return Readings(sensors=sensors, contacts=contacts, overflow=jnp.zeros(()), **poses)
-
-    # GPUs would multiply matrices with 10 bits of mantissa, TPUs with 7
-    @jax.default_matmul_precision("highest")
-    def run(physics: Physics, ctrl: jax.Array, substeps: jax.Array) -> tuple[Physics, Readings]:
-        base = physics.mocap_pos
-        start = template.replace(ctrl=ctrl, mocap_pos=base, mocap_quat=physics.mocap_quat)
-
-        def after(state: State, k: jax.Array) -> mjx.Data:
-            """`state` and the guides, k substeps from the start."""
-            data = start.replace(**state)
-            if not scene.orbit.any():
-                return data
-            time = (physics.substeps + k) * timestep
-            moved = mocap_at(base, scene.orbit, time, jnp)
-            return data.replace(mocap_pos=jnp.where(substeps > 0, moved, base))
-
-        def substep(state: State, k: jax.Array) -> tuple[State, None]:
-            moved = integrate(model, forward_pass(model, after(state, k)))
-            return {f: jnp.where(k < substeps, getattr(moved, f), state[f]) for f in STATE}, None
-
-        state: State = dict(zip(STATE, (physics.qpos, physics.qvel, physics.warmstart), strict=True))
-        if max_substeps:
-            state, _ = jax.lax.scan(substep, state, jnp.arange(max_substeps))
-        data = after(state, substeps - 1)  # guides stay where the last substep had them
-        shown = readings(forward_pass(model, data))
-        moved = physics.replace(
-            qpos=state["qpos"],
-            qvel=state["qvel"],
-            warmstart=state["qacc_warmstart"],
-            substeps=physics.substeps + substeps,
-        )
-        return moved, shown
-
-    return run
-
-
-def contact_geoms(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Masks of the robot's geoms [ngeom] and of each watched object's [ngeom, watched]."""
-    model = scene.model
-    bodies = model.geom_bodyid
-    robot = model.body_rootid[bodies] == model.body("robot").id
-    ids = [model.body(name).id for names in scene.watched.values() for name in names]
-    return robot, np.stack([bodies == i for i in ids], 1) if ids else np.zeros((model.ngeom, 0), bool)

@@ -1,17 +1,19 @@
 """Contacts of boxes with pillars, in closed form.
 
-MuJoCo Warp's convex collisions, in float32, now and then miss touches of a box and an upright cylinder
-that are up to 0.06 mm deep: a robot that leans on a pillar touches it in one substep and not in the
-next. Seen from above it is a circle against a polygon, the box's shadow, and that has a formula. As in
-MuJoCo a side that lies flat has two contacts, a standing edge one, at its upper end.
+MuJoCo Warp's convex collisions work in float32. Now and then they miss touches of a box and an upright
+cylinder that are up to 0.06 mm deep: a robot that leans on a pillar touches it in one substep and not
+in the next. Seen from above, the pillar is a circle and the box's shadow is a polygon, and for these
+there is a formula. As in MuJoCo, a side that lies flat has two contacts. A standing edge has one, at
+its upper end.
 
-The cylinder must be upright and its ends out of the boxes' reach, as those of pillars are.
+A pillar is an upright cylinder of a mocap body, with ends out of the boxes' reach.
 """
 # Kernels are Warp's language in Python's syntax, which no type checker of Python knows:
 # pyright: reportIndexIssue=false, reportAssignmentType=false, reportGeneralTypeIssues=false
 # pyright: reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
@@ -115,49 +117,59 @@ def touch(
     return wp.vec2(dist, dist), wp.vec2(height, height), normal, False
 
 
+@wp.struct
+class Geoms:
+    """The model's fields that say where geoms are and what they are made of."""
+
+    geom_size: wp.array2d[wp.vec3]
+    geom_condim: wp.array[int]
+    geom_priority: wp.array[int]
+    geom_solmix: wp.array2d[float]
+    geom_solref: wp.array2d[wp.vec2]
+    geom_solimp: wp.array2d[types.vec5]
+    geom_friction: wp.array2d[wp.vec3]
+    geom_adhesion: wp.array2d[float]
+    pair_dim: wp.array[int]
+    pair_solref: wp.array2d[wp.vec2]
+    pair_solreffriction: wp.array2d[wp.vec2]
+    pair_solimp: wp.array2d[types.vec5]
+    pair_adhesion: wp.array2d[float]
+    pair_friction: wp.array2d[types.vec5]
+    geom_xpos: wp.array2d[wp.vec3]
+    geom_xmat: wp.array2d[wp.mat33]
+
+
+@wp.struct
+class Contacts:
+    """The list of contacts of all worlds, and how many it has room for."""
+
+    dist: wp.array[float]
+    pos: wp.array[wp.vec3]
+    frame: wp.array[wp.mat33]
+    includemargin: wp.array[float]
+    friction: wp.array[types.vec5]
+    solref: wp.array[wp.vec2]
+    solreffriction: wp.array[wp.vec2]
+    solimp: wp.array[types.vec5]
+    dim: wp.array[int]
+    geom: wp.array[wp.vec2i]
+    efc_address: wp.array2d[int]
+    worldid: wp.array[int]
+    type: wp.array[int]
+    geomcollisionid: wp.array[int]
+    adhesion: wp.array[float]
+    count: wp.array[int]
+    room: int
+
+
 @wp.kernel(enable_backward=False)
-def pillar_contacts(
-    pairs: wp.array[wp.vec2i],
-    geom_size: wp.array2d[wp.vec3],
-    geom_condim: wp.array[int],
-    geom_priority: wp.array[int],
-    geom_solmix: wp.array2d[float],
-    geom_solref: wp.array2d[wp.vec2],
-    geom_solimp: wp.array2d[types.vec5],
-    geom_friction: wp.array2d[wp.vec3],
-    geom_adhesion: wp.array2d[float],
-    pair_dim: wp.array[int],
-    pair_solref: wp.array2d[wp.vec2],
-    pair_solreffriction: wp.array2d[wp.vec2],
-    pair_solimp: wp.array2d[types.vec5],
-    pair_adhesion: wp.array2d[float],
-    pair_friction: wp.array2d[types.vec5],
-    geom_xpos: wp.array2d[wp.vec3],
-    geom_xmat: wp.array2d[wp.mat33],
-    contacts: int,
-    contact_dist: wp.array[float],
-    contact_pos: wp.array[wp.vec3],
-    contact_frame: wp.array[wp.mat33],
-    contact_includemargin: wp.array[float],
-    contact_friction: wp.array[types.vec5],
-    contact_solref: wp.array[wp.vec2],
-    contact_solreffriction: wp.array[wp.vec2],
-    contact_solimp: wp.array[types.vec5],
-    contact_dim: wp.array[int],
-    contact_geom: wp.array[wp.vec2i],
-    contact_efc_address: wp.array2d[int],
-    contact_worldid: wp.array[int],
-    contact_type: wp.array[int],
-    contact_geomcollisionid: wp.array[int],
-    contact_adhesion: wp.array[float],
-    nacon: wp.array[int],
-):
+def pillar_contacts(pairs: wp.array[wp.vec2i], m: Geoms, out: Contacts):
     world, i = wp.tid()
     pair = pairs[i]
-    pillar = geom_xpos[world, pair[0]]
-    shape = geom_size[world % geom_size.shape[0], pair[0]]
-    at, axes = geom_xpos[world, pair[1]], geom_xmat[world, pair[1]]
-    size = geom_size[world % geom_size.shape[0], pair[1]]
+    pillar = m.geom_xpos[world, pair[0]]
+    shape = m.geom_size[world % m.geom_size.shape[0], pair[0]]
+    at, axes = m.geom_xpos[world, pair[1]], m.geom_xmat[world, pair[1]]
+    size = m.geom_size[world % m.geom_size.shape[0], pair[1]]
     far = shape[0] + wp.length(size)
     if wp.length_sq(wp.vec2(pillar[0] - at[0], pillar[1] - at[1])) > far * far:
         return
@@ -169,9 +181,9 @@ def pillar_contacts(
     if dists[deepest] >= 0.0:
         return
     condim, friction, solref, solreffriction, solimp, adhesion = contact_material_params(
-        geom_condim, geom_priority, geom_solmix, geom_solref, geom_solimp, geom_friction,
-        geom_adhesion, pair_dim, pair_solref, pair_solreffriction, pair_solimp, pair_adhesion,
-        pair_friction, pair, -1, world,
+        m.geom_condim, m.geom_priority, m.geom_solmix, m.geom_solref, m.geom_solimp, m.geom_friction,
+        m.geom_adhesion, m.pair_dim, m.pair_solref, m.pair_solreffriction, m.pair_solimp,
+        m.pair_adhesion, m.pair_friction, pair, -1, world,
     )  # fmt: skip
     frame = make_frame(-n)
     for k in range(wp.where(flat, 2, 1)):
@@ -179,11 +191,11 @@ def pillar_contacts(
         back = shape[0] + 0.5 * dists[end]
         pos = wp.vec3(pillar[0] - back * n[0], pillar[1] - back * n[1], heights[end])
         write_contact(
-            contacts, k, dists[end], pos, frame, 0.0, 0.0, condim, friction, solref, solreffriction,
-            solimp, adhesion, pair, wp.vec2i(-1, -1), world, contact_dist, contact_pos, contact_frame,
-            contact_includemargin, contact_friction, contact_solref, contact_solreffriction,
-            contact_solimp, contact_dim, contact_geom, contact_efc_address, contact_worldid,
-            contact_type, contact_geomcollisionid, contact_adhesion, nacon,
+            out.room, k, dists[end], pos, frame, 0.0, 0.0, condim, friction, solref, solreffriction,
+            solimp, adhesion, pair, wp.vec2i(-1, -1), world, out.dist, out.pos, out.frame,
+            out.includemargin, out.friction, out.solref, out.solreffriction, out.solimp, out.dim,
+            out.geom, out.efc_address, out.worldid, out.type, out.geomcollisionid, out.adhesion,
+            out.count,
         )  # fmt: skip
 
 
@@ -192,22 +204,26 @@ class Pillars:
     """Launches the kernel for one `Data`."""
 
     pairs: wp.array
-    inputs: list
+    geoms: Any
+    out: Any
 
     def contacts(self, worlds: int) -> None:
-        wp.launch(pillar_contacts, (worlds, len(self.pairs)), inputs=self.inputs)
+        inputs = [self.pairs, self.geoms, self.out]
+        wp.launch(pillar_contacts, (worlds, len(self.pairs)), inputs=inputs)
 
 
-def adopt(model: mujoco.MjModel, m: Any, d: Any) -> Pillars | None:
-    """Take pairs of a box and a mocap body's upright cylinder from MuJoCo Warp; None: there are none.
+def adopt(model: mujoco.MjModel, m: Any, d: Any, upright: Sequence[str]) -> Pillars | None:
+    """Take pairs of a box and a pillar from MuJoCo Warp; None: there are none.
 
     Args:
         model: what `m` and `d` were made of.
+        upright: the names of the pillars' bodies.
     """
     cylinder, box = (int(t) for t in (types.GeomType.CYLINDER, types.GeomType.BOX))
-    upright = (np.abs(model.geom_quat[:, 1:3]) < 1e-6).all(1)
+    stands = (np.abs(model.geom_quat[:, 1:3]) < 1e-6).all(1)
+    named = np.isin(model.geom_bodyid, [model.body(name).id for name in upright])
     fixed = model.body_mocapid[model.geom_bodyid] >= 0
-    pillar = (model.geom_type == cylinder) & upright & fixed & (model.geom_margin == 0)
+    pillar = (model.geom_type == cylinder) & stands & named & fixed & (model.geom_margin == 0)
     plain = (model.geom_type == box) & (model.geom_margin == 0)
     given, ids = m.nxn_geom_pair_filtered.numpy(), m.nxn_pairid_filtered.numpy()
     first, second = given.T
@@ -219,13 +235,10 @@ def adopt(model: mujoco.MjModel, m: Any, d: Any) -> Pillars | None:
     m.nxn_geom_pair_filtered = wp.array(given[~ours], dtype=wp.vec2i, device=device)
     m.nxn_pairid_filtered = wp.array(ids[~ours], dtype=wp.vec2i, device=device)
     pairs = np.where(pillar[first][:, None], given, given[:, ::-1])[ours]
-    names = [arg.label for arg in pillar_contacts.adj.args]
-    contact = {f"contact_{name}": x for name, x in vars(d.contact).items()}
-    known = contact | {"pairs": wp.array(pairs, dtype=wp.vec2i, device=device), "contacts": d.naconmax}
-    return Pillars(
-        known["pairs"],
-        [
-            known[name] if name in known else getattr(m if hasattr(m, name) else d, name)
-            for name in names
-        ],
-    )
+    geoms, out = Geoms(), Contacts()
+    for name in Geoms.vars:
+        setattr(geoms, name, getattr(m if hasattr(m, name) else d, name))
+    for name in Contacts.vars.keys() - {"count", "room"}:
+        setattr(out, name, getattr(d.contact, name))
+    out.count, out.room = d.nacon, d.naconmax
+    return Pillars(wp.array(pairs, dtype=wp.vec2i, device=device), geoms, out)

@@ -1,4 +1,4 @@
-// MuJoCo's Newton solver for one world: the body of a function in solver_warp.py, which says what is
+// MuJoCo's Newton solver for one world: the body of a function in solver.py, which says what is
 // solved and how, after lanes.cu. NV, ROOM (for contacts), LANES and SCRATCH are constants there, p,
 // world and lane its arguments. Each lane has a degree of freedom, and every 32nd row and contact.
 //

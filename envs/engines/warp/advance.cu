@@ -1,5 +1,5 @@
 // Euler's step, semi-implicit, with the forces of dampers taken at its end: the body of a function in
-// dynamics_warp.py, after lanes.cu. DAMPED is a constant, p, world and lane its arguments.
+// dynamics.py, after lanes.cu. DAMPED is a constant, p, world and lane its arguments.
 
 #if defined(__CUDA_ARCH__)
 __shared__ float M[DAMPED ? NV * N : 1], v[NV];

@@ -185,8 +185,29 @@ class Workspace:
     never: int  # flags of contacts, which are not plain rows, and of what the model has none of
 
 
+def uncovered(m: Any, d: Any) -> list[str]:
+    """What the kernel is not for in a model with the options that `m` has now, in a few words each."""
+    opt, off = m.opt, types.DisableBit
+    batched = (opt.tolerance, opt.ls_tolerance, opt.timestep, opt.impratio_invsqrt)
+    found = {
+        f"{m.nv} degrees of freedom": not 0 < m.nv <= MOST or m.is_sparse,
+        "no room for constraints": d.njmax <= 0,
+        "flexible bodies": m.nflex > 0,
+        "adhesion": m.flg_adhesion or m.actuator_trntype_body_adr.size > 0,
+        "surfaces that move": m.flg_surfacevel,
+        "a solver other than Newton's": opt.solver != types.SolverType.NEWTON,
+        "elliptic friction cones": opt.cone != types.ConeType.PYRAMIDAL,
+        "a discrete integrator": opt.integrator == types.IntegratorType.DISCRETE,
+        "noslip iterations": opt.noslip_iterations != 0,
+        "no warmstart": opt.disableflags & off.WARMSTART,
+        "sleeping bodies": opt.enableflags & types.EnableBit.SLEEP,
+        "options that differ between worlds": any(x.shape[0] != 1 for x in batched),
+    }
+    return [name for name, is_so in found.items() if is_so]
+
+
 def adopt(model: mujoco.MjModel, m: Any, d: Any) -> bool:
-    """Have the worlds of `d` solved here, if the kernel is for their model; others keep MuJoCo Warp's.
+    """Have the worlds of `d` solved here, unless something is `uncovered`; then MuJoCo Warp does it.
 
     It looks at the options of `m` as they are now. MuJoCo Warp's inverse dynamics and adhesion, which
     read the rows of contacts, are not for data that was adopted. A contact whose rows do not all fit
@@ -195,24 +216,8 @@ def adopt(model: mujoco.MjModel, m: Any, d: Any) -> bool:
     Args:
         model: what `m` and `d` were made of.
     """
-    opt, worlds = m.opt, d.nworld
-    if not (
-        0 < m.nv <= MOST
-        and d.njmax > 0
-        and not m.is_sparse
-        and m.nflex == 0
-        and not m.flg_adhesion
-        and not m.flg_surfacevel
-        and m.actuator_trntype_body_adr.size == 0
-        and opt.solver == types.SolverType.NEWTON
-        and opt.cone == types.ConeType.PYRAMIDAL
-        and opt.integrator != types.IntegratorType.DISCRETE
-        and opt.noslip_iterations == 0
-        and not opt.disableflags & types.DisableBit.WARMSTART
-        and not opt.enableflags & types.EnableBit.SLEEP
-        and opt.tolerance.shape[0] == opt.ls_tolerance.shape[0] == opt.timestep.shape[0] == 1
-        and opt.impratio_invsqrt.shape[0] == 1
-    ):
+    worlds = d.nworld
+    if uncovered(m, d):
         return False
     dim = min([*model.geom_condim, *model.pair_dim], default=1)
     fewest = max(1, 2 * (dim - 1))  # rows of a contact

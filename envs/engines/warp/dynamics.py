@@ -3,8 +3,8 @@
 MuJoCo Warp takes some 50 kernels of a few microseconds each to get from positions and velocities to the
 forces without constraints, for robots of 4 to 30 bodies. Here that is one kernel, in which 8, 16 or 32
 threads share a world and keep what they compute in shared memory, and one more moves the state on.
-Between them collisions are MuJoCo Warp's, but for `pillars_warp`, plain constraint rows too, and the
-solver is `solver_warp`.
+Between them collisions are MuJoCo Warp's, but for `pillars.py`. Plain constraint rows are MuJoCo Warp's
+too. The solver is `solver.py`.
 
 Of `Data` only what later kernels and this project read is written: no `qacc_smooth`, no parts of
 `qfrc_smooth`, no inertial frames, cameras, lights or energy. A pass whose sensors read more is MuJoCo
@@ -21,6 +21,7 @@ Source: MuJoCo's documentation, Computation; Featherstone (2008), Rigid Body Dyn
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +31,8 @@ import warp as wp
 from mujoco.mjx.third_party import mujoco_warp
 from mujoco.mjx.third_party.mujoco_warp._src import collision_driver, sensor, smooth, types
 
-from jaxsafe.envs.engines import pillars_warp, solver_warp
-from jaxsafe.envs.engines.solver_warp import THREADS, threads
+from jaxsafe.envs.engines.warp import pillars, solver
+from jaxsafe.envs.engines.warp.solver import THREADS, threads
 
 SHARED_MEMORY = 47 * 1024  # bytes of a block; Warp takes one more KiB
 vec10 = types.vec10
@@ -192,7 +193,7 @@ class Plan:
     sizes: tuple[int, int, int, int]  # bodies, joints, degrees of freedom, actuators
     damped: bool
     readable: bool  # whether its sensors need nothing else
-    pillars: pillars_warp.Pillars | None
+    pillars: pillars.Pillars | None
 
 
 def tree(model: mujoco.MjModel) -> dict[str, np.ndarray]:
@@ -221,16 +222,14 @@ def tree(model: mujoco.MjModel) -> dict[str, np.ndarray]:
     }
 
 
-def adopt(model: mujoco.MjModel, m: Any, d: Any) -> bool:
-    """Have `step` and `forward` run `d` here, if the kernels are for its model: Euler's integrator,
-    motors on joints and sites, linear springs and dampers, and the solver's own conditions.
+def sizes_of(model: mujoco.MjModel) -> tuple[int, int, int, int]:
+    """Bodies, joints, degrees of freedom, actuators."""
+    return model.nbody, model.njnt, model.nv, model.nu
 
-    The arrays of `m` and `d` are bound now, and options looked at: later only what is written into
-    these arrays counts, and flags of sensors, contacts and the solver.
 
-    Args:
-        model: what `m` and `d` were made of.
-    """
+def uncovered(model: mujoco.MjModel, m: Any, d: Any) -> list[str]:
+    """What the kernels are not for, in a few words each: they are for Euler's integrator, motors on
+    joints and sites, linear springs and dampers, and what the solver is for."""
     turns = np.isin(model.jnt_type, (types.JointType.FREE, types.JointType.BALL))
     at = model.actuator_trnid[:, 0]
     on_joint = model.actuator_trntype <= types.TrnType.JOINTINPARENT  # the same for hinges and slides
@@ -238,26 +237,46 @@ def adopt(model: mujoco.MjModel, m: Any, d: Any) -> bool:
     bias = model.actuator_biastype
     motors = on_joint & ~turns[np.where(on_joint, at, 0)] & (bias <= types.BiasType.AFFINE)
     thrusters = on_site & (bias == types.BiasType.NONE)
-    sizes = (model.nbody, model.njnt, model.nv, model.nu)
+    linear = (motors | thrusters).all() and (model.actuator_gaintype == types.GainType.FIXED).all()
+    shared = 4 * shared_size(*sizes_of(model)) * (THREADS // lanes_of(sizes_of(model)))
     batched = [getattr(m, name) for name in System.vars if hasattr(m, name)] + [m.opt.gravity]
-    if not (
-        solver_warp.adopt(model, m, d)
-        and m.opt.integrator == types.IntegratorType.EULER
-        and not m.opt.disableflags & ~int(types.DisableBit.SENSOR)
-        and not m.opt.enableflags
-        and m.opt.run_collision_detection
-        and not m.opt.run_rne_postconstraint
-        and not m.has_fluid
-        and not (model.na or model.ntendon or m.nhistory or m.nactuator != model.nu)
-        and (motors | thrusters).all()
-        and (model.actuator_gaintype == types.GainType.FIXED).all()
-        and not (m.jnt_actfrclimited.numpy().any() or m.body_gravcomp.numpy().any())
-        and not m.jnt_stiffness.numpy()[0, turns].any()
-        and not (m.jnt_stiffnesspoly.numpy().any() or m.dof_dampingpoly.numpy().any())
-        and not any(vars(m.callback).values())
-        and all(x.shape[0] == 1 for x in batched if x.ndim == 2 or x is m.opt.gravity)
-        and 4 * shared_size(*sizes) * (THREADS // lanes_of(sizes)) <= SHARED_MEMORY
-    ):
+    batched = [x for x in batched if x.ndim == 2 or x is m.opt.gravity]
+    stiff = m.jnt_stiffness.numpy()[0, turns].any()
+    found = {
+        "an integrator other than Euler": m.opt.integrator != types.IntegratorType.EULER,
+        "disabled features": m.opt.disableflags & ~int(types.DisableBit.SENSOR),
+        "enabled features": m.opt.enableflags,
+        "no collisions": not m.opt.run_collision_detection,
+        "sensors of forces between bodies": m.opt.run_rne_postconstraint,
+        "a fluid": m.has_fluid,
+        "tendons": model.ntendon,
+        "actuators with a state or a delay": model.na or m.nhistory or m.nactuator != model.nu,
+        "actuators that are no motors on joints or sites": not linear,
+        "limits on the forces of actuators at joints": m.jnt_actfrclimited.numpy().any(),
+        "compensated gravity": m.body_gravcomp.numpy().any(),
+        "springs of ball joints": stiff,
+        "springs or dampers that are not linear": (
+            m.jnt_stiffnesspoly.numpy().any() or m.dof_dampingpoly.numpy().any()
+        ),
+        "callbacks": any(vars(m.callback).values()),
+        "parameters that differ between worlds": any(x.shape[0] != 1 for x in batched),
+        f"{model.nbody} bodies": shared > SHARED_MEMORY,
+    }
+    return [*solver.uncovered(m, d), *(name for name, is_so in found.items() if is_so)]
+
+
+def adopt(model: mujoco.MjModel, m: Any, d: Any, upright: Sequence[str] = ()) -> bool:
+    """Have `step` and `forward` run `d` here, unless something is `uncovered`.
+
+    The solver may adopt `d` even so. The arrays of `m` and `d` are bound now, and options looked at:
+    later only what is written into these arrays counts, and flags of sensors, contacts and the solver.
+
+    Args:
+        model: what `m` and `d` were made of.
+        upright: the model's pillars, see `Simulation.pillars`.
+    """
+    solver.adopt(model, m, d)
+    if uncovered(model, m, d):
         return False
     p, extra = System(), tree(model)
     for name, x in extra.items():
@@ -271,10 +290,10 @@ def adopt(model: mujoco.MjModel, m: Any, d: Any) -> bool:
     p.rows, p.contacts = d.njmax, d.naconmax
     d.dynamics = Plan(
         system=p,
-        sizes=sizes,
+        sizes=sizes_of(model),
         damped=bool(m.dof_damping.numpy().any()),
         readable=bool(np.isin(model.sensor_type, READABLE).all()),
-        pillars=pillars_warp.adopt(model, m, d),
+        pillars=pillars.adopt(model, m, d, upright),
     )
     return True
 
@@ -305,12 +324,12 @@ def forward(m: Any, d: Any) -> None:
     collision_driver.collision(m, d)
     if plan.pillars:
         plan.pillars.contacts(d.nworld)
-    solver_warp.make_constraint(m, d)
+    solver.make_constraint(m, d)
     if sensors:
         d.sensordata.zero_()
         sensor.sensor_pos(m, d)
         sensor.sensor_vel(m, d)
-    solver_warp.solve(m, d)
+    solver.solve(m, d)
     if sensors:
         if m.sensor_rne_postconstraint:
             smooth.rne_postconstraint(m, d)

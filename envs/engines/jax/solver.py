@@ -25,7 +25,7 @@ import numpy as np
 from mujoco import mjx
 from mujoco.mjx._src import support
 
-from jaxsafe.envs.engines.physics import batched
+from jaxsafe.envs.engines.batching import batched
 
 TRIALS = 6  # of a step along a line; most take two, and none of 1,900 more than six
 FEW = 8  # one in so many worlds: when fewer are left, they go on alone

@@ -1,5 +1,5 @@
 // All that a state says before contacts: poses, inertia, velocities, forces without constraints. The
-// body of a function in dynamics_warp.py; BODIES, JOINTS, DOFS, ACTUATORS, LANES, WORLDS (of a block)
+// body of a function in dynamics.py; BODIES, JOINTS, DOFS, ACTUATORS, LANES, WORLDS (of a block)
 // and SHARED are constants there, p, for_sensors, block and thread its arguments. LANES threads share a
 // world.
 
