@@ -1,21 +1,25 @@
 """Write a page for each algorithm and each task from the code: python docs/pages.py
 
-Of an algorithm, docs/algorithms/NAME.md: equations, source and departures are the module's docstring;
+Of an algorithm, docs/algorithms/NAME.md: equations, source and departures are its config's docstring;
 settings and their origin are the lines of its config; results are those of docs/results. Of a task,
 docs/environments/NAME.md: objects, observations and costs are the environment's, how close it is to the
 original is the tables of docs/fidelity.md. A test holds the pages to the code.
 """
 
+import ast
 import dataclasses
 import importlib
 import inspect
+import io
 import math
 import re
 import sys
+import textwrap
+import tokenize
 from pathlib import Path
 from typing import Any
 
-from jaxsafe.algos import ALGOS, Entry
+from jaxsafe.algos import ALGOS, Row
 from jaxsafe.config import from_dict
 from jaxsafe.envs import ENVS
 from jaxsafe.run import compat, run_folder
@@ -61,12 +65,28 @@ def prose(docstring: str) -> tuple[str, str]:
     return title, "\n\n".join(blocks)
 
 
+def comments_of(cls: type) -> dict[str, str]:
+    """Field -> its comment: the lines of comment above the field and the one after its default."""
+    text = textwrap.dedent(inspect.getsource(cls))
+    tokens = [*tokenize.generate_tokens(io.StringIO(text).readline)]
+    notes = {t.start[0]: t.string.lstrip("# ") for t in tokens if t.type == tokenize.COMMENT}
+    alone = {line for line in notes if text.splitlines()[line - 1].startswith("    #")}
+    (tree,) = ast.parse(text).body
+    found = {}
+    for field in (node for node in ast.walk(tree) if isinstance(node, ast.AnnAssign)):
+        first = field.lineno
+        while first - 1 in alone:
+            first -= 1
+        lines = range(first, (field.end_lineno or field.lineno) + 1)
+        found[ast.unparse(field.target)] = " ".join(notes[line] for line in lines if line in notes)
+    return found
+
+
 def settings(config: type) -> str:
-    """A row a field: its default, and the comment beside it in the class that defines it."""
-    comments = {}
+    """A row a field: its default, and the comment in the class that defines it."""
+    comments: dict[str, str] = {}
     for cls in reversed(config.__mro__[:-1]):
-        for name, comment in re.findall(r"^    (\w+): .*?(?:  # (.*))?$", inspect.getsource(cls), re.M):
-            comments[name] = comment or comments.get(name, "")
+        comments |= {name: note or comments.get(name, "") for name, note in comments_of(cls).items()}
     rows = ["| setting | default | |", "|---|---|---|"]
     for field in dataclasses.fields(config):
         note = comments[field.name].replace("|", "\\|")
@@ -74,13 +94,13 @@ def settings(config: type) -> str:
     return "\n".join(rows)
 
 
-def published(entry: Entry) -> str:
+def published(row: Row) -> str:
     """What `preset=published` and `compat=omnisafe` change."""
     lines = []
-    for origin, options in entry.published.items():
+    for origin, options in row.published.items():
         changed = ", ".join(f"`{name}={value}`" for name, value in options.items())
         lines.append(f"`preset=published` ({origin}): {changed}.")
-    conventions = compat.overrides("omnisafe", entry.config)
+    conventions = compat.overrides("omnisafe", row.config)
     changed = ", ".join(f"`{name}={value}`" for name, value in conventions.items())
     lines.append(f"`compat=omnisafe` ([why](../howto/migrate.md#conventions)): {changed}.")
     return "\n\n".join(lines)
@@ -107,15 +127,15 @@ def measured(name: str) -> str:
         how += "".join(f", `algo.{k}={given[k]}`" for k in options if given[k] != usual[k])
         rows.append(f"| {how} | {ret} | {cost} | {results.published(config)} |")
     if not rows:
-        return "Not run at length yet; it learns the small exact problem of tests/test_on_policy.py."
+        return "Not run at length yet; it learns the small exact problem of tests/toys.py, Lever."
     head = "| 1e7 steps a seed, limit 25 | return, last 10% | cost | published |\n|---|---|---|---|\n"
     return head + "\n".join(rows)
 
 
 def page(name: str) -> str:
-    entry = ALGOS[name]
-    title, text = prose(importlib.import_module(entry.make.__module__).__doc__ or "")
-    module = entry.make.__module__.rsplit(".", 1)[1]
+    row = ALGOS[name]
+    title, text = prose(row.config.__doc__ or "")
+    module = row.config.__module__.rsplit(".", 1)[1]
     return f"""# {title.removesuffix(".")}
 
     python scripts/train.py env=point_goal1 algo={name}
@@ -126,11 +146,9 @@ The code: [algos/{module}.py](../../algos/{module}.py).
 
 ## Settings
 
-[O] is OmniSafe's default, [S] that of safety-starter-agents.
+{settings(row.config)}
 
-{settings(entry.config)}
-
-{published(entry)}
+{published(row)}
 
 ## Results
 
@@ -235,12 +253,16 @@ of boxes, vases and gremlins; those of Point's task. An episode has {env.episode
 """.replace("\n\n\n", "\n\n")
 
 
+def algorithms() -> str:
+    """The index of the algorithms' pages."""
+    lines = [f"| [`{name}`]({name}.md) | {row.summary} |" for name, row in ALGOS.items()]
+    return "# Algorithms\n\n| | |\n|---|---|\n" + "\n".join(lines) + "\n"
+
+
 def pages() -> dict[Path, str]:
     """Every page that is made, by its path."""
     found = {HERE / "algorithms" / f"{name}.md": page(name) for name in ALGOS}
-    lines = [f"| [`{name}`]({name}.md) | {entry.summary} |" for name, entry in ALGOS.items()]
-    index = "# Algorithms\n\n| | |\n|---|---|\n" + "\n".join(lines) + "\n"
-    found[HERE / "algorithms" / "README.md"] = index
+    found[HERE / "algorithms" / "README.md"] = algorithms()
     tasks = list(dict.fromkeys(name.split("_")[1] for name in ENVS))
     found |= {HERE / "environments" / f"{task}.md": task_page(task) for task in tasks}
     lines = ["| task | | costs |", "|---|---|---|"]

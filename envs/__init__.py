@@ -2,14 +2,11 @@
 that `register` adds."""
 
 import dataclasses
-import importlib
 import inspect
-import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
-from jaxsafe.config import ConfigError, convert, nearest
+from jaxsafe.config import ConfigError, convert, named_object, nearest
 from jaxsafe.envs.check import check_env
 from jaxsafe.envs.safety_gym import layout, suite
 from jaxsafe.envs.safety_gym.config import SafetyGymConfig, defaults, read
@@ -57,21 +54,7 @@ def load(address: str) -> None:
     Raises:
         ConfigError: no such module, or nothing of that name in it.
     """
-    module, _, name = address.partition(":")
-    if not (module and name):
-        raise ConfigError(f"env={address}: expected module:name")
-    if (here := str(Path.cwd())) not in sys.path:
-        sys.path.insert(0, here)
-    try:
-        found = importlib.import_module(module)
-    except ModuleNotFoundError as error:
-        if not error.name or not f"{module}.".startswith(f"{error.name}."):  # a module that it imports
-            raise
-        raise ConfigError(f"env={address}: no module {module!r} in {here} or installed") from error
-    if name not in vars(found):
-        public = [key for key in vars(found) if not key.startswith("_")]
-        raise ConfigError(f"env={address}: {module} has no {name!r}{nearest(name, public)}")
-    register(address, vars(found)[name])
+    register(address, named_object("env", address))
 
 
 def canonical(name: str) -> str:

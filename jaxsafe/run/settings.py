@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from jaxsafe import algos, envs
-from jaxsafe.algos import Entry as Row
+from jaxsafe.algos import Row
 from jaxsafe.config import ConfigError, flat, from_dict, is_float, nearest
 from jaxsafe.learn.constraints import check_names, own_limits
 from jaxsafe.run import distributed, run_folder
@@ -28,6 +28,7 @@ ON_RESUME = (
     "total_steps",
     "checkpoint_every",
     "checkpoint_iterations",
+    "checkpoint_replay",
     "eval_episodes",
     "video",
 )  # may change
@@ -49,6 +50,9 @@ BOUNDS = {
     "budget_init": (0.0, 1.0),
     "simmer_window": (1, math.inf),
     "value_coef": (0.0, math.inf),
+    "tau": (0.0, 1.0),
+    "alpha_init": (1e-10, math.inf),
+    "alpha_lr": (0.0, math.inf),
 }
 
 
@@ -71,6 +75,7 @@ class TrainConfig:
     init_from: str | None = None  # a run folder whose policy to start from
     checkpoint_every: float = 60.0  # s between checkpoints
     checkpoint_iterations: int = 0  # also after this many iterations; 0: by time alone
+    checkpoint_replay: bool | None = None  # keep the replay, to resume bit for bit; null: up to 2 GB
     eval_episodes: int = 20  # at the end, for each seed; 0: none
     video: bool = True  # of the first seed's policy, at the end
 
@@ -269,11 +274,11 @@ def load(kind: str, name: str) -> None:
 
 def algo_options(row: Row, preset: str = "fast", compat: str = "none") -> dict[str, Any]:
     """The defaults of an algorithm; those of `preset` if it has that one."""
-    options = presets(row).get(preset, {}) | overrides(compat, row.config)
+    options = {**presets(row).get(preset, {}), **overrides(compat, row.config)}
     return dataclasses.asdict(row.config(**options))
 
 
-def presets(row: Row) -> dict[str, dict[str, Any]]:
+def presets(row: Row) -> dict[str, Mapping[str, Any]]:
     """Overrides by name: 'fast' has none, 'published' is the first of the published settings."""
     first = next(iter(row.published.values()), None)
     return {"fast": {}, **({} if first is None else {"published": first}), **row.published}

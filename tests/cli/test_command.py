@@ -36,6 +36,7 @@ from toys import FIRST
 
 from jaxsafe import algos, envs
 from jaxsafe.config import ConfigError
+from jaxsafe.learn.conventions import conventions
 from jaxsafe.run import (
     arguments,
     checkpoint,
@@ -145,12 +146,11 @@ def test_the_conventions_of_omnisafe_are_defaults_of_either_preset():
         assert found.plain()["compat"] == "omnisafe"
 
 
-def test_each_convention_is_of_some_algorithm_and_differs_from_its_defaults():
-    for convention in compat.OMNISAFE:
-        takers = [e.config for e in algos.ALGOS.values() if convention.applies(e.config)]
-        assert takers
-        for config in takers:
-            assert all(getattr(config(), k) != v for k, v in convention.options.items())
+def test_each_convention_differs_from_the_defaults_of_every_algorithm_that_has_it():
+    for row in algos.ALGOS.values():
+        assert compat.overrides("omnisafe", row.config)
+        for convention in conventions(row.config):
+            assert all(getattr(row.config(), k) != v for k, v in convention.options.items())
 
 
 @pytest.fixture(scope="module")
