@@ -1,5 +1,7 @@
 """What holds for every on-policy algorithm, without compiling one."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import pytest
@@ -12,7 +14,7 @@ from jaxsafe.config import ConfigError
 NAMES = on_policy_names()
 
 
-def shapes(name, env=Corridor(), **options):  # noqa: B008
+def shapes(name, env: Any = Corridor(), **options):  # noqa: B008
     """The train state before and after an update, and its metrics, as shapes."""
     algo, cfg = ALGOS[name].make(env), ALGOS[name].config(**TINY | options)
     before = jax.eval_shape(lambda: algo.init(jax.random.key(0), cfg, FIRST))
