@@ -5,7 +5,8 @@
 
 A checkpoint is written under a temporary name and renamed when it is complete, so a folder
 with a number for a name is whole unless the disk lost bytes; the checksums catch that.
-Random keys are stored as their key data, empty leaves not at all.
+Random keys are stored as their key data, empty leaves not at all. The replay of an off-policy
+algorithm may be left out, as it can be large; a run that is resumed without it fills it anew.
 """
 
 import hashlib
@@ -24,6 +25,8 @@ import orbax.checkpoint as ocp
 from jaxsafe.types import PyTree
 
 KEEP = 2  # the newest ones that stay
+REPLAY = "replay"  # the part of a train state that may be left out
+SMALL_REPLAY = 2e9  # bytes up to which it is kept, unless the user says otherwise
 
 
 class CheckpointError(RuntimeError):
@@ -37,6 +40,7 @@ class Manifest(NamedTuple):
     steps: int  # environment steps of one seed
     files: dict[str, str]  # path under the checkpoint -> SHA-256
     leaves: dict[str, tuple[str, tuple[int, ...]]]  # name -> dtype, shape
+    since: int = 0  # the iteration from which on its replay holds everything, see types.Shared
 
 
 def is_key(leaf: Any) -> bool:
@@ -80,9 +84,31 @@ def orbax_checkpointer() -> ocp.Checkpointer:
     return ocp.Checkpointer(handler, multiprocessing_options=alone)
 
 
-def save(folder: Path, ts: PyTree, iteration: int, steps: int) -> Path:
+def in_replay(name: str) -> bool:
+    return name.split(".")[0] == REPLAY
+
+
+def replay_bytes(like: PyTree) -> int:
+    """What the replay of a train state takes, 0 without one; `like` is arrays or their shapes."""
+    return sum(x.size * x.dtype.itemsize for name, x in as_data(like).items() if in_replay(name))
+
+
+def keeps_replay(like: PyTree, wanted: bool | None) -> bool:
+    """Whether checkpoints hold the replay of such a train state, by the setting `checkpoint_replay`."""
+    return replay_bytes(like) <= SMALL_REPLAY if wanted is None else wanted
+
+
+def save(
+    folder: Path, ts: PyTree, iteration: int, steps: int, since: int = 0, replay: bool = True
+) -> Path:
     """Write `ts` as the newest checkpoint under `folder` and drop all but the last `KEEP`.
 
+    Args:
+        folder: holds the numbered checkpoints.
+        ts: the train state.
+        iteration, steps: how far it is; steps are of one seed.
+        since: the iteration from which on its replay holds everything.
+        replay: whether to keep the replay.
     Raises:
         CheckpointError: it could not be written (a full disk); earlier checkpoints stay.
     """
@@ -91,7 +117,8 @@ def save(folder: Path, ts: PyTree, iteration: int, steps: int) -> Path:
         for leftover in folder.glob("*.part"):  # of a process that was killed
             shutil.rmtree(leftover)
         part.mkdir(parents=True)
-        arrays = to_arrays(ts)
+        named = zip(leaf_names(ts), jax.tree.leaves(ts), strict=True)
+        arrays = to_arrays({name: x for name, x in named if replay or not in_replay(name)})
         with orbax_checkpointer() as orbax:
             orbax.save(
                 (part / "state").absolute(),
@@ -100,6 +127,7 @@ def save(folder: Path, ts: PyTree, iteration: int, steps: int) -> Path:
         manifest = {
             "iteration": iteration,
             "steps": steps,
+            "since": since,
             "files": {name: digest(part / name) for name in files(part)},
             "leaves": {k: [str(v.dtype), list(v.shape)] for k, v in arrays.items()},
         }
@@ -125,6 +153,8 @@ def restore(
 ) -> tuple[PyTree, Manifest]:
     """The newest sound checkpoint under `folder`, in the structure of `like`.
 
+    A replay that was left out comes back empty, and `since` in the manifest is then its iteration.
+
     Args:
         folder: holds the numbered checkpoints.
         like: arrays, or `jax.eval_shape`s, that fix names, shapes and dtypes.
@@ -134,6 +164,11 @@ def restore(
     """
     arrays, manifest = load(folder, warn)
     expected = as_data(like)
+    if replay_bytes(like) and not any(map(in_replay, manifest.leaves)):
+        empty = {name: np.zeros(x.shape, x.dtype) for name, x in expected.items() if in_replay(name)}
+        arrays |= empty
+        known = {name: (str(x.dtype), x.shape) for name, x in empty.items()}
+        manifest = manifest._replace(leaves=manifest.leaves | known, since=manifest.iteration)
     for name in sorted({*expected, *manifest.leaves}):
         want = (str(expected[name].dtype), tuple(expected[name].shape)) if name in expected else None
         if (have := manifest.leaves.get(name)) != want:
@@ -167,7 +202,8 @@ def read_manifest(path: Path) -> Manifest:
         str(k): (str(dtype), tuple(int(n) for n in shape))
         for k, (dtype, shape) in raw["leaves"].items()
     }
-    return Manifest(int(raw["iteration"]), int(raw["steps"]), dict(raw["files"]), leaves)
+    since = int(raw.get("since", 0))  # of 0.1, which had no replay, absent
+    return Manifest(int(raw["iteration"]), int(raw["steps"]), dict(raw["files"]), leaves, since)
 
 
 def verify(path: Path, manifest: Manifest) -> None:

@@ -60,12 +60,14 @@ def train(
             f"stopped before the first update; {resume_command if resuming else 'nothing to save'}"
         )
         begun = time.perf_counter()
-        iteration = 0
+        iteration = since = 0
+        like = jax.eval_shape(program.init, program.start, Shared(np.int32(0)))
+        keeps_replay = checkpoint.keeps_replay(like, settings.checkpoint_replay)
         if resuming:
-            like = jax.eval_shape(program.init, program.start, Shared(np.int32(0)))
-            ts, iteration = restored(store, like, report)
+            ts, iteration, since = restored(store, like, report)
             ts = distributed.place(ts, program.sharding)
-            report.line(f"resuming at {iteration * per_update:,} steps")
+            empty = ", with an empty replay" if iteration and since == iteration else ""
+            report.line(f"resuming at {iteration * per_update:,} steps{empty}")
         else:
             start = distributed.place(program.start, program.sharding)
             ts = jax.jit(program.init)(start, Shared(np.int32(0)))
@@ -86,27 +88,31 @@ def train(
         ) as log:
             limits = [m.algo.cost_limit for m in program.members if not own_limits(m.algo)]
             report.start(iterations * per_update, iteration * per_update, limits)
-            saved_at = time.perf_counter()
+            saved_at, pause = time.perf_counter(), settings.checkpoint_every
             while iteration < iterations:
-                ts, metrics = update(ts, Shared(np.int32(iteration)))
+                ts, metrics = update(ts, Shared(np.int32(iteration), np.int32(since)))
                 metrics, iteration = distributed.whole(metrics), iteration + 1
                 if log:
                     log.append(iteration, metrics)
                 by_count = (
                     settings.checkpoint_iterations and iteration % settings.checkpoint_iterations == 0
                 )
-                late = time.perf_counter() - saved_at >= settings.checkpoint_every
+                late = time.perf_counter() - saved_at >= pause
                 stopping, by_time = vote(stop.requested, late)
                 if stopping or by_count or by_time or iteration == iterations:
+                    saving = time.perf_counter()
                     state = distributed.whole(ts)
+                    steps = iteration * per_update
                     if log:
                         log.sync()
-                        checkpoint.save(store, state, iteration, iteration * per_update)
+                        checkpoint.save(store, state, iteration, steps, since, keeps_replay)
                         acting = jax.tree.map(
                             lambda x: x[: len(program.members)], program.params(state)
                         )
-                        checkpoint.save(folder / "policy", acting, iteration, iteration * per_update)
+                        checkpoint.save(folder / "policy", acting, iteration, steps)
                     saved_at = time.perf_counter()
+                    if keeps_replay and checkpoint.replay_bytes(like):  # at most 5% of the time
+                        pause = max(settings.checkpoint_every, 19 * (saved_at - saving))
                 if stopping:
                     break
         report.stop()
@@ -116,15 +122,16 @@ def train(
     return Outcome(ts, iteration, iteration * per_update, interrupted)
 
 
-def restored(store: Path, like: PyTree, report: Report) -> tuple[PyTree, int]:
-    """The train state of the newest sound checkpoint that process 0 finds, and its iteration."""
+def restored(store: Path, like: PyTree, report: Report) -> tuple[PyTree, int, int]:
+    """The train state of the newest sound checkpoint that process 0 finds, its iteration, and the one
+    from which on its replay holds everything."""
     if jax.process_count() == 1:
         ts, manifest = checkpoint.restore(store, like, report.line)
-        return ts, manifest.iteration
+        return ts, manifest.iteration, manifest.since
     arrays = {name: np.zeros(x.shape, x.dtype) for name, x in checkpoint.as_data(like).items()}
-    iteration = 0
+    clock = np.zeros(2, int)
     if distributed.leads():
         ts, manifest = checkpoint.restore(store, like, report.line)
-        arrays, iteration = checkpoint.to_arrays(ts), manifest.iteration
-    arrays, known = distributed.first((arrays, np.array(iteration)))
-    return checkpoint.from_arrays(like, arrays), int(known)
+        arrays, clock = checkpoint.to_arrays(ts), np.array([manifest.iteration, manifest.since])
+    arrays, (iteration, since) = distributed.first((arrays, clock))
+    return checkpoint.from_arrays(like, arrays), int(iteration), int(since)

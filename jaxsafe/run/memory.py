@@ -37,18 +37,19 @@ def check_memory(env: Env, algo_config: Any, num_members: int, devices: int) -> 
 
 
 def check_state_memory(program: Program, settings: TrainConfig) -> None:
-    """Like `check_memory`, for the train state itself (old and new), known once it is traced."""
+    """Like `check_memory`, for the train state itself, known once it is traced: old and new, but a
+    replay only once, as it is written in place."""
     limit, what = device_memory()
-    leaves = jax.tree.leaves(jax.eval_shape(program.init, program.start, Shared(np.int32(0))))
-    need = (
-        2
-        * sum(x.size * (8 if checkpoint.is_key(x) else x.dtype.itemsize) for x in leaves)
-        // settings.devices
-    )
+    like = jax.eval_shape(program.init, program.start, Shared(np.int32(0)))
+    whole = sum(x.size * x.dtype.itemsize for x in checkpoint.as_data(like).values())
+    replay = checkpoint.replay_bytes(like)
+    need = (2 * (whole - replay) + replay) / settings.devices
     if need > limit:
+        part = f" ({replay / settings.devices / 2**30:,.1f} GiB of it replay)" if replay else ""
+        less = "a smaller algo.replay_size or " if replay > whole / 2 else "fewer num_envs or "
         raise TooLarge(
-            f"the train state needs {need / 2**30:,.1f} GiB a device, {what} has {limit / 2**30:,.1f}; "
-            "use fewer num_envs or num_seeds"
+            f"the train state needs {need / 2**30:,.1f} GiB a device{part}, {what} has "
+            f"{limit / 2**30:,.1f}; use {less}num_seeds"
         )
 
 

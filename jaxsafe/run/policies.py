@@ -4,7 +4,6 @@ A policy is what acts: networks, normaliser, config. It has a file of its own be
 Nothing in the folder is executed.
 """
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -89,14 +88,11 @@ def policy_of(settings: Settings, env: Env, folder: Path) -> tuple[Algorithm, Py
     """The algorithm, and what acts of the newest policy of each member, [S, ...]."""
     algo = settings.row.make(env, None)
 
-    def one_step(cfg: Any) -> Any:
-        return dataclasses.replace(cfg, num_envs=1, horizon=1, minibatches=1)
-
     def first(cfg: Any) -> PyTree:
         return algo.params(algo.init(jax.random.key(0), cfg, Shared(np.int32(0))))
 
     run = members(settings.configs, settings.train)
-    floats = jax.tree.map(lambda *x: np.array(x, np.float32), *[one_step(m.algo) for m in run])
+    floats = jax.tree.map(lambda *x: np.array(x, np.float32), *[m.algo for m in run])
     like = jax.eval_shape(first, jax.tree.map(lambda x: x[0], floats))
     arrays = read_policy(folder, len(run))
     return algo, acting(like, arrays, floats, folder)

@@ -2,6 +2,7 @@
 
 import datetime
 import json
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -17,9 +18,9 @@ from jaxsafe.run.interrupts import Interrupts
 from jaxsafe.run.memory import check_memory, check_state_memory
 from jaxsafe.run.policies import warm_start
 from jaxsafe.run.progress import Report
-from jaxsafe.run.settings import NOT_COMPARED, Settings, differences, make_env, settle
+from jaxsafe.run.settings import NOT_COMPARED, Settings, TrainConfig, differences, make_env, settle
 from jaxsafe.run.spread import Program, build
-from jaxsafe.types import Env
+from jaxsafe.types import Env, Shared
 
 
 class Session(NamedTuple):
@@ -127,6 +128,20 @@ def prepare(settings: Settings) -> tuple[Env, Program]:
     return env, program
 
 
+def about_replay(program: Program, train: TrainConfig) -> str:
+    """How large the replay of a seed is, and what a resumed run does without it; '' of none."""
+    like = jax.eval_shape(program.init, program.start, Shared(np.int32(0)))
+    size = checkpoint.replay_bytes(like)
+    if not size:
+        return ""
+    rows = next(x for name, x in checkpoint.as_data(like).items() if checkpoint.in_replay(name))
+    each = math.prod(rows.shape[:3]) // len(program.members)  # [members or devices, R, N, ...]
+    line = f"replay of {each:,} transitions a seed, {size / 1e9:.2f} GB in all"
+    if checkpoint.keeps_replay(like, train.checkpoint_replay):
+        return line
+    return f"{line}, not kept in checkpoints: a resumed run first fills it anew with its policy"
+
+
 def run(session: Session, report: Report, finish: Finish) -> int:
     """Train, then `finish`. Returns the exit status: 0, or 130 if the user stopped it."""
     settings, folder, env, program, again = session
@@ -154,6 +169,8 @@ def run(session: Session, report: Report, finish: Finish) -> int:
         f"jaxsafe {jaxsafe.__version__} | {settings.env_name} | {settings.algo_name} | "
         f"{several}{seeds} | {where} | compiling rollout and update{kernels} ..."
     )
+    if line := about_replay(program, train):
+        report.line(line)
     outcome = loop.train(program, train, folder, report, again, adapt)
     distributed.leave()
     if outcome.interrupted:

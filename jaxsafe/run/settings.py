@@ -28,6 +28,7 @@ ON_RESUME = (
     "total_steps",
     "checkpoint_every",
     "checkpoint_iterations",
+    "checkpoint_replay",
     "eval_episodes",
     "video",
 )  # may change
@@ -49,6 +50,9 @@ BOUNDS = {
     "budget_init": (0.0, 1.0),
     "simmer_window": (1, math.inf),
     "value_coef": (0.0, math.inf),
+    "tau": (0.0, 1.0),
+    "alpha_init": (1e-10, math.inf),
+    "alpha_lr": (0.0, math.inf),
 }
 
 
@@ -71,6 +75,7 @@ class TrainConfig:
     init_from: str | None = None  # a run folder whose policy to start from
     checkpoint_every: float = 60.0  # s between checkpoints
     checkpoint_iterations: int = 0  # also after this many iterations; 0: by time alone
+    checkpoint_replay: bool | None = None  # keep the replay, to resume bit for bit; null: up to 2 GB
     eval_episodes: int = 20  # at the end, for each seed; 0: none
     video: bool = True  # of the first seed's policy, at the end
 

@@ -99,3 +99,18 @@ def test_what_a_killed_process_left_behind_is_ignored_and_cleared(tmp_path):
     assert [p.name for p in checkpoints(tmp_path)] == ["00000001"]
     save(tmp_path, state(), 3, 3)
     assert not list(tmp_path.glob("*.part"))
+
+
+def test_a_replay_that_is_left_out_comes_back_empty_and_says_since_when(tmp_path):
+    ts = state() | {"replay": {"obs": jnp.ones((5, 2)), "first": jnp.ones(5, bool)}}
+    assert checkpoint.replay_bytes(ts) == 5 * 2 * 4 + 5
+    save(tmp_path, ts, 7, 70, since=2)
+    kept, manifest = restore(tmp_path, ts)
+    assert_same(kept, ts)
+    assert manifest.since == 2
+    save(tmp_path, ts, 8, 80, since=2, replay=False)
+    back, manifest = restore(tmp_path, ts)
+    assert_same(back, ts | {"replay": jax.tree.map(jnp.zeros_like, ts["replay"])})
+    assert (manifest.iteration, manifest.since) == (8, 8)
+    save(tmp_path, state(), 9, 90)  # of another algorithm: its replay is not empty but absent
+    assert checkpoint.replay_bytes(state()) == 0 and restore(tmp_path, state())[1].since == 0

@@ -1,0 +1,227 @@
+"""A replay: the latest rows of every environment, in a ring on the device.
+
+A row describes the arrival at an observation, and then the action that was taken from it:
+
+    row t:  first_t  obs_t  reward_t  cost_t  terminated_t  truncated_t  |  action_t
+
+Environments reset on the next step. The last observation of an episode has a row of its own, whose
+action is ignored, and the row after it is the first of the next episode. So row t + 1 is always what
+follows row t, one observation a row is enough, and each episode takes one row more than it has steps.
+
+The ring has R rows of N environments, leaves [R, N, ...]. Which rows are written next and which ones
+the ring holds are functions of the loop's clock. They are the same for all members of a `vmap`, so
+that writing is one `dynamic_update_slice` into a donated ring and never a scatter.
+
+Positions count from the oldest row that the ring holds: 0 is the oldest, `count - 1` the newest.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from jaxsafe.types import Count, PyTree
+
+
+@flax.struct.dataclass
+class Row:
+    """The arrival at `obs` and the action taken from it; every field is [..., N, ...].
+
+    obs: pytree, in its own dtypes. action: float [..., A], ignored where the episode has ended.
+    reward, cost: float [...], costs: float [..., K], all of the step that led to `obs`; 0 where
+    `first`. first: bool [...], a reset led to `obs`. terminated, truncated: bool [...].
+    """
+
+    obs: PyTree
+    action: jax.Array
+    reward: jax.Array
+    cost: jax.Array
+    costs: jax.Array
+    first: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+
+    @property
+    def last(self) -> jax.Array:
+        return self.terminated | self.truncated
+
+
+class Span(NamedTuple):
+    """The rows that a ring holds: `count` of them, int32 [], from row `oldest`, int32 []."""
+
+    oldest: jax.Array
+    count: jax.Array
+
+
+class Index(NamedTuple):
+    """Rows of a ring, by their positions and environments: int32 of one shape."""
+
+    position: jax.Array
+    env: jax.Array
+
+
+class Transitions(NamedTuple):
+    """B transitions of up to n steps.
+
+    obs: pytree [B, ...]. action: float [B, A]. next_obs: pytree [B, ...], the observation after
+    `steps` steps, int [B]. reward, cost: float [B], costs: float [B, K], discounted sums over those
+    steps. terminated: bool [B], next_obs has no value. weight: float [B], 0 for what must not count,
+    else 1: take means over weights.
+    """
+
+    obs: PyTree
+    action: jax.Array
+    reward: jax.Array
+    cost: jax.Array
+    costs: jax.Array
+    next_obs: PyTree
+    steps: jax.Array
+    terminated: jax.Array
+    weight: jax.Array
+
+
+# (ring, span, index) -> the observations there, pytree [B, ...]
+Look = Callable[[Row, Span, Index], PyTree]
+
+
+def ring_rows(transitions: int, num_envs: int, block: int) -> int:
+    """R, rows for about so many transitions of all environments: whole blocks, the nearest number."""
+    return max(1, round(transitions / (num_envs * block))) * block
+
+
+def empty_ring(row: Row, rows: int) -> Row:
+    """A ring for rows like `row` [N, ...], arrays or their shapes."""
+    return jax.tree.map(lambda x: jnp.zeros((rows, *x.shape), x.dtype), row)
+
+
+def held(rows: int, block: int, written: Count, iteration: Count, since: Count) -> Span:
+    """What a ring of `rows` rows holds in the course of an iteration.
+
+    Args:
+        rows: R, a multiple of `block`.
+        block: rows that an iteration writes.
+        written: how many of them it has written by now.
+        iteration, since: int32 [], the loop's clock, and the iteration that wrote the oldest rows.
+    """
+    blocks = rows // block
+    end = (iteration % blocks) * block + written
+    count = jnp.minimum(jnp.minimum(iteration - since, blocks) * block + written, rows)
+    return Span((end - count) % rows, count)
+
+
+def write(ring: Row, new: Row, span: Span) -> Row:
+    """`ring` with the rows `new` [T, N, ...] after those of `span`; T divides the rows of the ring."""
+    end = (span.oldest + span.count) % ring.reward.shape[0]
+
+    def put(ring: jax.Array, new: jax.Array) -> jax.Array:
+        return jax.lax.dynamic_update_slice_in_dim(ring, new, end, axis=0)
+
+    return jax.tree.map(put, ring, new)
+
+
+def take(leaves: PyTree, span: Span, index: Index) -> PyTree:
+    """The entries of `leaves` [R, N, ...] at `index`, a pytree of [B, ...]."""
+
+    def entries(x: jax.Array) -> jax.Array:
+        rows = jax.lax.rem(span.oldest + index.position, jnp.int32(x.shape[0]))
+        return x.at[rows, index.env].get(mode="promise_in_bounds")
+
+    return jax.tree.map(entries, leaves)
+
+
+def draw(key: jax.Array, ring: Row, span: Span, batch: int, ahead: int = 1) -> Index:
+    """`batch` rows, uniformly and with replacement, of those with `ahead` rows after them."""
+    position_key, env_key = jax.random.split(key)
+    choices = jnp.maximum(span.count - ahead, 1)
+    return Index(
+        jax.random.randint(position_key, (batch,), 0, choices),
+        jax.random.randint(env_key, (batch,), 0, ring.reward.shape[1]),
+    )
+
+
+def one_frame(ring: Row, span: Span, index: Index) -> PyTree:
+    return take(ring.obs, span, index)
+
+
+def frames(count: int) -> Look:
+    """Looks at the last `count` observations at once, [B, count, ...], the oldest first.
+
+    Before an episode's first observation, or before the oldest row, the earliest one is repeated.
+    """
+
+    def look(ring: Row, span: Span, index: Index) -> PyTree:
+        back = jnp.arange(count)[:, None]  # [count, 1]
+        earlier = jnp.maximum(index.position - back, 0)
+        begins = take(ring.first, span, Index(earlier, index.env)) | (earlier == 0)
+        age = jnp.argmax(begins, axis=0)  # rows back to the episode's first
+        age = jnp.where(begins.any(axis=0), age, count - 1)
+        source = index.position - jnp.minimum(back, age)[::-1]
+        stacked = take(ring.obs, span, Index(source, jnp.broadcast_to(index.env, source.shape)))
+        return jax.tree.map(lambda x: jnp.moveaxis(x, 0, 1), stacked)
+
+    return look
+
+
+def transitions(
+    ring: Row,
+    span: Span,
+    index: Index,
+    *,
+    discount: jax.Array | float,
+    cost_discount: jax.Array | float,
+    n_step: int = 1,
+    look: Look = one_frame,
+) -> Transitions:
+    """The transitions that begin at `index`, which has a row after it.
+
+        reward = sum_{j<k} discount^j r_{t+1+j},   next_obs = obs_{t+k},   k <= n_step
+
+    k is smaller than n_step where the episode ends sooner, or where the ring holds fewer rows. An
+    episode's last row begins nothing: its weight is 0.
+
+    Args:
+        discount, cost_discount: scalars, of rewards and of costs within the n steps.
+        look: what is observed at a row, `one_frame` or `frames(count)`.
+    """
+    ahead = index.position + jnp.arange(n_step + 1)[:, None]  # [n + 1, B]
+    inside = ahead[1:] < span.count
+    window = Index(jnp.minimum(ahead, span.count - 1), jnp.broadcast_to(index.env, ahead.shape))
+    kept = (ring.reward, ring.cost, ring.costs, ring.terminated, ring.last)
+    reward, cost, costs, terminated, last = take(kept, span, window)
+    happened = jnp.cumprod(~last[:-1] & inside, axis=0).astype(bool)  # [n, B]
+    steps = happened.sum(0)
+    end = Index(index.position + steps, index.env)
+
+    def total(x: jax.Array, discount: jax.Array | float) -> jax.Array:
+        """Over the steps that happened, of x [n + 1, B, ...]."""
+        like_x = (-1, *(1,) * (x.ndim - 1))
+        factors = (jnp.asarray(discount) ** jnp.arange(n_step)).reshape(like_x)
+        counts = happened.reshape(*happened.shape, *(1,) * (x.ndim - 2))
+        return jnp.where(counts, factors * x[1:], 0).sum(0)
+
+    return Transitions(
+        obs=look(ring, span, index),
+        action=take(ring.action, span, index),
+        reward=total(reward, discount),
+        cost=total(cost, cost_discount),
+        costs=total(costs, cost_discount),
+        next_obs=look(ring, span, end),
+        steps=steps,
+        terminated=jnp.take_along_axis(terminated, steps[None], axis=0)[0],
+        weight=(steps > 0).astype(jnp.float32),
+    )
+
+
+def sequences(ring: Row, span: Span, index: Index, length: int) -> Row:
+    """Rows [length, B, ...] from `index` on, for models with a memory.
+
+    A sequence may contain ends: it goes on with the next episode, whose row is `first`. The one that
+    passes the newest row goes on with the oldest, which is marked `first` too. So the draw needs no
+    rows ahead, every row is in as many sequences as any other, and a memory that is begun anew at
+    `first` never sees two episodes.
+    """
+    position = (index.position + jnp.arange(length)[:, None]) % span.count
+    rows = take(ring, span, Index(position, jnp.broadcast_to(index.env, position.shape)))
+    return rows.replace(first=rows.first | (position == 0))

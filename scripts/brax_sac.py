@@ -1,0 +1,37 @@
+"""Train SAC on a task of Brax, which has no cost: python scripts/brax_sac.py [TASK] [key=value ...]
+
+    python scripts/brax_sac.py halfcheetah                       # 3e6 steps
+    python scripts/brax_sac.py ant preset=parallel total_steps=1e6 num_seeds=4
+
+Options are those of scripts/train.py, without lists. The run folder, its curves and its evaluation are
+those of every run. Backends differ in their physics: figures are comparable within one alone.
+"""
+
+import argparse
+
+import brax.envs
+import yaml
+
+import jaxsafe
+from jaxsafe.interop.brax import from_brax
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("task", nargs="?", default="halfcheetah", help="of brax.envs (halfcheetah)")
+    parser.add_argument("options", nargs="*", metavar="key=value")
+    parser.add_argument("--backend", default="generalized", help="of Brax (generalized)")
+    args = parser.parse_args()
+    options = {"total_steps": 3_000_000, "video": False}
+    for text in args.options:
+        name, _, value = text.partition("=")
+        options[name] = yaml.safe_load(value)
+    env = from_brax(brax.envs.get_environment(args.task, backend=args.backend), costs=())
+    run = jaxsafe.train(env, options.pop("algo", "sac"), **options)
+    print(jaxsafe.evaluate(run))
+
+
+if __name__ == "__main__":
+    main()

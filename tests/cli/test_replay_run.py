@@ -1,0 +1,77 @@
+"""Runs with a replay: stopped, killed, resumed, and too large."""
+
+import numpy as np
+import pytest
+from shell import TOY, assert_same_run, start, typed, wait_for
+
+from jaxsafe.run import checkpoint, run_folder
+from jaxsafe.run.run_folder import read_metrics
+
+SAC = (
+    TOY, "algo=sac", "num_envs=4", "algo.horizon=8", "algo.learn_every=4", "algo.batch_size=16",
+    "algo.replay_ratio=4", "algo.replay_size=250", "algo.learning_starts=64", "algo.hidden=[8]",
+    "eval_episodes=2", "video=false",
+)  # fmt: skip
+STEPS = 32  # of an update
+END = 30 * STEPS
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    run = tmp_path_factory.mktemp("whole") / "run"
+    assert typed("train", *SAC, f"total_steps={END}", f"run_dir={run}") == 0
+    return run
+
+
+def test_killed_and_resumed_with_its_replay_it_ends_bit_for_bit_as_if_uninterrupted(
+    whole, tmp_path, capsys
+):
+    run = tmp_path / "run"
+    args = (*SAC, f"total_steps={END}", f"run_dir={run}", "checkpoint_iterations=1")
+    process = start("train", *args, cwd=tmp_path)
+    wait_for(lambda: len(checkpoint.checkpoints(run / "checkpoints")) == 2, process)
+    process.kill()
+    process.communicate()
+    reached = run_folder.progress(run)
+    assert reached is not None and 0 < reached[0] < 30, "killed too late to test anything"
+    assert typed("train", *args, "resume=true") == 0
+    said = capsys.readouterr().out
+    assert "replay of 256 transitions a seed, 0.00 GB in all\n" in said and "empty" not in said
+    assert_same_run(run, whole)
+
+
+def test_resumed_without_its_replay_it_fills_it_anew_before_it_learns_on(tmp_path, capsys):
+    run = tmp_path / "run"
+    args = (*SAC, f"run_dir={run}", "checkpoint_replay=false", "eval_episodes=0")
+    assert typed("train", *args, f"total_steps={8 * STEPS}") == 0
+    said = capsys.readouterr().out
+    assert "not kept in checkpoints: a resumed run first fills it anew with its policy" in said
+    arrays, manifest = checkpoint.load(run / "checkpoints")
+    assert not any(map(checkpoint.in_replay, arrays)) and manifest.since == 0
+    assert typed("train", *args, f"total_steps={12 * STEPS}", "resume=true") == 0
+    assert "resuming at 256 steps, with an empty replay" in capsys.readouterr().out
+    losses = read_metrics(run)["train/critic_loss"]
+    learns = np.isfinite(losses)
+    # 64 steps are 2 updates: the second learns once it has all of them
+    assert learns.tolist() == [False, *[True] * 7, False, *[True] * 3]
+    # with the replay kept from here on, the gap before it is remembered
+    again = (*SAC, f"run_dir={run}", "eval_episodes=0", f"total_steps={14 * STEPS}", "resume=true")
+    assert typed("train", *again) == 0
+    assert checkpoint.load(run / "checkpoints")[1].since == 12
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        (["algo.replay_size=1e13"], "GiB of it replay"),
+        (["algo.n_step=300"], "replay_size=250 holds 64 steps of 4 environments"),
+        (["algo.batch_size=1000"], "the nearest that fit are"),
+        (["algo.replay_ratio=0"], "replay_ratio=0: expected at least 1"),
+        (["algo.alpha_init=-1"], "algo.alpha_init=-1.0: expected at least 1e-10"),
+        (["algo.tau=nan"], "algo.tau=nan: expected between 0 and 1"),
+    ],
+)
+def test_what_cannot_work_is_one_line(tmp_path, capsys, options, message):
+    assert typed("train", *SAC, f"run_dir={tmp_path / 'run'}", *options) == 2
+    said = capsys.readouterr()
+    assert message in said.out + said.err and len((said.out + said.err).strip().splitlines()) == 1
