@@ -41,7 +41,11 @@ def start(name, env, **settings):
 
 def run(env, num_envs, horizon, policy, **options):
     rollout = init_rollout(env, jax.random.key(0), num_envs, stagger=False)
-    step = jax.jit(partial(collect, env, policy, horizon=horizon, **options))
+
+    def behave(carry, obs, first, key):
+        return *policy(obs, key), carry
+
+    step = jax.jit(partial(collect, env, behave, horizon=horizon, **options))
     return step(rollout, key=jax.random.key(1))[1]
 
 
