@@ -19,7 +19,8 @@ from jaxsafe.run.settings import NOT_COMPARED, REGISTERED, Entries, settle
 from jaxsafe.run.spread import members
 
 # Fields that do not make another setting.
-NOT_A_SETTING = {"seed", "num_seeds", "num_envs", "devices", *NOT_COMPARED} - {"total_steps"}
+NOT_A_SETTING = {"seed", "num_seeds", "num_envs", "devices", *NOT_COMPARED}
+NOT_A_SETTING -= {"total_steps", "total_updates"}
 
 NEEDED = ("iteration", "steps", "seed", "train/return", "train/cost")  # columns
 
@@ -41,7 +42,15 @@ class Run(NamedTuple):
 
     @property
     def steps(self) -> int:
-        return int(self.table["steps"].max())
+        """Environment steps, or gradient steps where training takes none."""
+        return int(self.table[run_folder.clock_of(self.table)].max())
+
+    @property
+    def ended(self) -> bool:
+        """Whether training is at the end that its config gives."""
+        if (updates := self.config["total_updates"]) is not None:
+            return int(self.table["updates"].max()) >= updates
+        return self.steps >= self.config["total_steps"]
 
 
 def read(paths: Iterable[Path]) -> list[Run]:

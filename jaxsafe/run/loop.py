@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from jaxsafe.learn.constraints import own_limits
-from jaxsafe.run import checkpoint, distributed, spread
+from jaxsafe.run import checkpoint, clock, distributed, spread
 from jaxsafe.run.interrupts import Interrupts
 from jaxsafe.run.log import Log
 from jaxsafe.run.progress import Report
@@ -25,7 +25,6 @@ from jaxsafe.types import PyTree, Shared
 class Outcome(NamedTuple):
     ts: PyTree
     iteration: int
-    steps: int
     interrupted: bool
 
 
@@ -37,7 +36,7 @@ def train(
     resume_command: str,
     adapt: Callable[[PyTree], PyTree] | None = None,
 ) -> Outcome:
-    """Train to `settings.total_steps`, from the newest checkpoint in `folder` if there is one.
+    """Train to the end that `settings` gives, from the newest checkpoint in `folder` if there is one.
 
     Args:
         program: from `build`.
@@ -51,8 +50,7 @@ def train(
     Raises:
         checkpoint.CheckpointError, OSError: the disk failed; the last good checkpoint stays.
     """
-    per_update = program.clocks.steps
-    iterations = -(-settings.total_steps // per_update)
+    iterations, unit = clock.iterations(settings, program.clocks), clock.unit(program.clocks)
     store = folder / "checkpoints"
     resuming = bool(distributed.first(np.array(bool(checkpoint.checkpoints(store)))))
     with report, Interrupts(report.line, report.hosted) as stop:
@@ -67,14 +65,14 @@ def train(
             ts, iteration, since = restored(store, like, report)
             ts = distributed.place(ts, program.sharding)
             empty = ", with an empty replay" if iteration and since == iteration else ""
-            report.line(f"resuming at {iteration * per_update:,} steps{empty}")
+            report.line(f"resuming at {unit.at(iteration):,} {unit.name}{empty}")
         else:
             start = distributed.place(program.start, program.sharding)
             ts = jax.jit(program.init)(start, Shared(np.int32(0)))
             ts = distributed.place(adapt(ts), program.sharding) if adapt else ts
         if iteration >= iterations:
             report.line("nothing left to train")
-            return Outcome(ts, iteration, iteration * per_update, False)
+            return Outcome(ts, iteration, False)
         names = sorted(jax.eval_shape(program.update, ts, Shared(np.int32(0)))[1])
         update = spread.compiled(program, ts)
         report.line(f"compiled in {time.perf_counter() - begun:.1f} s")
@@ -82,12 +80,12 @@ def train(
 
         vote = distributed.Vote(program.sharding)
         with (
-            Log(folder, names, program.members, iteration, per_update, report)
+            Log(folder, names, program.members, iteration, program.clocks, report)
             if distributed.leads()
             else contextlib.nullcontext()
         ) as log:
             limits = [m.algo.cost_limit for m in program.members if not own_limits(m.algo)]
-            report.start(iterations * per_update, iteration * per_update, limits)
+            report.start(unit.at(iterations), unit.at(iteration), limits, unit.name)
             saved_at, pause = time.perf_counter(), settings.checkpoint_every
             while iteration < iterations:
                 ts, metrics = update(ts, Shared(np.int32(iteration), np.int32(since)))
@@ -102,14 +100,14 @@ def train(
                 if stopping or by_count or by_time or iteration == iterations:
                     saving = time.perf_counter()
                     state = distributed.whole(ts)
-                    steps = iteration * per_update
+                    at = clock.after(iteration, program.clocks)
                     if log:
                         log.sync()
-                        checkpoint.save(store, state, iteration, steps, since, keeps_replay)
+                        checkpoint.save(store, state, at, since, keeps_replay)
                         acting = jax.tree.map(
                             lambda x: x[: len(program.members)], program.params(state)
                         )
-                        checkpoint.save(folder / "policy", acting, iteration, steps)
+                        checkpoint.save(folder / "policy", acting, at)
                     saved_at = time.perf_counter()
                     if keeps_replay and checkpoint.replay_bytes(like):  # at most 5% of the time
                         pause = max(settings.checkpoint_every, 19 * (saved_at - saving))
@@ -118,8 +116,9 @@ def train(
         report.stop()
         interrupted = iteration < iterations
         if interrupted:
-            report.line(f"stopped at {iteration * per_update:,} steps; continue with: {resume_command}")
-    return Outcome(ts, iteration, iteration * per_update, interrupted)
+            done = f"{unit.at(iteration):,} {unit.name}"
+            report.line(f"stopped at {done}; continue with: {resume_command}")
+    return Outcome(ts, iteration, interrupted)
 
 
 def restored(store: Path, like: PyTree, report: Report) -> tuple[PyTree, int, int]:
@@ -127,11 +126,12 @@ def restored(store: Path, like: PyTree, report: Report) -> tuple[PyTree, int, in
     from which on its replay holds everything."""
     if jax.process_count() == 1:
         ts, manifest = checkpoint.restore(store, like, report.line)
-        return ts, manifest.iteration, manifest.since
+        return ts, manifest.at.iteration, manifest.since
     arrays = {name: np.zeros(x.shape, x.dtype) for name, x in checkpoint.as_data(like).items()}
-    clock = np.zeros(2, int)
+    numbers = np.zeros(2, int)
     if distributed.leads():
         ts, manifest = checkpoint.restore(store, like, report.line)
-        arrays, clock = checkpoint.to_arrays(ts), np.array([manifest.iteration, manifest.since])
-    arrays, (iteration, since) = distributed.first((arrays, clock))
+        arrays = checkpoint.to_arrays(ts)
+        numbers = np.array([manifest.at.iteration, manifest.since])
+    arrays, (iteration, since) = distributed.first((arrays, numbers))
     return checkpoint.from_arrays(like, arrays), int(iteration), int(since)

@@ -20,19 +20,19 @@ class TooLarge(ConfigError):
     """What was asked cannot fit the memory."""
 
 
-def check_memory(env: Env, algo_config: Any, num_members: int, devices: int) -> None:
+def check_memory(env: Env, program: Program, settings: TrainConfig) -> None:
     """Refuse, before anything compiles, a trajectory that cannot fit the device.
 
     A lower bound: observations before and after each step, actions and a few scalars.
     """
     limit, what = device_memory()
     step = 4 * (2 * env.obs_size + env.action_size + 8 + len(env.cost_names))  # bytes
-    need = step * algo_config.num_envs * algo_config.horizon * num_members // devices
+    steps, members = program.clocks.steps, len(program.members)
+    need = step * steps * members // settings.devices
     if need > limit:
         raise TooLarge(
-            f"num_envs={algo_config.num_envs} x horizon={algo_config.horizon} x "
-            f"{num_members} seeds needs at least {need / 2**30:,.1f} GiB a device, "
-            f"{what} has {limit / 2**30:,.1f}; use fewer num_envs"
+            f"{steps:,} environment steps an update x {members} seeds needs at least "
+            f"{need / 2**30:,.1f} GiB a device, {what} has {limit / 2**30:,.1f}; use fewer num_envs"
         )
 
 

@@ -34,12 +34,13 @@ from tensorboardX.proto import event_pb2, summary_pb2
 import jaxsafe
 from jaxsafe.config import ConfigError
 from jaxsafe.run import checkpoint
+from jaxsafe.run.checkpoint import Progress
 
 PACKAGES = (
     "jax", "jaxlib", "mujoco", "mujoco-mjx", "warp-lang", "flax", "optax", "orbax-checkpoint", "numpy",
     "brax",
 )  # fmt: skip
-INDEX = ("iteration", "steps", "seed", "seconds")
+INDEX = (*Progress._fields, "seed", "seconds")  # the first columns of metrics.csv
 
 
 def write_config(folder: Path, config: dict[str, Any]) -> None:
@@ -148,7 +149,7 @@ class Metrics:
                     for r in rows
                     if len(r) == len(header) and r[0].isdigit() and int(r[0]) <= iteration
                 ]
-            self.seconds = float(kept[-1][3]) if kept else 0.0
+            self.seconds = float(kept[-1][INDEX.index("seconds")]) if kept else 0.0
         part = self.path.with_suffix(".part")
         with part.open("w", newline="") as file:
             csv.writer(file, lineterminator="\n").writerows([header, *kept])
@@ -156,14 +157,12 @@ class Metrics:
         self.file = self.path.open("a", newline="")
         self.writer = csv.writer(self.file, lineterminator="\n")
 
-    def append(
-        self, iteration: int, steps: int, seeds: list[int], seconds: float, values: Mapping
-    ) -> None:
+    def append(self, at: Progress, seeds: list[int], seconds: float, values: Mapping) -> None:
         """Add one row a seed; `values` holds float [S] by metric name."""
         columns = [np.asarray(values[name], np.float32) for name in self.names]
         for s, seed in enumerate(seeds):
             cells = ("" if math.isnan(c[s]) else str(c[s]) for c in columns)
-            self.writer.writerow([iteration, steps, seed, f"{seconds:.3f}", *cells])
+            self.writer.writerow([*at, seed, f"{seconds:.3f}", *cells])
         self.file.flush()
 
     def sync(self) -> None:
@@ -276,6 +275,13 @@ def setting_name(swept: Mapping[str, Any]) -> str:
     return ", ".join(f"{k}={v:.9g}" if isinstance(v, float) else f"{k}={v}" for k, v in swept.items())
 
 
+def clock_of(metrics: Mapping[str, np.ndarray]) -> str:
+    """The column that says how far training is: 'steps' or, where it takes no environment steps,
+    'updates'."""
+    moves = "updates" not in metrics or not len(metrics["steps"]) or metrics["steps"].max() > 0
+    return "steps" if moves else "updates"
+
+
 def last_tenth(metrics: dict[str, np.ndarray], name: str) -> np.ndarray:
     """The mean of a metric over the last 10 % of training so far, [S]; NaN for a seed without value."""
     late = metrics["iteration"] > 0.9 * metrics["iteration"].max()
@@ -284,14 +290,13 @@ def last_tenth(metrics: dict[str, np.ndarray], name: str) -> np.ndarray:
     return np.array([v.mean() if len(v) else np.nan for v in values])
 
 
-def progress(folder: Path) -> tuple[int, int] | None:
-    """Iteration and steps of the newest checkpoint; None without one."""
+def progress(folder: Path) -> Progress | None:
+    """How far the newest checkpoint is; None without one."""
     for path in checkpoint.checkpoints(folder / "checkpoints"):
         try:
-            manifest = checkpoint.read_manifest(path)
+            return checkpoint.read_manifest(path).at
         except (ValueError, KeyError, TypeError, AttributeError, OSError):
             continue
-        return manifest.iteration, manifest.steps
     return None
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 import jaxsafe
 from jaxsafe.config import ConfigError, flat
-from jaxsafe.run import checkpoint, distributed, loop, run_folder
+from jaxsafe.run import checkpoint, clock, distributed, loop, run_folder
 from jaxsafe.run.devices import check_devices, device_name, use_compilation_cache
 from jaxsafe.run.interrupts import Interrupts
 from jaxsafe.run.memory import check_memory, check_state_memory
@@ -52,7 +52,7 @@ def choose_folder(settings: Settings, job: int | None, say: Callable[[str], None
         if train.resume:
             for folder in sorted((p.parent for p in home.glob("*/config.yaml")), reverse=True):
                 done = run_folder.progress(folder)
-                if (done is None or done[1] < train.total_steps) and same(settings, folder):
+                if (done is None or not clock.ended(train, done)) and same(settings, folder):
                     return folder
             say(f"no unfinished run of this command in {home}: starting one")
         name = f"{datetime.datetime.now():%Y%m%d-%H%M%S}-seed{train.seed}"
@@ -122,8 +122,8 @@ def prepare(settings: Settings) -> tuple[Env, Program]:
     use_compilation_cache()
     check_devices(train)
     env = make_env(settings)
-    check_memory(env, settings.algo, len(settings.configs) * train.num_seeds, train.devices)
     program = build(env, settings.row.make, settings.configs, train)
+    check_memory(env, program, train)
     check_state_memory(program, train)
     return env, program
 
@@ -159,7 +159,8 @@ def run(session: Session, report: Report, finish: Finish) -> int:
     except OSError as error:
         raise checkpoint.CheckpointError(f"cannot write to {folder}: {error.strerror}") from error
     several = f"{len(settings.configs)} settings x " if len(settings.configs) > 1 else ""
-    seeds = f"{train.num_seeds} seed{'s' if train.num_seeds > 1 else ''} x {cfg.num_envs} envs"
+    seeds = f"{train.num_seeds} seed{'s' if train.num_seeds > 1 else ''}"
+    seeds += f" x {cfg.num_envs} envs" if program.clocks.steps else ""
     where = device_name() + (f" x {train.devices}" if train.devices > 1 else "")
     if jax.process_count() > 1:
         where += f" in {jax.process_count()} processes"

@@ -26,6 +26,7 @@ from jaxsafe.types import Env
 DEFAULT = {"env": "point_goal1", "algo": "ppo_lag"}
 ON_RESUME = (
     "total_steps",
+    "total_updates",
     "checkpoint_every",
     "checkpoint_iterations",
     "checkpoint_replay",
@@ -61,6 +62,7 @@ class TrainConfig:
     """The settings beside `env` and `algo`."""
 
     total_steps: int = 10_000_000  # environment steps of one seed, rounded up to whole updates
+    total_updates: int | None = None  # gradient steps of one seed; null: total_steps ends the run
     num_envs: int | None = None  # of one seed; null: algo.num_envs
     num_seeds: int = 1  # trained at once: seed, seed + 1, ...
     seed: int = 0
@@ -80,7 +82,7 @@ class TrainConfig:
     video: bool = True  # of the first seed's policy, at the end
 
     def __post_init__(self) -> None:
-        for name in ("total_steps", "num_envs", "num_seeds", "devices"):
+        for name in ("total_steps", "total_updates", "num_envs", "num_seeds", "devices"):
             if (value := getattr(self, name)) is not None and value < 1:
                 raise ConfigError(f"{name}={value}: expected at least 1")
         for name in ("seed", "checkpoint_every", "checkpoint_iterations", "eval_episodes"):
@@ -166,6 +168,8 @@ def settle(config: dict[str, Any], entries: Entries = REGISTERED) -> Settings:
     row = find_algo(algo_name, entries)
     train = from_dict(TrainConfig, top)
     if train.num_envs is not None:
+        if "num_envs" not in {f.name for f in dataclasses.fields(row.config)}:
+            raise ConfigError(f"num_envs={train.num_envs}: {algo_name} trains without environments")
         algo["num_envs"] = train.num_envs
     for name in env:
         if name not in entry.defaults:

@@ -15,7 +15,7 @@ import numpy as np
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
 from jaxsafe.config import ConfigError, flat
-from jaxsafe.run import checkpoint, run_folder
+from jaxsafe.run import checkpoint, clock, run_folder
 from jaxsafe.run.settings import TrainConfig
 from jaxsafe.types import Algorithm, Clocks, Env, PyTree, Shared
 
@@ -76,17 +76,20 @@ def build(env: Env, make: Callable, configs: Sequence[Any], settings: TrainConfi
             f"{len(run)} seeds do not split over devices={devices}: "
             f"expected a multiple of {devices}, or 1"
         )
-    if configs[0].num_envs % share:
-        raise ConfigError(f"num_envs={configs[0].num_envs} does not split over devices={devices}")
-
     algo: Algorithm = make(env, AXIS if share > 1 else None)
     clocks = algo.clocks(configs[0])
+    if share > 1 and not clocks.steps:
+        raise ConfigError(
+            f"devices={devices}: a lone seed has no environments to split over them; use num_seeds"
+        )
+    if share > 1 and configs[0].num_envs % share:
+        raise ConfigError(f"num_envs={configs[0].num_envs} does not split over devices={devices}")
+    iterations = float(clock.iterations(settings, clocks))
 
     def settled(cfg: Any) -> Any:
-        ends = cfg.total_iterations
-        if math.isinf(ends):
-            ends = float(-(-settings.total_steps // clocks.steps))
-        return dataclasses.replace(cfg, num_envs=cfg.num_envs // share, total_iterations=ends)
+        ends = iterations if math.isinf(cfg.total_iterations) else cfg.total_iterations
+        part = {"num_envs": cfg.num_envs // share} if share > 1 else {}
+        return dataclasses.replace(cfg, total_iterations=ends, **part)
 
     # A split seed has one key for all its devices: the algorithm folds the device's index in.
     keys = jax.vmap(jax.random.key)(np.array([m.seed for m in run] * share, np.uint32))

@@ -24,7 +24,7 @@ import yaml
 
 from jaxsafe.config import ConfigError, flat, is_float, one_line
 from jaxsafe.learn import on_policy
-from jaxsafe.run import checkpoint, distributed, memory, run_folder, session
+from jaxsafe.run import checkpoint, clock, distributed, memory, run_folder, session
 from jaxsafe.run.interrupts import Interrupts
 from jaxsafe.run.policies import warm_start
 from jaxsafe.run.progress import Report
@@ -273,4 +273,4 @@ def train(sweep: Sweep, again: str, report: Report, after: After) -> int:
 def finished(settings: Settings, folder: Path) -> bool:
     done, train = run_folder.progress(folder), settings.train
     evaluated = (folder / "evaluation.json").exists() or not train.eval_episodes
-    return done is not None and done[1] >= train.total_steps and evaluated
+    return done is not None and clock.ended(train, done) and evaluated

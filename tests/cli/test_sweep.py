@@ -247,7 +247,7 @@ def test_an_interrupted_sweep_goes_on_and_ends_bit_for_bit_as_if_uninterrupted(t
         patch.setattr(checkpoint, "save", killed)
         train(tmp_path / "sweep", *args)
     first, second = sorted((tmp_path / "sweep").glob("0*"))
-    assert (run_folder.progress(first), run_folder.progress(second)) == ((6, 192), (2, 64))
+    assert [run_folder.progress(f) for f in (first, second)] == [(6, 192, 24), (2, 64, 8)]
     train(tmp_path / "sweep", *GRID, "checkpoint_iterations=2")  # the parts are remembered
     starts = [len(json.loads((f / "versions.json").read_text())) for f in (first, second)]
     assert starts == [1, 2]
@@ -317,7 +317,8 @@ def write(folder: Path, configs: dict[str, Any], table: list[tuple]) -> None:
         late = iteration > 18
         seeds, limits, returns, costs = (np.array(c) for c in zip(*table, strict=True))
         values = {"train/return": late * returns, "train/cost": np.where(late, costs, 99.0)}
-        log.append(iteration, iteration * 10, list(seeds), 0.0, values | dict.fromkeys(swept, limits))
+        at = checkpoint.Progress(iteration, iteration * 10, iteration)
+        log.append(at, list(seeds), 0.0, values | dict.fromkeys(swept, limits))
     log.close()
 
 

@@ -257,7 +257,7 @@ def test_a_schedule_comes_back_from_a_checkpoint(tmp_path):
     env = Clock(episode_length=6)
     algo, update = build("ppo_simmer_pid", env)
     ts, _ = update(start("ppo_simmer_pid", env, **HAND))
-    checkpoint.save(tmp_path, ts, iteration=1, steps=24)
+    checkpoint.save(tmp_path, ts, checkpoint.Progress(1, 24, 1))
     cfg = ALGOS["ppo_simmer_pid"].config(**TINY | HAND)
     like = jax.eval_shape(lambda: algo.init(jax.random.key(0), cfg, FIRST))
     back, _ = checkpoint.restore(tmp_path, like)
