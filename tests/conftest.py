@@ -4,6 +4,10 @@ import jax
 import pytest
 
 from jaxsafe.envs.view import render
+from jaxsafe.run.devices import use_compilation_cache
+
+use_compilation_cache()  # what a first run of the tests compiles, the next one reads
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 
 
 @pytest.fixture(autouse=True, scope="module")

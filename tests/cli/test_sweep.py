@@ -195,7 +195,7 @@ def test_parts_are_whole_settings_or_seeds_of_one_and_of_equal_size():
 @pytest.mark.parametrize("name", sorted(algos.ALGOS))
 def test_every_float_of_every_algorithm_may_differ_between_members(name):
     kind = algos.ALGOS[name].config
-    cfg = kind(num_envs=2, horizon=4, minibatches=1, hidden=(4,))
+    cfg = kind(num_envs=256, horizon=4, hidden=(4,))
     other = replace(cfg, **{field: 0.25 for field in float_fields(kind)})
     program = build(Corridor(), algos.ALGOS[name].make, (cfg, other), TrainConfig(num_seeds=2))
     ts = jax.eval_shape(program.init, program.start, FIRST)
