@@ -8,6 +8,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from jaxsafe.algos import (
+    bc,
     cpo,
     cppo_pid,
     crpo,
@@ -47,6 +48,7 @@ class Entry(NamedTuple):
 
 
 ALGOS: dict[str, Entry] = {
+    "bc": Entry(bc.BCConfig, bc.make, "imitates a data set by regression, blind to cost"),
     "cpo": Entry(
         cpo.CPOConfig, cpo.make, "trust-region step within a linearised constraint", cpo.PUBLISHED
     ),

@@ -18,6 +18,7 @@ from typing import Any
 from jaxsafe.algos import ALGOS, Entry
 from jaxsafe.config import from_dict
 from jaxsafe.envs import ENVS
+from jaxsafe.learn.offline import OfflineConfig
 from jaxsafe.run import compat, run_folder
 from jaxsafe.run.settings import algo_options
 
@@ -82,7 +83,8 @@ def published(entry: Entry) -> str:
         lines.append(f"`preset=published` ({origin}): {changed}.")
     conventions = compat.overrides("omnisafe", entry.config)
     changed = ", ".join(f"`{name}={value}`" for name, value in conventions.items())
-    lines.append(f"`compat=omnisafe` ([why](../howto/migrate.md#conventions)): {changed}.")
+    if changed:
+        lines.append(f"`compat=omnisafe` ([why](../howto/migrate.md#conventions)): {changed}.")
     return "\n\n".join(lines)
 
 
@@ -106,6 +108,8 @@ def measured(name: str) -> str:
         usual = algo_options(ALGOS[name], config["preset"], config.get("compat", "none"))
         how += "".join(f", `algo.{k}={given[k]}`" for k in options if given[k] != usual[k])
         rows.append(f"| {how} | {ret} | {cost} | {results.published(config)} |")
+    if not rows and issubclass(ALGOS[name].config, OfflineConfig):
+        return "Not run at length yet."
     if not rows:
         return "Not run at length yet; it learns the small exact problem of tests/test_on_policy.py."
     head = "| 1e7 steps a seed, limit 25 | return, last 10% | cost | published |\n|---|---|---|---|\n"
@@ -116,9 +120,10 @@ def page(name: str) -> str:
     entry = ALGOS[name]
     title, text = prose(importlib.import_module(entry.make.__module__).__doc__ or "")
     module = entry.make.__module__.rsplit(".", 1)[1]
+    data = " dataset=data.npz" if issubclass(entry.config, OfflineConfig) else ""
     return f"""# {title.removesuffix(".")}
 
-    python scripts/train.py env=point_goal1 algo={name}
+    python scripts/train.py env=point_goal1 algo={name}{data}
 
 {text}
 

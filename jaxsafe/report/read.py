@@ -23,6 +23,7 @@ NOT_A_SETTING = {"seed", "num_seeds", "num_envs", "devices", *NOT_COMPARED}
 NOT_A_SETTING -= {"total_steps", "total_updates"}
 
 NEEDED = ("iteration", "steps", "seed", "train/return", "train/cost")  # columns
+STAND_IN = {"train/return": "eval/return", "train/cost": "eval/cost"}  # where training has no episodes
 
 
 class Run(NamedTuple):
@@ -104,6 +105,9 @@ def read_one(folder: Path, entries: Entries = REGISTERED) -> list[Run]:
     metrics = run_folder.read_metrics(folder)
     if not len(metrics.get("iteration", ())):
         return []
+    if run_folder.clock_of(metrics) == "updates":
+        nothing = np.full(len(metrics["seed"]), np.nan)
+        metrics = {name: metrics.get(other, nothing) for name, other in STAND_IN.items()} | metrics
     for name in NEEDED:
         if name not in metrics:
             raise ConfigError(f"{run_folder.metrics_file(folder)} has no column {name}")

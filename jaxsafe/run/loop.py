@@ -19,7 +19,7 @@ from jaxsafe.run.log import Log
 from jaxsafe.run.progress import Report
 from jaxsafe.run.settings import TrainConfig
 from jaxsafe.run.spread import Program
-from jaxsafe.types import PyTree, Shared
+from jaxsafe.types import PyTree
 
 
 class Outcome(NamedTuple):
@@ -59,7 +59,8 @@ def train(
         )
         begun = time.perf_counter()
         iteration = since = 0
-        like = jax.eval_shape(program.init, program.start, Shared(np.int32(0)))
+        program = program._replace(data=distributed.place(program.data, program.everywhere))
+        like = jax.eval_shape(program.init, program.start, program.shared())
         keeps_replay = checkpoint.keeps_replay(like, settings.checkpoint_replay)
         if resuming:
             ts, iteration, since = restored(store, like, report)
@@ -68,12 +69,12 @@ def train(
             report.line(f"resuming at {unit.at(iteration):,} {unit.name}{empty}")
         else:
             start = distributed.place(program.start, program.sharding)
-            ts = jax.jit(program.init)(start, Shared(np.int32(0)))
+            ts = jax.jit(program.init)(start, program.shared())
             ts = distributed.place(adapt(ts), program.sharding) if adapt else ts
         if iteration >= iterations:
             report.line("nothing left to train")
             return Outcome(ts, iteration, False)
-        names = sorted(jax.eval_shape(program.update, ts, Shared(np.int32(0)))[1])
+        names = sorted(jax.eval_shape(program.update, ts, program.shared())[1])
         update = spread.compiled(program, ts)
         report.line(f"compiled in {time.perf_counter() - begun:.1f} s")
         stop.nothing_to_save = ""
@@ -88,7 +89,7 @@ def train(
             report.start(unit.at(iterations), unit.at(iteration), limits, unit.name)
             saved_at, pause = time.perf_counter(), settings.checkpoint_every
             while iteration < iterations:
-                ts, metrics = update(ts, Shared(np.int32(iteration), np.int32(since)))
+                ts, metrics = update(ts, program.shared(iteration, since))
                 metrics, iteration = distributed.whole(metrics), iteration + 1
                 if log:
                     log.append(iteration, metrics)

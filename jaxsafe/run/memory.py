@@ -5,13 +5,12 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 
 from jaxsafe.config import ConfigError
 from jaxsafe.run import checkpoint, spread
 from jaxsafe.run.settings import TrainConfig
 from jaxsafe.run.spread import Program
-from jaxsafe.types import Env, Shared
+from jaxsafe.types import Env
 
 ROOM = 0.8  # of the memory that a program may take by `capacity`
 
@@ -38,14 +37,16 @@ def check_memory(env: Env, program: Program, settings: TrainConfig) -> None:
 
 def check_state_memory(program: Program, settings: TrainConfig) -> None:
     """Like `check_memory`, for the train state itself, known once it is traced: old and new, but a
-    replay only once, as it is written in place."""
+    replay only once, as it is written in place. Every device has the whole data set."""
     limit, what = device_memory()
-    like = jax.eval_shape(program.init, program.start, Shared(np.int32(0)))
+    like = jax.eval_shape(program.init, program.start, program.shared())
     whole = sum(x.size * x.dtype.itemsize for x in checkpoint.as_data(like).values())
     replay = checkpoint.replay_bytes(like)
-    need = (2 * (whole - replay) + replay) / settings.devices
+    data = sum(x.nbytes for x in jax.tree.leaves(program.data))
+    need = (2 * (whole - replay) + replay) / settings.devices + data
     if need > limit:
         part = f" ({replay / settings.devices / 2**30:,.1f} GiB of it replay)" if replay else ""
+        part += f" ({data / 2**30:,.1f} GiB of it the data set)" if data else ""
         less = "a smaller algo.replay_size or " if replay > whole / 2 else "fewer num_envs or "
         raise TooLarge(
             f"the train state needs {need / 2**30:,.1f} GiB a device{part}, {what} has "
@@ -57,7 +58,7 @@ def capacity(program: Program) -> int:
     """How many of its members fit the memory at once, by the compiled update's own account."""
     like = jax.tree.map(
         lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=program.sharding),
-        jax.eval_shape(program.init, program.start, Shared(np.int32(0))),
+        jax.eval_shape(program.init, program.start, program.shared()),
     )
     used: Any = spread.compiled(program, like).memory_analysis()
     need = used.temp_size_in_bytes + used.argument_size_in_bytes + used.output_size_in_bytes

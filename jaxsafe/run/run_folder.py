@@ -66,8 +66,8 @@ def read_config(folder: Path) -> dict[str, Any]:
     return config
 
 
-def append_versions(folder: Path, device: str, engine: str | None) -> None:
-    """Add this start of the run to versions.json."""
+def append_versions(folder: Path, device: str, engine: str | None, dataset: str | None = None) -> None:
+    """Add this start of the run to versions.json, with the SHA-256 of its data set."""
     path = folder / "versions.json"
     try:
         starts = list(json.loads(path.read_text())) if path.exists() else []
@@ -80,6 +80,7 @@ def append_versions(folder: Path, device: str, engine: str | None) -> None:
         "commit": commit(),
         "device": device,
         "engine": engine,
+        "dataset": dataset,
         "python": platform.python_version(),
         "platform": platform.platform(),
         "jaxsafe": jaxsafe.__version__,
@@ -95,6 +96,14 @@ def trained_by(folder: Path) -> str:
         return f"{last['jaxsafe']} ({last['commit']})"
     except (OSError, ValueError, LookupError, TypeError):
         return "of an unknown version"
+
+
+def dataset_of(folder: Path) -> str | None:
+    """The SHA-256 of the data set that a run was last started with; None where that is not known."""
+    try:
+        return str(json.loads((folder / "versions.json").read_text())[-1]["dataset"] or "") or None
+    except (OSError, ValueError, LookupError, TypeError):
+        return None
 
 
 def installed(package: str) -> str | None:

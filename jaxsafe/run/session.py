@@ -12,7 +12,7 @@ import numpy as np
 
 import jaxsafe
 from jaxsafe.config import ConfigError, flat
-from jaxsafe.run import checkpoint, clock, distributed, loop, run_folder
+from jaxsafe.run import checkpoint, clock, dataset, distributed, loop, run_folder
 from jaxsafe.run.devices import check_devices, device_name, use_compilation_cache
 from jaxsafe.run.interrupts import Interrupts
 from jaxsafe.run.memory import check_memory, check_state_memory
@@ -20,7 +20,7 @@ from jaxsafe.run.policies import warm_start
 from jaxsafe.run.progress import Report
 from jaxsafe.run.settings import NOT_COMPARED, Settings, TrainConfig, differences, make_env, settle
 from jaxsafe.run.spread import Program, build
-from jaxsafe.types import Env, Shared
+from jaxsafe.types import Env
 
 
 class Session(NamedTuple):
@@ -96,6 +96,11 @@ def compare(settings: Settings, folder: Path) -> None:
     free = {*NOT_COMPARED}
     if len(settings.configs) * settings.train.num_seeds > 1:
         free.add("devices")  # each member is whole on one of them
+    path, known = settings.train.dataset, run_folder.dataset_of(folder)
+    if path is not None and known:
+        if dataset.sha256(path) != known:
+            raise ConfigError(f"dataset={path} is not the file that {folder} was trained with")
+        free.add("dataset")  # the same file may have moved
     for name, (here, there) in differences(flat(settings.plain()), saved).items():
         if name not in free:
             raise ConfigError(
@@ -122,7 +127,8 @@ def prepare(settings: Settings) -> tuple[Env, Program]:
     use_compilation_cache()
     check_devices(train)
     env = make_env(settings)
-    program = build(env, settings.row.make, settings.configs, train)
+    data = () if train.dataset is None else dataset.read_dataset(train.dataset)
+    program = build(env, settings.row.make, settings.configs, train, data)
     check_memory(env, program, train)
     check_state_memory(program, train)
     return env, program
@@ -130,7 +136,7 @@ def prepare(settings: Settings) -> tuple[Env, Program]:
 
 def about_replay(program: Program, train: TrainConfig) -> str:
     """How large the replay of a seed is, and what a resumed run does without it; '' of none."""
-    like = jax.eval_shape(program.init, program.start, Shared(np.int32(0)))
+    like = jax.eval_shape(program.init, program.start, program.shared())
     size = checkpoint.replay_bytes(like)
     if not size:
         return ""
@@ -155,7 +161,8 @@ def run(session: Session, report: Report, finish: Finish) -> int:
         if distributed.leads():
             folder.mkdir(parents=True, exist_ok=True)
             run_folder.write_config(folder, settings.plain())
-            run_folder.append_versions(folder, device_name(), engine)
+            data = None if train.dataset is None else dataset.sha256(train.dataset)
+            run_folder.append_versions(folder, device_name(), engine, data)
     except OSError as error:
         raise checkpoint.CheckpointError(f"cannot write to {folder}: {error.strerror}") from error
     several = f"{len(settings.configs)} settings x " if len(settings.configs) > 1 else ""

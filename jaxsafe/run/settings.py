@@ -34,6 +34,7 @@ ON_RESUME = (
     "video",
 )  # may change
 NOT_COMPARED = ("run_dir", "resume", *ON_RESUME)
+OFFLINE_UPDATES = 100_000  # total_updates with a data set, unless the user says otherwise
 NAMED = "cost_limits"  # an option of algorithms: floats by name, as {hazards: 10}
 # Bounds of the hyperparameters that have one wherever they occur.
 BOUNDS = {
@@ -62,7 +63,8 @@ class TrainConfig:
     """The settings beside `env` and `algo`."""
 
     total_steps: int = 10_000_000  # environment steps of one seed, rounded up to whole updates
-    total_updates: int | None = None  # gradient steps of one seed; null: total_steps ends the run
+    # gradient steps of one seed, which then end the run; null: total_steps, or 100,000 with a data set
+    total_updates: int | None = None
     num_envs: int | None = None  # of one seed; null: algo.num_envs
     num_seeds: int = 1  # trained at once: seed, seed + 1, ...
     seed: int = 0
@@ -74,6 +76,7 @@ class TrainConfig:
     compat: str = "none"  # whose departures from the papers to follow: none, or omnisafe
     run_dir: str | None = None  # null: runs/<env>-<algo>/<time>-seed<seed>
     resume: bool | str = False  # true: run_dir, or the newest unfinished run like this one; or a folder
+    dataset: str | None = None  # an .npz to learn from, for offline algorithms
     init_from: str | None = None  # a run folder whose policy to start from
     checkpoint_every: float = 60.0  # s between checkpoints
     checkpoint_iterations: int = 0  # also after this many iterations; 0: by time alone
@@ -167,6 +170,8 @@ def settle(config: dict[str, Any], entries: Entries = REGISTERED) -> Settings:
     algo_name = algo.pop("name")
     row = find_algo(algo_name, entries)
     train = from_dict(TrainConfig, top)
+    if train.dataset is not None and train.total_updates is None:
+        train = dataclasses.replace(train, total_updates=OFFLINE_UPDATES)
     if train.num_envs is not None:
         if "num_envs" not in {f.name for f in dataclasses.fields(row.config)}:
             raise ConfigError(f"num_envs={train.num_envs}: {algo_name} trains without environments")

@@ -56,9 +56,16 @@ class Program(NamedTuple):
     start: PyTree  # (keys, config): [M], or [devices] for one split member
     members: list[Member]
     sharding: jax.sharding.Sharding
+    everywhere: jax.sharding.Sharding  # of what members share
+    data: PyTree = ()  # the data set
+
+    def shared(self, iteration: int = 0, since: int = 0) -> Shared:
+        return Shared(np.int32(iteration), np.int32(since), self.data)
 
 
-def build(env: Env, make: Callable, configs: Sequence[Any], settings: TrainConfig) -> Program:
+def build(
+    env: Env, make: Callable, configs: Sequence[Any], settings: TrainConfig, data: PyTree = ()
+) -> Program:
     """Spread one algorithm over settings, seeds and devices.
 
     Args:
@@ -66,8 +73,10 @@ def build(env: Env, make: Callable, configs: Sequence[Any], settings: TrainConfi
         make: `make(env, axis_name) -> Algorithm` of the algorithm.
         configs: its config in each setting; they differ in floats alone.
         settings: seeds and devices.
+        data: the data set, for an algorithm that takes no environment steps.
     Raises:
-        ConfigError: the members, or the environments of a lone one, do not split over the devices.
+        ConfigError: the members, or the environments of a lone one, do not split over the devices; a
+            data set that is missing, or that the algorithm has no use for.
     """
     devices, run = settings.devices, members(configs, settings)
     share = devices if len(run) == 1 else 1  # devices among which the environments of one are split
@@ -78,6 +87,10 @@ def build(env: Env, make: Callable, configs: Sequence[Any], settings: TrainConfi
         )
     algo: Algorithm = make(env, AXIS if share > 1 else None)
     clocks = algo.clocks(configs[0])
+    if data and clocks.steps:
+        raise ConfigError(f"dataset={settings.dataset}: this algorithm learns from no data set")
+    if not data and not clocks.steps:
+        raise ConfigError("an offline algorithm learns from a data set: give dataset=PATH")
     if share > 1 and not clocks.steps:
         raise ConfigError(
             f"devices={devices}: a lone seed has no environments to split over them; use num_seeds"
@@ -99,7 +112,7 @@ def build(env: Env, make: Callable, configs: Sequence[Any], settings: TrainConfi
     update = over_rows(algo.update, rows)
     if devices == 1:
         one = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
-        return Program(init, update, algo.params, clocks, (keys, floats), run, one)
+        return Program(init, update, algo.params, clocks, (keys, floats), run, one, one, data)
     mesh = jax.make_mesh(
         (devices,), (AXIS,), devices=jax.devices()[:devices], axis_types=(AxisType.Auto,)
     )
@@ -124,8 +137,17 @@ def build(env: Env, make: Callable, configs: Sequence[Any], settings: TrainConfi
     def empty(x: jax.Array) -> jax.Array:
         return jnp.zeros((x.shape[0] // devices, *x.shape[1:]), x.dtype)
 
-    sharding = NamedSharding(mesh, spec)
-    return Program(split(init), split(update), algo.params, clocks, (keys, floats), run, sharding)
+    return Program(
+        init=split(init),
+        update=split(update),
+        params=algo.params,
+        clocks=clocks,
+        start=(keys, floats),
+        members=run,
+        sharding=NamedSharding(mesh, spec),
+        everywhere=NamedSharding(mesh, PartitionSpec()),
+        data=data,
+    )
 
 
 def over_rows(fn: Callable[[PyTree, Shared], PyTree], rows: int) -> Callable[[PyTree, Shared], PyTree]:
@@ -146,4 +168,8 @@ def over_rows(fn: Callable[[PyTree, Shared], PyTree], rows: int) -> Callable[[Py
 
 def compiled(program: Program, ts: PyTree) -> Any:
     """The update for a train state of these shapes; JAX remembers it."""
-    return jax.jit(program.update, donate_argnums=0).lower(ts, Shared(np.int32(0))).compile()
+    data = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=program.everywhere), program.data
+    )
+    shared = program.shared()._replace(data=data)
+    return jax.jit(program.update, donate_argnums=0).lower(ts, shared).compile()

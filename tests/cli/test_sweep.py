@@ -16,6 +16,7 @@ from toys import FIRST, Corridor
 
 from jaxsafe import algos
 from jaxsafe.config import ConfigError, float_fields
+from jaxsafe.learn.offline import OfflineConfig, blank
 from jaxsafe.report import plots
 from jaxsafe.report.evaluation import evaluate
 from jaxsafe.report.finish import finish
@@ -195,10 +196,13 @@ def test_parts_are_whole_settings_or_seeds_of_one_and_of_equal_size():
 @pytest.mark.parametrize("name", sorted(algos.ALGOS))
 def test_every_float_of_every_algorithm_may_differ_between_members(name):
     kind = algos.ALGOS[name].config
-    cfg = kind(num_envs=256, horizon=4, hidden=(4,))
+    offline = issubclass(kind, OfflineConfig)
+    cfg = kind(hidden=(4,)) if offline else kind(num_envs=256, horizon=4, hidden=(4,))
     other = replace(cfg, **{field: 0.25 for field in float_fields(kind)})
-    program = build(Corridor(), algos.ALGOS[name].make, (cfg, other), TrainConfig(num_seeds=2))
-    ts = jax.eval_shape(program.init, program.start, FIRST)
+    data = blank(Corridor()) if offline else ()
+    train = TrainConfig(num_seeds=2, total_updates=1)
+    program = build(Corridor(), algos.ALGOS[name].make, (cfg, other), train, data)
+    ts = jax.eval_shape(program.init, program.start, program.shared())
     assert all(x.shape == (4,) for x in jax.tree.leaves(ts.config))
     assert jax.tree.leaves(program.start[1])[0].dtype == np.float32
 
