@@ -1,14 +1,4 @@
-"""BC: behaviour cloning, which imitates a data set and is blind to cost.
-
-    minimise_theta  E_{(s, a) in data}[ |mu_theta(s) - a|^2 ],    mu_theta(s) = tanh(f_theta(s))
-
-The policy is deterministic. Actions of the data beyond [-1, 1] are clipped to it, as the environments
-clip them.
-
-Source: Pomerleau (1989), "ALVINN: An Autonomous Land Vehicle in a Neural Network"; the loss and the
-network are those of Fujimoto and Gu (2021), "A Minimalist Approach to Offline Reinforcement Learning",
-arXiv:2106.06860, without its critic.
-"""
+"""Learners that imitate a data set."""
 
 from typing import Any
 
@@ -21,6 +11,7 @@ from jaxsafe.learn.batch import pmean
 from jaxsafe.learn.off_policy import Fit, Learner, Turn
 from jaxsafe.learn.offline import OfflineConfig, offline
 from jaxsafe.learn.replay import Transitions
+from jaxsafe.learn.row import Row
 from jaxsafe.learn.steps import adam
 from jaxsafe.nn.critics import net
 from jaxsafe.types import Algorithm, Env, Metrics, PyTree
@@ -28,7 +19,17 @@ from jaxsafe.types import Algorithm, Env, Metrics, PyTree
 
 @config
 class BCConfig(OfflineConfig):
-    pass
+    """BC: behaviour cloning, which imitates a data set and is blind to cost.
+
+        minimise_theta  E_{(s, a) in data}[ |mu_theta(s) - a|^2 ],    mu_theta(s) = tanh(f_theta(s))
+
+    The policy is deterministic. Actions of the data beyond [-1, 1] are clipped to it, as the
+    environments clip them.
+
+    Source: Pomerleau (1989), "ALVINN: An Autonomous Land Vehicle in a Neural Network"; the loss and
+    the network are those of Fujimoto and Gu (2021), "A Minimalist Approach to Offline Reinforcement
+    Learning", arXiv:2106.06860, without its critic.
+    """
 
 
 def init(key: jax.Array, obs_size: int, action_size: int, cfg: Any) -> Fit:
@@ -65,3 +66,13 @@ def learner(action_size: int) -> Learner:
 def make(env: Env, axis_name: str | None = None) -> Algorithm:
     """`axis_name` splits nothing here: there are no environments."""
     return offline(env, learner(env.action_size))
+
+
+ROWS = {
+    "bc": Row(
+        BCConfig,
+        make,
+        "imitates a data set by regression, blind to cost",
+        holds="nothing",
+    )
+}

@@ -1,40 +1,8 @@
-"""CPO: constrained policy optimisation, a trust-region step within a linearised constraint.
-
-    maximise_x  g'x   subject to   b'x + c <= 0,   x'Hx / 2 <= delta
-
-g, b: gradients of E[w A_r] and E[w A_c]; H: the Fisher matrix; c: the violation, see below. With
-q = g'H^-1 g, r = g'H^-1 b, s = b'H^-1 b the solution is x = (H^-1 g - nu H^-1 b) / lam; where no x
-satisfies both constraints, the step only lowers cost: x = -nu H^-1 b.
-
-Source: Achiam et al. (2017), "Constrained Policy Optimization", arXiv:1705.10528, section 6 and
-theorem 2 (which minimises: its g is -g here).
-Differs from it: c is made of v, per step, not of the discounted J_c, and the line search asks for the
-surrogates' values rather than for a decreasing expected cost; both as in safety-starter-agents. The
-Fisher product is damped.
-
-    c = violation_gain v + margin,   v = (J_c - cost_limit) / mean episode length
-    margin <- clip(margin + margin_lr v, 0, margin_max sqrt(2 delta s))
-
-A batch's own b promises more than it keeps: with thousands of parameters, most of the step fits this
-batch's noise and lowers the surrogate, but not the cost; some 1% comes true on Goal and Button. With
-c = v the cost therefore stays well above the limit, as in Ray, Achiam and Amodei (2019). The margin,
-from their code (where it is off and has no bound), asks for more until the limit holds. Alone it
-swings about the limit, for where a share eta comes true cost and margin are a pendulum, damped by
-violation_gain sqrt(eta / margin_lr) / 2. sqrt(2 delta s) is the most that a step can promise: what
-the margin gains far beyond it, while the cost is high, would only have to be lost again.
-
-Of several constraints (`cost_limits`) each has its own b, c and margin, and the step satisfies all of
-them, or else goes towards the nearest x that would.
-
-OmniSafe has c = v per episode (`per_step=False`), about a thousand times as large as b'x can be: then
-a step maximises reward while the cost is under the limit and lowers cost while it is over. What it gets
-wrong between the two (a sign in the dual, a clamp) is not reproduced: it is there in hardly 1% of
-iterations.
-"""
+"""CPO, and the trust-region step between reward and cost that PCPO shares with it."""
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -44,8 +12,10 @@ from jaxsafe.algos import trpo
 from jaxsafe.config import config
 from jaxsafe.learn.batch import all_finite, pmean
 from jaxsafe.learn.constraints import LimitsConfig, limit, named
+from jaxsafe.learn.conventions import Convention
 from jaxsafe.learn.halfspaces import dot, furthest_point
 from jaxsafe.learn.on_policy import on_policy_pair
+from jaxsafe.learn.row import Row
 from jaxsafe.learn.steps import Context, Pair, Step, own_trunk
 from jaxsafe.learn.surrogates import plain
 from jaxsafe.learn.trust_region import conjugate_gradient, distance, fisher_product, line_search
@@ -55,15 +25,60 @@ from jaxsafe.types import Algorithm, Env, Metrics, PyTree
 
 @config
 class CPOConfig(LimitsConfig, trpo.TRPOConfig):
-    line_search_tries: int = 20  # OmniSafe
-    per_step: bool = True  # the violation v in cost per step, as b is; OmniSafe: per episode
-    violation_gain: float = 5.0  # times v, which a step is asked to take back
-    margin_lr: float = 0.05  # safety-starter-agents, who leave it off; 0: no margin
-    margin_max: float = 2.0  # times the most that a step can promise
+    """CPO: constrained policy optimisation, a trust-region step within a linearised constraint.
 
+        maximise_x  g'x   subject to   b'x + c <= 0,   x'Hx / 2 <= delta
 
-# CPO.yaml differs from TRPO.yaml by the constraint alone.
-PUBLISHED: dict[str, dict[str, Any]] = trpo.PUBLISHED
+    g, b: gradients of E[w A_r] and E[w A_c]; H: the Fisher matrix; c: the violation, see below. With
+    q = g'H^-1 g, r = g'H^-1 b, s = b'H^-1 b the solution is x = (H^-1 g - nu H^-1 b) / lam. Where no x
+    satisfies both constraints, the step only lowers cost: x = -nu H^-1 b.
+
+    Source: Achiam et al. (2017), "Constrained Policy Optimization", arXiv:1705.10528, section 6 and
+    theorem 2 (which minimises: its g is -g here).
+    Differs from it: c is made of v, the violation per step, instead of the discounted J_c. The line
+    search compares the surrogates' values and does not ask for a decreasing expected cost. Both are as
+    in safety-starter-agents. The Fisher product is damped.
+
+        c = violation_gain v + margin,   v = (J_c - cost_limit) / mean episode length
+        margin <- clip(margin + margin_lr v, 0, margin_max sqrt(2 delta s))
+
+    A step lowers the cost by less than b'x promises. There are thousands of parameters, so most of the
+    step fits the noise of its batch: that lowers the surrogate and not the cost. On Goal and Button
+    about 1% of the promised decrease is realised. With c = v the cost therefore stays well above the
+    limit, as in Ray, Achiam and Amodei (2019).
+
+    The margin asks for more until the limit holds. It is from the code of that paper, where it is off
+    and has no bound. With the margin alone the cost swings about the limit: if a share eta of each
+    decrease is realised, cost and margin move like a pendulum. violation_gain damps it; its damping
+    ratio is violation_gain sqrt(eta / margin_lr) / 2. The bound is there because a step can promise at
+    most sqrt(2 delta s). A margin far beyond that does nothing more while the cost is high, and takes
+    long to fall when the cost is low.
+
+    With several constraints (`cost_limits`) each has its own b, c and margin. The step satisfies all of
+    them. If no step does, it goes towards the nearest x that would.
+
+    OmniSafe's c = v is per episode (`per_step=False`), about a thousand times as large as b'x can be.
+    Then a step maximises reward while the cost is under the limit, and lowers cost while it is over. In
+    between OmniSafe has two mistakes, a sign in the dual and a clamp. They are not reproduced, because
+    they matter in fewer than 1% of iterations.
+    """
+
+    CONVENTIONS: ClassVar = (
+        Convention(
+            {"per_step": False, "violation_gain": 1.0, "margin_lr": 0.0},
+            "c = J_c - cost_limit is per episode, though b is per step",
+            "per step, times a gain, with a margin",
+        ),
+    )
+
+    line_search_tries: int = 20  # Steps that the line search tries at most, as in OmniSafe.
+    # Whether the violation v is in cost per step, as b is. OmniSafe's is per episode.
+    per_step: bool = True
+    violation_gain: float = 5.0  # A step is asked to take back this many times v.
+    # How fast the margin grows with v, as in safety-starter-agents, where it is off. 0: no margin.
+    margin_lr: float = 0.05
+    margin_max: float = 2.0  # Bound of the margin, as a multiple of the most that a step can promise.
+
 
 RECOVER, RETURN, BOUNDED, FREE = range(4)  # cases of the dual
 
@@ -101,8 +116,8 @@ def dual(
     rho = jnp.clip(r / (jnp.sqrt(q) * jnp.sqrt(s)), -1.0, 1.0)
     kappa = c / (jnp.sqrt(2 * delta) * jnp.sqrt(s))
     meets = jnp.clip(kappa, -1.0, 1.0)
-    # the floor keeps alpha e_g - beta e_b, a difference of near equals, clear of rounding and of
-    # the solver's residual; it forgoes at most 1% of the reward, and only within 0.01 rad of parallel
+    # alpha e_g - beta e_b is a difference of near equals where e_g and e_b are nearly parallel. The
+    # floor keeps rounding and the solver's residual out of it, and acts within 0.01 rad of parallel.
     alpha = jnp.sqrt((1 - meets**2) / jnp.maximum(1 - rho**2, 1e-4))
     alpha = jnp.maximum(alpha, 1e-6)  # at kappa = 1 the step is -e_b, and lam stays finite
     beta = jnp.maximum(0.0, meets + rho * alpha)
@@ -131,7 +146,7 @@ def duals(
 
 
 def cosines(s: jax.Array) -> jax.Array:
-    """Between the vectors with these inner products [K, K]; of a zero vector 0 with all but itself."""
+    """Cosines of K vectors, from their Gram matrix. A zero vector has cosine 0 with every other one."""
     size = jnp.sqrt(jnp.maximum(jnp.diag(s), 1e-20))
     return jnp.fill_diagonal(s / size / size[:, None], 1.0, inplace=False)
 
@@ -261,3 +276,14 @@ cpo_step = step_by(solution)
 
 def make(env: Env, axis_name: str | None = None) -> Algorithm:
     return on_policy_pair(env, plain, cpo_step, axis_name, named=named)
+
+
+ROWS = {
+    "cpo": Row(
+        CPOConfig,
+        make,
+        "trust-region step within a linearised constraint",
+        {"omnisafe": trpo.PUBLISHED},  # CPO.yaml differs from TRPO.yaml by the constraint alone
+        omnisafe="CPO",
+    ),
+}

@@ -1,17 +1,4 @@
-"""CUP: a PPO step on the reward, then a projection towards lower cost.
-
-    1. theta_1: maximise  E[min(w A_r, clip(w) A_r)]
-    2. theta:   minimise  E[lam (1 - gamma gae_lambda) / (1 - gamma) w A_c + KL(pi || pi_1)]
-    minimise_lam  -lam (J_c - cost_limit),  0 <= lam <= lam_max, once an iteration, before both
-
-w = pi(a | s) / pi_old(a | s) with the policy that collected the batch, in both steps; gamma and
-gae_lambda are `cost_discount` and `cost_gae_lambda`.
-
-Source: Yang et al. (2022), "Constrained Update Projection Approach to Safe Policy Optimization",
-arXiv:2209.07089, algorithm 1 and equation 22.
-Differs from it, as OmniSafe does: Adam on lam; A_c is centred; each step stops at target_kl. On a
-shared trunk both steps train the values, too.
-"""
+"""CUP: a PPO step and a projection, one after the other."""
 
 import dataclasses
 from typing import Any
@@ -19,10 +6,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxsafe.algos import ppo
+from jaxsafe.algos import pg, ppo
 from jaxsafe.config import config
 from jaxsafe.learn.constraints import each, named
 from jaxsafe.learn.on_policy import Batch, TrainState, loop
+from jaxsafe.learn.row import Row
 from jaxsafe.learn.steps import Context, adam_epochs
 from jaxsafe.learn.surrogates import clipped, plain, with_entropy
 from jaxsafe.learn.treatments import LagrangianConfig, lagrangian
@@ -33,13 +21,24 @@ from jaxsafe.types import Algorithm, Env, Metrics, PyTree
 
 @config
 class CUPConfig(LagrangianConfig, ppo.PPOConfig):
-    target_kl: float = 0.01  # nats, of each step; OmniSafe
-    lam_max: float = 2.0  # OmniSafe
+    """CUP: a PPO step on the reward, then a projection towards lower cost.
 
+        1. theta_1: maximise  E[min(w A_r, clip(w) A_r)]
+        2. theta:   minimise  E[lam (1 - gamma gae_lambda) / (1 - gamma) w A_c + KL(pi || pi_1)]
+        minimise_lam  -lam (J_c - cost_limit),  0 <= lam <= lam_max,  by Adam, once before both
 
-PUBLISHED: dict[str, dict[str, Any]] = {
-    name: options | {"dual_lr": 0.035} for name, options in ppo.PUBLISHED.items()
-}
+    w = pi(a | s) / pi_old(a | s) with the policy that collected the batch, in both steps; gamma and
+    gae_lambda are `cost_discount` and `cost_gae_lambda`.
+
+    Source: Yang et al. (2022), "Constrained Update Projection Approach to Safe Policy Optimization",
+    arXiv:2209.07089, algorithm 1 and equation 22.
+    Differs from it, as OmniSafe does: Adam moves lam, A_c is centred, and each step stops at target_kl.
+    On a shared trunk both steps train the values, too.
+    """
+
+    # Passes of each of the two steps stop when the KL is above this (nats), as in OmniSafe.
+    target_kl: float = 0.01
+    lam_max: float = 2.0  # The highest price, as in OmniSafe.
 
 
 def projection(
@@ -76,3 +75,15 @@ def make(env: Env, axis_name: str | None = None) -> Algorithm:
         return actor, opt_state, dual, metrics | lagrangian.metrics(dual)
 
     return loop(env, adam_epochs.init, lagrangian.init, improve, axis_name, named=named)
+
+
+ROWS = {
+    "cup": Row(
+        CUPConfig,
+        make,
+        "PPO step, then a projection towards lower cost",
+        {"omnisafe": ppo.PUBLISHED | {"dual_lr": 0.035}},
+        omnisafe="CUP",
+        lever=pg.LEVER,
+    ),
+}

@@ -1,21 +1,12 @@
-"""FOCOPS: first-order constrained optimisation in policy space.
+"""FOCOPS: a surrogate of its own with PPO-Lagrangian's price on cost."""
 
-    maximise_theta  E[1{KL <= eta} (w A / temperature - KL)],  A = (A_r - lam A_c) / (1 + lam)
-    minimise_lam    -lam (J_c - cost_limit),  0 <= lam <= lam_max, once an iteration, before the policy
-
-KL: KL(new || old) of each state; w = pi(a | s) / pi_old(a | s).
-
-Source: Zhang, Vuong and Ross (2020), "First Order Constrained Optimization in Policy Space",
-arXiv:2002.06506, equation 11 and algorithm 1.
-Differs from it: Adam on lam, and the scale 1 / (1 + lam), as in OmniSafe; the indicator is per state
-as in the paper (OmniSafe's multiplies the mean of the minibatch, `per_state=False`).
-"""
-
-from typing import Any
+from typing import ClassVar
 
 from jaxsafe.algos import pg
 from jaxsafe.config import config
+from jaxsafe.learn.conventions import Convention
 from jaxsafe.learn.on_policy import on_policy
+from jaxsafe.learn.row import Row
 from jaxsafe.learn.steps import adam_epochs
 from jaxsafe.learn.surrogates import near_old
 from jaxsafe.learn.treatments import LagrangianConfig, lagrangian
@@ -24,17 +15,49 @@ from jaxsafe.types import Algorithm, Env
 
 @config
 class FOCOPSConfig(LagrangianConfig, pg.PGConfig):
-    temperature: float = 1.5  # lambda of the paper; OmniSafe
-    near_kl: float = 0.02  # eta, nats; OmniSafe
-    per_state: bool = True  # each state's KL gates its own gain; OmniSafe: the mean gain, by the share
-    lam_max: float = 2.0  # nu_max of the paper; OmniSafe
+    """FOCOPS: first-order constrained optimisation in policy space.
 
+        maximise_theta  E[1{KL <= eta} (w A / temperature - KL)],  A = (A_r - lam A_c) / (1 + lam)
+        minimise_lam    -lam (J_c - cost_limit),  0 <= lam <= lam_max,  by Adam, once before each step
 
-PUBLISHED: dict[str, dict[str, Any]] = {
-    name: options | {"epochs": 40, "critic_epochs": 40, "dual_lr": 0.035}
-    for name, options in pg.PUBLISHED.items()
-}
+    KL: KL(new || old) of each state; w = pi(a | s) / pi_old(a | s).
+
+    Source: Zhang, Vuong and Ross (2020), "First Order Constrained Optimization in Policy Space",
+    arXiv:2002.06506, equation 11 and algorithm 1.
+    Differs from it: Adam moves lam, and the advantage is scaled by 1 / (1 + lam), as in OmniSafe. The
+    indicator is per state as in the paper. OmniSafe's multiplies the mean of the minibatch
+    (`per_state=False`).
+    """
+
+    CONVENTIONS: ClassVar = (
+        Convention(
+            {"per_state": False},
+            "the share of states within near_kl multiplies the minibatch's mean gain",
+            "each state's indicator multiplies its own gain, as in the paper",
+        ),
+    )
+
+    # Advantages are divided by it (lambda of the paper), as in OmniSafe: higher keeps closer to the
+    # old policy.
+    temperature: float = 1.5
+    near_kl: float = 0.02  # eta: states whose KL is above this (nats) do not count, as in OmniSafe.
+    # Whether the KL of a state gates its own gain. In OmniSafe the share of near states multiplies
+    # the mean gain.
+    per_state: bool = True
+    lam_max: float = 2.0  # The highest price, nu_max of the paper, as in OmniSafe.
 
 
 def make(env: Env, axis_name: str | None = None) -> Algorithm:
     return on_policy(env, lagrangian, near_old, adam_epochs, axis_name)
+
+
+ROWS = {
+    "focops": Row(
+        FOCOPSConfig,
+        make,
+        "first-order steps near the optimal policy of a constrained problem",
+        {"omnisafe": pg.PUBLISHED | pg.OFTEN | {"dual_lr": 0.035}},
+        omnisafe="FOCOPS",
+        lever=pg.LEVER,
+    ),
+}

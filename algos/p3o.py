@@ -1,25 +1,16 @@
-"""P3O: PPO with an exact penalty on what the clipped cost surrogate exceeds the limit by.
+"""P3O: PPO with a penalty that is felt beyond the limit alone."""
 
-    maximise_theta  E[min(w A_r, clip(w) A_r)] - kappa max(0, E[max(w A_c, clip(w) A_c)] + c)
-
-c: (J_c - cost_limit) / mean episode length, the violation in cost per step.
-
-Source: Zhang et al. (2022), "Penalized Proximal Policy Optimization for Safe Reinforcement Learning",
-arXiv:2205.11814, equation 13.
-Differs from it: c, which there is (1 - gamma) times the discounted violation, another mean per step.
-OmniSafe takes c per episode (`per_step=False`) and does not clip the cost's surrogate
-(`clip_cost=False`).
-"""
-
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 
-from jaxsafe.algos import ppo
+from jaxsafe.algos import pg, ppo
 from jaxsafe.config import config
 from jaxsafe.learn.batch import pmean
+from jaxsafe.learn.conventions import Convention
 from jaxsafe.learn.on_policy import on_policy_pair
+from jaxsafe.learn.row import Row
 from jaxsafe.learn.steps import Context, Pair, Step, adam_epochs
 from jaxsafe.learn.surrogates import clipped, pessimistic, plain
 from jaxsafe.nn.gaussian import Gaussian
@@ -28,14 +19,33 @@ from jaxsafe.types import Algorithm, Env, Metrics, PyTree
 
 @config
 class P3OConfig(ppo.PPOConfig):
-    kappa: float = 20.0  # reward advantages, of standard deviation 1, per unit of cost; OmniSafe
-    per_step: bool = True  # the violation c in cost per step; OmniSafe: per episode
-    clip_cost: bool = True  # max(w A_c, clip(w) A_c); OmniSafe: w A_c
+    """P3O: PPO with an exact penalty on what the clipped cost surrogate exceeds the limit by.
 
+        maximise_theta  E[min(w A_r, clip(w) A_r)] - kappa max(0, E[max(w A_c, clip(w) A_c)] + c)
 
-PUBLISHED: dict[str, dict[str, Any]] = {
-    name: options | {"epochs": 10, "critic_epochs": 10} for name, options in ppo.PUBLISHED.items()
-}
+    c: (J_c - cost_limit) / mean episode length, the violation in cost per step.
+
+    Source: Zhang et al. (2022), "Penalized Proximal Policy Optimization for Safe Reinforcement
+    Learning", arXiv:2205.11814, equation 13.
+    Differs from it: the paper's c is (1 - gamma) times the discounted violation, which is another mean
+    per step. OmniSafe takes c per episode (`per_step=False`) and does not clip the cost's surrogate
+    (`clip_cost=False`).
+    """
+
+    CONVENTIONS: ClassVar = (
+        Convention(
+            {"per_step": False, "clip_cost": False},
+            "kappa max(0, E[w A_c] + J_c - cost_limit), per episode",
+            "the paper's, clipped and per step",
+        ),
+    )
+
+    # Price of a unit of cost beyond the limit, in standard deviations of A_r, as in OmniSafe.
+    kappa: float = 20.0
+    # Whether the violation c is in cost per step. OmniSafe's is per episode.
+    per_step: bool = True
+    # Whether the cost's surrogate is max(w A_c, clip(w) A_c). OmniSafe's is w A_c.
+    clip_cost: bool = True
 
 
 def update(
@@ -68,3 +78,15 @@ def surrogate_c(
 def make(env: Env, axis_name: str | None = None) -> Algorithm:
     step = Step(adam_epochs.init, update)
     return on_policy_pair(env, clipped, step, axis_name, surrogate_c=surrogate_c)
+
+
+ROWS = {
+    "p3o": Row(
+        P3OConfig,
+        make,
+        "PPO with an exact penalty beyond the limit",
+        {"omnisafe": ppo.PUBLISHED | {"epochs": 10, "critic_epochs": 10}},
+        omnisafe="P3O",
+        lever=pg.LEVER | {"kappa": 5.0},
+    ),
+}

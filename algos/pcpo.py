@@ -1,38 +1,51 @@
-"""PCPO: a trust-region step on the reward, then a projection onto the linearised constraint.
+"""PCPO: CPO's trust-region step with another rule for where it goes."""
 
-    x = sqrt(2 delta / q) H^-1 g - max(0, (sqrt(2 delta / q) r + c) / s) H^-1 b
-
-g, b, H, q, r, s, c as in CPO; the projection is in the metric of H, the KL's. Of several constraints it
-is onto what satisfies them all.
-
-Source: Yang et al. (2020), "Projection-based Constrained Policy Optimization", arXiv:2010.03152,
-equation 9.
-Differs from it, as CPO does: c with its margin, and the line search, which keeps the step within
-delta (the paper has none; OmniSafe has CPO's, and x without H^-1 in the first term, `natural=False`).
-"""
-
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 
-from jaxsafe.algos import cpo
+from jaxsafe.algos import cpo, trpo
 from jaxsafe.config import config
 from jaxsafe.learn.constraints import named
+from jaxsafe.learn.conventions import Convention
 from jaxsafe.learn.halfspaces import dot, nearest_point
 from jaxsafe.learn.on_policy import on_policy_pair
+from jaxsafe.learn.row import Row
 from jaxsafe.learn.surrogates import plain
 from jaxsafe.types import Algorithm, Env
 
 
 @config
 class PCPOConfig(cpo.CPOConfig):
-    line_search_tries: int = 200  # OmniSafe
-    natural: bool = True  # the reward's step is along H^-1 g; OmniSafe: along g
-    margin_max: float = 5.0  # more than CPO's, for the reward's step is taken first, whatever c is
+    """PCPO: a trust-region step on the reward, then a projection onto the linearised constraint.
 
+        x = sqrt(2 delta / q) H^-1 g - max(0, (sqrt(2 delta / q) r + c) / s) H^-1 b
 
-PUBLISHED: dict[str, dict[str, Any]] = cpo.PUBLISHED
+    g, b, H, q, r, s and c are as in CPO. The projection is in the metric of H, which is the KL's. With
+    several constraints it is onto the steps that satisfy them all.
+
+    Source: Yang et al. (2020), "Projection-based Constrained Policy Optimization", arXiv:2010.03152,
+    equation 9.
+    Differs from it, as CPO does: c has a margin, and a line search keeps the step within delta. The
+    paper has no line search. OmniSafe has CPO's, and leaves H^-1 out of the first term
+    (`natural=False`).
+    """
+
+    CONVENTIONS: ClassVar = (
+        Convention(
+            {"natural": False},
+            "the reward's step is sqrt(2 delta / q) g",
+            "sqrt(2 delta / q) H^-1 g, the paper's",
+        ),
+    )
+
+    line_search_tries: int = 200  # Steps that the line search tries at most, as in OmniSafe.
+    # Whether the reward's step is along H^-1 g. OmniSafe's is along g.
+    natural: bool = True
+    # Bound of the margin, as a multiple of the most that a step can promise. It is larger than CPO's,
+    # because the reward's step is taken first, whatever c is.
+    margin_max: float = 5.0
 
 
 def projection(p: cpo.Problem, cfg: Any) -> cpo.Direction:
@@ -56,3 +69,14 @@ def backs(excess: jax.Array, s: jax.Array) -> jax.Array:
 
 def make(env: Env, axis_name: str | None = None) -> Algorithm:
     return on_policy_pair(env, plain, cpo.step_by(projection), axis_name, named=named)
+
+
+ROWS = {
+    "pcpo": Row(
+        PCPOConfig,
+        make,
+        "trust-region step projected onto a linearised constraint",
+        {"omnisafe": trpo.PUBLISHED},
+        omnisafe="PCPO",
+    ),
+}

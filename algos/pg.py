@@ -1,45 +1,79 @@
-"""PG: the policy gradient, by several passes over each batch, blind to cost.
+"""Policy gradients by epochs of Adam, with and without a price on cost."""
 
-    maximise_theta  E[w A],  w = pi(a | s) / pi_old(a | s)
-
-Source: Sutton et al. (1999), "Policy Gradient Methods for Reinforcement Learning with Function
-Approximation", with generalised advantages.
-Differs from it, as OmniSafe does: the ratio w lets a batch serve several steps, until
-KL(old || new) > target_kl.
-"""
-
+from functools import partial
 from typing import Any
 
 from jaxsafe.config import config
 from jaxsafe.learn.on_policy import OMNISAFE, OnPolicyConfig, on_policy
-from jaxsafe.learn.steps import adam_epochs
+from jaxsafe.learn.row import Row
+from jaxsafe.learn.steps import AdamConfig, adam_epochs
 from jaxsafe.learn.surrogates import plain
-from jaxsafe.learn.treatments import none
+from jaxsafe.learn.treatments import LagrangianConfig, Treatment, lagrangian, none
 from jaxsafe.types import Algorithm, Env
 
 
 @config
-class PGConfig(OnPolicyConfig):
-    lr: float = 3e-4  # of the policy; OmniSafe, safety-starter-agents
-    lr_decay: bool = False  # of lr, linearly to 0 at total_iterations; OmniSafe: True
-    epochs: int = 10  # passes over each batch; with 8 minibatches the 80 steps of safety-starter-agents
-    target_kl: float = 0.02  # nats, checked after each pass; OmniSafe
-    critics_stop: bool = False  # the critics have no more passes than the policy had; OmniSafe
+class PGConfig(AdamConfig, OnPolicyConfig):
+    """PG: the policy gradient, by several passes over each batch, blind to cost.
+
+        maximise_theta  E[w A],  w = pi(a | s) / pi_old(a | s)
+
+    Source: Sutton et al. (1999), "Policy Gradient Methods for Reinforcement Learning with Function
+    Approximation", with generalised advantages.
+    Differs from it, as OmniSafe does: the ratio w lets a batch serve several steps, until
+    KL(old || new) > target_kl.
+    """
+
+
+@config
+class PDOConfig(LagrangianConfig, PGConfig):
+    """PDO: primal-dual policy gradient, whose advantage pays for cost at an adaptive price.
+
+        maximise_theta  E[w A],  A = (A_r - lam A_c) / (1 + lam)
+        minimise_lam    -lam (J_c - cost_limit),  lam >= 0,  by Adam, once before each step
+
+    Source: Chow et al. (2018), "Risk-Constrained Reinforcement Learning with Percentile Risk Criteria",
+    arXiv:1512.01629.
+    Differs from it, as OmniSafe does: the constraint is on the expected cost, where the paper has one
+    on the CVaR or on a probability. OmniSafe also normalises rewards and costs. Here only the published
+    settings do.
+    """
+
+
+def make(env: Env, axis_name: str | None = None, treatment: Treatment = none) -> Algorithm:
+    return on_policy(env, treatment, plain, adam_epochs, axis_name)
 
 
 # OmniSafe @15603dd, configs/on-policy/PolicyGradient.yaml. Its minibatches of 64 do not divide
 # 20 * 1000 steps: these are of 80.
-PUBLISHED: dict[str, dict[str, Any]] = {
-    "omnisafe": {
-        **OMNISAFE,
-        "epochs": 10,
-        "critic_epochs": 10,
-        "minibatches": 250,
-        "critic_lr": 3e-4,
-        "lr_decay": True,
-    }
+PUBLISHED: dict[str, Any] = {
+    **OMNISAFE,
+    "epochs": 10,
+    "critic_epochs": 10,
+    "minibatches": 250,
+    "critic_lr": 3e-4,
+    "lr_decay": True,
 }
+LEVER: dict[str, Any] = {"lr": 1e-2, "target_kl": 0.1, "epochs": 8}  # for a problem of two levers
+OFTEN: dict[str, Any] = {"epochs": 40, "critic_epochs": 40}  # passes of most of OmniSafe's algorithms
+SCALED: dict[str, Any] = {"reward_normalize": True, "cost_normalize": True}
 
-
-def make(env: Env, axis_name: str | None = None) -> Algorithm:
-    return on_policy(env, none, plain, adam_epochs, axis_name)
+ROWS = {
+    "pg": Row(
+        PGConfig,
+        make,
+        "policy gradient, no constraint",
+        {"omnisafe": PUBLISHED},
+        omnisafe="PolicyGradient",
+        holds="nothing",
+        lever=LEVER,
+    ),
+    "pdo": Row(
+        PDOConfig,
+        partial(make, treatment=lagrangian),
+        "policy gradient with an adaptive price on cost",
+        {"omnisafe": PUBLISHED | OFTEN | SCALED | {"dual_lr": 0.035}},
+        omnisafe="PDO",
+        lever=LEVER | {"lr": 3e-3, "target_kl": 0.03},
+    ),
+}

@@ -1,34 +1,254 @@
-"""PPO: proximal policy optimisation, blind to cost.
+"""PPO, and PPO with each treatment of the constraint and each augmentation of the task."""
 
-    maximise_theta  E[min(w A, clip(w, 1 - eps, 1 + eps) A)],  w = pi(a | s) / pi_old(a | s)
-
-Source: Schulman et al. (2017), "Proximal Policy Optimization Algorithms", arXiv:1707.06347.
-Differs from it: passes stop once KL(old || new) > target_kl, as in safety-starter-agents and
-OmniSafe; the value function is a network of its own, unless `trunk` is shared. A cost critic is trained
-for its metrics alone.
-"""
-
+from functools import partial
 from typing import Any
 
 from jaxsafe.algos import pg
 from jaxsafe.config import config
+from jaxsafe.learn.augment import (
+    OMNISAFE_SAUTE,
+    OMNISAFE_SIMMER,
+    Augmentation,
+    EarlyConfig,
+    SauteConfig,
+    SimmerConfig,
+    early,
+    nothing,
+    saute,
+    schedule,
+    simmer,
+)
 from jaxsafe.learn.on_policy import on_policy
+from jaxsafe.learn.row import Row
 from jaxsafe.learn.steps import adam_epochs
 from jaxsafe.learn.surrogates import clipped
-from jaxsafe.learn.treatments import none
+from jaxsafe.learn.treatments import (
+    BarrierConfig,
+    LagrangianConfig,
+    PenaltyConfig,
+    PIDConfig,
+    Treatment,
+    barrier,
+    lagrangian,
+    none,
+    penalty,
+    pid,
+)
 from jaxsafe.types import Algorithm, Env
 
 
 @config
 class PPOConfig(pg.PGConfig):
-    clip: float = 0.2  # eps; the paper
+    """PPO: proximal policy optimisation, blind to cost.
+
+        maximise_theta  E[min(w A, clip(w, 1 - eps, 1 + eps) A)],  w = pi(a | s) / pi_old(a | s)
+
+    Source: Schulman et al. (2017), "Proximal Policy Optimization Algorithms", arXiv:1707.06347.
+    Differs from it: passes stop once KL(old || new) > target_kl, as in safety-starter-agents and
+    OmniSafe. The value function is a network of its own, unless `trunk` is shared. A cost critic is
+    trained for its metrics alone.
+    """
+
+    clip: float = 0.2  # eps: ratios count as if they were at most this far from 1, as in the paper.
 
 
-# PPO.yaml differs from PolicyGradient.yaml by its passes.
-PUBLISHED: dict[str, dict[str, Any]] = {
-    name: options | {"epochs": 40, "critic_epochs": 40} for name, options in pg.PUBLISHED.items()
+@config
+class PPOLagConfig(LagrangianConfig, PPOConfig):
+    """PPO-Lagrangian: PPO whose advantage pays for cost at an adaptive price.
+
+        maximise_theta  E[min(w A, clip(w, 1 - eps, 1 + eps) A)],  A = (A_r - lam A_c) / (1 + lam)
+        minimise_lam    -lam (J_c - cost_limit),  lam >= 0,  by Adam, once before each step
+
+    Source: Ray, Achiam and Amodei (2019), "Benchmarking Safe Exploration in Deep Reinforcement
+    Learning"; the 1 / (1 + lam) scale is from the authors' code.
+    Differs from it: in the authors' code only the reward term is clipped, and Adam moves a softplus of
+    lam. Here, as in OmniSafe, both terms are clipped, and Adam moves lam. J_c is of this batch
+    (`returns.mean_length`), where OmniSafe has the last 100 episodes.
+    """
+
+
+@config
+class PPOPenaltyConfig(PenaltyConfig, PPOConfig):
+    """PPO-Penalty: PPO whose advantage pays for cost at a fixed price.
+
+        maximise_theta  E[min(w A, clip(w, 1 - eps, 1 + eps) A)],  A = A_r - price A_c
+
+    It is the baseline that adaptive prices are compared with. Nothing keeps it to the cost limit, which
+    is only drawn in plots.
+    """
+
+
+@config
+class CPPOPIDConfig(PIDConfig, PPOConfig):
+    """CPPO-PID: PPO whose price on cost is the output of a PID controller.
+
+        maximise_theta  E[min(w A, clip(w, 1 - eps, 1 + eps) A)],  A = (A_r - lam A_c) / (1 + lam)
+        lam <- (K_p P + I + K_d D)+,   I <- (I + K_i (J_c - cost_limit))+
+
+    P is the smoothed J_c - cost_limit. D is what the smoothed J_c rose over `pid_delay` iterations, and
+    0 if it fell.
+
+    Source: Stooke, Achiam and Abbeel (2020), "Responsive Safety in Reinforcement Learning by PID
+    Lagrangian Methods", arXiv:2007.03964, algorithm 2.
+    """
+
+
+@config
+class IPOConfig(BarrierConfig, PPOConfig):
+    """IPO: PPO whose price on cost is the slope of a logarithmic barrier.
+
+        maximise_theta  E[min(w A, clip(w, 1 - eps, 1 + eps) A)],  A = (A_r - p A_c) / (1 + p)
+        p = barrier / (cost_limit - J_c) within the limit, at most price_max; price_max beyond it
+
+    Source: Liu, Ding and Liu (2020), "IPO: Interior-point Policy Optimization under Constraints",
+    arXiv:1910.09615.
+    Differs from it, as OmniSafe does: the barrier enters by its gradient at the present policy.
+    OmniSafe also normalises rewards and costs. Here only the published settings do.
+    """
+
+
+@config
+class PPOSauteConfig(SauteConfig, PPOConfig):
+    """PPO-Saute: PPO that sees what is left of its budget on cost, and earns while there is some.
+
+        z_0 = 1,   z_{t+1} = (z_t - c_t / B) / gamma_n,   B = cost_limit mean_{t<T} gamma_n^t
+        maximise_theta  E[min(w A, clip(w, 1 - eps, 1 + eps) A)],  A of r_t if z_{t+1} > 0, else n
+
+    The policy takes z beside the observation. The limit is to hold in every episode, not on average.
+
+    Source: Sootla et al. (2022), "Saute RL: Almost Surely Safe Reinforcement Learning Using State
+    Augmentation", arXiv:2202.06558; B, which turns a sum into a discounted one, is from the authors'
+    code.
+    Differs from it: a step that ends at z = 0 exactly is unsafe, as in the authors' code and in
+    OmniSafe. z is not normalised. The value at a time limit is of the z that the episode ended with;
+    OmniSafe's is of z = 1 (`full_at_end`). A cost critic is trained for its metrics alone.
+    """
+
+
+@config
+class PPOSimmerPIDConfig(SimmerConfig, PPOConfig):
+    """PPO-Simmer: PPO-Saute whose episodes start with a part of the budget that a controller raises.
+
+        z_0 = B / cost_limit, then z, the reward and the step as in PPO-Saute
+        B = clip(d + u, 0, cost_limit),   u = clip(K_p e + K_i sum e + K_aw (u' - u'_raw), -U, U)
+        e = s e' + (1 - s) (d - J_c),   once an iteration; ' is the iteration before
+
+    d rises on a line to cost_limit: the task starts safer than it has to be, and simmers up. u' is what
+    the clips left of u'_raw, both the clip at U and the clip of B. So the sum does not wind up.
+
+    Source: Sootla et al. (2022), "Effects of Safety State Augmentation on Safe Exploration",
+    arXiv:2206.02675, PI Simmer; the filter, the sum over the last `simmer_window` errors and both clips
+    are from the authors' code.
+    Differs from it: d is a line, where the paper has a staircase. OmniSafe has B' for d, so that u adds
+    up (`simmer_adds`), and calls K_aw the gain of a derivative. There, all episodes of an epoch but the
+    first start at z = 1, the whole share of B (`simmer_full`).
+    """
+
+
+@config
+class PPOEarlyTerminatedConfig(EarlyConfig, PPOConfig):
+    """PPO in the early-terminated task: an episode that breaks the cost limit ends there, for good.
+
+        maximise_theta  E[min(w A, clip(w, 1 - eps, 1 + eps) A)]
+        terminated_t  where  sum_{s<=t} c_s > cost_limit;  there r_t = r_e, and the value after it is 0
+
+    The policy loses the reward that was to come, so the limit is to hold in every episode. Only
+    training ends episodes: evaluation runs whole ones, whose cost says what the limit was worth.
+
+    Source: Sun et al. (2021), "Safe Exploration by Solving Early Terminated MDP", arXiv:2107.04200.
+    Differs from it: PPO sees the observation alone, as in OmniSafe. The paper's policies are off-policy
+    ones that remember the episode. Each environment counts the cost of its own episode; OmniSafe's
+    count goes on after an episode that time ends (`keep_cost`). A cost critic is trained for its
+    metrics alone.
+    """
+
+
+def make(
+    env: Env,
+    axis_name: str | None = None,
+    treatment: Treatment = none,
+    augmentation: Augmentation = nothing,
+) -> Algorithm:
+    return on_policy(env, treatment, clipped, adam_epochs, axis_name, augmentation)
+
+
+# OmniSafe @15603dd: PPO.yaml differs from PolicyGradient.yaml by its passes, and the others from
+# PPO.yaml by their own part. For Point and Car on Goal and Circle PPOSaute.yaml adds
+# algo.saute_discount=0.9999 algo.unsafe_reward=-0.2 algo.epochs=80 algo.critic_epochs=80, and on Goal
+# algo.obs_normalize=false. PPOSimmerPID.yaml adds the same, but not for Car on Circle.
+PUBLISHED: dict[str, Any] = pg.PUBLISHED | pg.OFTEN
+# A time limit bootstraps, so what is left of a budget is worth as much as the rewards it would buy
+# beyond the limit: the less, the more they are discounted. At 0.99 a third of it is saved.
+BUDGETED: dict[str, Any] = {"unsafe_reward": -1.0, "discount": 0.9}
+CONTROLLED: dict[str, Any] = {"lam_init": 0.8, "pid_kp": 0.05, "pid_ki": 0.005, "pid_smoothing": 0.5}
+
+ROWS = {
+    "ppo": Row(
+        PPOConfig,
+        make,
+        "clipped policy steps, no constraint",
+        {"omnisafe": PUBLISHED},
+        omnisafe="PPO",
+        holds="nothing",
+        lever=pg.LEVER,
+    ),
+    "ppo_lag": Row(
+        PPOLagConfig,
+        partial(make, treatment=lagrangian),
+        "PPO with an adaptive price on cost",
+        {"omnisafe": PUBLISHED | {"dual_lr": 0.035}},
+        omnisafe="PPOLag",
+        lever=pg.LEVER,
+    ),
+    "ppo_penalty": Row(
+        PPOPenaltyConfig,
+        partial(make, treatment=penalty),
+        "PPO with a fixed price on cost",
+        {"omnisafe": PUBLISHED},
+        holds="nothing",
+        lever=pg.LEVER | {"price": 0.0},
+    ),
+    "cppo_pid": Row(
+        CPPOPIDConfig,
+        partial(make, treatment=pid),
+        "PPO with a price on cost from a PID controller",
+        {"omnisafe": PUBLISHED},
+        omnisafe="CPPOPID",
+        lever=pg.LEVER | CONTROLLED,
+    ),
+    "ipo": Row(
+        IPOConfig,
+        partial(make, treatment=barrier),
+        "PPO with a logarithmic barrier at the limit",
+        {"omnisafe": PUBLISHED | {"epochs": 10, "critic_epochs": 10} | pg.SCALED},
+        omnisafe="IPO",
+        lever=pg.LEVER | {"barrier": 0.1, "price_max": 4.0},
+    ),
+    "ppo_saute": Row(
+        PPOSauteConfig,
+        partial(make, augmentation=saute),
+        "PPO that sees its budget on cost, and earns nothing without",
+        {"omnisafe": PUBLISHED | OMNISAFE_SAUTE},
+        omnisafe="PPOSaute",
+        holds="episode",
+        lever=pg.LEVER | BUDGETED,
+    ),
+    "ppo_simmer_pid": Row(
+        PPOSimmerPIDConfig,
+        partial(make, treatment=schedule, augmentation=simmer),
+        "PPO-Saute with a budget that a PID controller raises",
+        {"omnisafe": PUBLISHED | OMNISAFE_SAUTE | OMNISAFE_SIMMER},
+        omnisafe="PPOSimmerPID",
+        holds="episode",
+        lever=pg.LEVER | BUDGETED | {"budget_ramp": 50.0},
+    ),
+    "ppo_early_terminated": Row(
+        PPOEarlyTerminatedConfig,
+        partial(make, augmentation=early),
+        "PPO whose training episodes end where they break the limit",
+        {"omnisafe": PUBLISHED},
+        omnisafe="PPOEarlyTerminated",
+        holds="episode",
+        lever=pg.LEVER,
+    ),
 }
-
-
-def make(env: Env, axis_name: str | None = None) -> Algorithm:
-    return on_policy(env, none, clipped, adam_epochs, axis_name)

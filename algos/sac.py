@@ -1,19 +1,4 @@
-"""SAC: soft actor-critic, blind to cost.
-
-    y = r + discount (1 - terminated) (min_i Q'_i(s', a') - alpha log pi(a' | s')),   a' ~ pi(s')
-    minimise_Q      E[sum_i (Q_i(s, a) - y)^2]
-    maximise_pi     E[min_i Q_i(s, a) - alpha log pi(a | s)],                         a ~ pi(s)
-    minimise_alpha  -log alpha E[log pi(a | s) + H],        H = target_entropy * action size
-    Q' <- Q' + tau (Q - Q')
-
-in this order at each gradient step; i = 1, 2. With `n_step` n, r is the discounted sum of up to n
-rewards and s' the state after them.
-
-Source: Haarnoja et al. (2018), "Soft Actor-Critic Algorithms and Applications", arXiv:1812.05905,
-algorithm 1; the loss of the temperature is that of the authors' code.
-Differs from it: the defaults are for a thousand environments (few, large gradient steps; targets that
-follow faster; layer norm in the critics; normalised observations).
-"""
+"""Soft actor-critic, for a thousand environments or for one."""
 
 from typing import Any
 
@@ -25,6 +10,7 @@ from jaxsafe.config import ConfigError, config
 from jaxsafe.learn.batch import pmean, select
 from jaxsafe.learn.off_policy import Fit, Learner, OffPolicyConfig, Turn, off_policy
 from jaxsafe.learn.replay import Transitions
+from jaxsafe.learn.row import Row
 from jaxsafe.learn.steps import adam
 from jaxsafe.nn.critics import init_critics, init_squashed, q_values, squashed_policy
 from jaxsafe.nn.distributions import squashed_mean, squashed_sample
@@ -33,33 +19,30 @@ from jaxsafe.types import Algorithm, Env, Metrics, PyTree
 
 @config
 class SACConfig(OffPolicyConfig):
-    alpha_init: float = 1.0  # the temperature at first; the paper's code
-    alpha_lr: float = 3e-4  # of log alpha, by Adam; 0 keeps alpha as it is
-    target_entropy: float = -1.0  # nats for each dimension of the action; the paper
-    policy_delay: int = 1  # gradient steps of the critics for each of policy, alpha and targets
+    """SAC: soft actor-critic, blind to cost.
 
+        y = r + discount (1 - terminated) (min_i Q'_i(s', a') - alpha log pi(a' | s')),   a' ~ pi(s')
+        minimise_Q      E[sum_i (Q_i(s, a) - y)^2]
+        maximise_pi     E[min_i Q_i(s, a) - alpha log pi(a | s)],                         a ~ pi(s)
+        minimise_alpha  -log alpha E[log pi(a | s) + H],        H = target_entropy * action size
+        Q' <- Q' + tau (Q - Q')
 
-# OmniSafe @15603dd, configs/off-policy/SAC.yaml: of the velocity tasks first. Its gradient step comes
-# after every environment step, as here; an update of 50 of them is ours and changes no result.
-OMNISAFE: dict[str, Any] = {
-    "num_envs": 1,
-    "horizon": 50,
-    "stagger": False,
-    "replay_ratio": 256,
-    "batch_size": 256,
-    "tau": 0.005,
-    "layer_norm": False,
-    "obs_normalize": False,
-    "alpha_init": 0.2,
-    "alpha_lr": 0.0,
-    "policy_delay": 2,
-}
-PUBLISHED: dict[str, dict[str, Any]] = {
-    "omnisafe": OMNISAFE,
-    "omnisafe_navigation": OMNISAFE | {"alpha_init": 1e-5, "lr": 5e-6, "critic_lr": 1e-3},
-    # the published replay ratio with 64 environments: 4 gradient steps for each of their steps
-    "parallel": {"num_envs": 64, "replay_ratio": 256, "batch_size": 4096, "tau": 0.005},
-}
+    in this order at each gradient step; i = 1, 2. With `n_step` n, r is the discounted sum of up to n
+    rewards and s' the state after them.
+
+    Source: Haarnoja et al. (2018), "Soft Actor-Critic Algorithms and Applications", arXiv:1812.05905,
+    algorithm 1; the loss of the temperature is that of the authors' code.
+    Differs from it: the defaults are for a thousand environments. Gradient steps are few and large, the
+    targets follow faster, the critics have layer norm, and observations are normalised.
+    """
+
+    alpha_init: float = 1.0  # The temperature at first, as in the authors' code.
+    # The learning rate of log alpha, by Adam, as in the authors' code. With 0, alpha stays as it is.
+    alpha_lr: float = 3e-4
+    # The entropy that alpha aims at, in nats for each dimension of the action, as in the paper.
+    target_entropy: float = -1.0
+    # Gradient steps of the critics for each one of policy, alpha and targets. The paper has 1.
+    policy_delay: int = 1
 
 
 def init(key: jax.Array, obs_size: int, action_size: int, cfg: Any) -> Fit:
@@ -146,3 +129,43 @@ def learner(action_size: int) -> Learner:
 
 def make(env: Env, axis_name: str | None = None) -> Algorithm:
     return off_policy(env, learner(env.action_size), axis_name)
+
+
+# OmniSafe @15603dd, configs/off-policy/SAC.yaml: of the velocity tasks first. Its gradient step comes
+# after every environment step, as here; an update of 50 of them is ours and changes no result.
+OMNISAFE: dict[str, Any] = {
+    "num_envs": 1,
+    "horizon": 50,
+    "stagger": False,
+    "replay_ratio": 256,
+    "batch_size": 256,
+    "tau": 0.005,
+    "layer_norm": False,
+    "obs_normalize": False,
+    "alpha_init": 0.2,
+    "alpha_lr": 0.0,
+    "policy_delay": 2,
+}
+PUBLISHED: dict[str, dict[str, Any]] = {
+    "omnisafe": OMNISAFE,
+    "omnisafe_navigation": OMNISAFE | {"alpha_init": 1e-5, "lr": 5e-6, "critic_lr": 1e-3},
+    # the published replay ratio with 64 environments: 4 gradient steps for each of their steps
+    "parallel": {"num_envs": 64, "replay_ratio": 256, "batch_size": 4096, "tau": 0.005},
+}
+# for a problem of two levers
+LEVER: dict[str, Any] = {
+    "num_envs": 32, "horizon": 8, "learn_every": 2, "batch_size": 256, "replay_size": 20_000,
+    "learning_starts": 256, "hidden": (32,), "discount": 0.9, "lr": 3e-3, "critic_lr": 3e-3,
+    "alpha_init": 0.1, "alpha_lr": 3e-3, "target_entropy": -2.0,
+}  # fmt: skip
+
+ROWS = {
+    "sac": Row(
+        SACConfig,
+        make,
+        "soft actor-critic, no constraint",
+        PUBLISHED,
+        holds="nothing",
+        lever=LEVER,
+    )
+}

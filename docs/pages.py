@@ -1,30 +1,37 @@
 """Write a page for each algorithm and each task from the code: python docs/pages.py
 
-Of an algorithm, docs/algorithms/NAME.md: equations, source and departures are the module's docstring;
+Of an algorithm, docs/algorithms/NAME.md: equations, source and departures are its config's docstring;
 settings and their origin are the lines of its config; results are those of docs/results. Of a task,
 docs/environments/NAME.md: objects, observations and costs are the environment's, how close it is to the
 original is the tables of docs/fidelity.md. A test holds the pages to the code.
 """
 
+import ast
 import dataclasses
+import functools
 import importlib
 import inspect
+import io
 import math
 import re
 import sys
+import textwrap
+import tokenize
 from pathlib import Path
 from typing import Any
 
-from jaxsafe.algos import ALGOS, Entry
-from jaxsafe.config import from_dict
+from jaxsafe.algos import ALGOS, Row
 from jaxsafe.envs import ENVS
 from jaxsafe.learn.offline import OfflineConfig
-from jaxsafe.run import compat, run_folder
-from jaxsafe.run.settings import algo_options
+from jaxsafe.report import stats, studies
+from jaxsafe.report import tables as report
+from jaxsafe.report.published import read_published
+from jaxsafe.report.read import Run, read
+from jaxsafe.run import compat
 
 HERE = Path(__file__).parent
-sys.path[:0] = [str(HERE), str(HERE / "results")]
-results, tables = importlib.import_module("make"), importlib.import_module("tables")
+sys.path.insert(0, str(HERE))
+tables = importlib.import_module("tables")
 TASKS = {  # what a robot is paid for
     "goal": "Reach the goal (green), again and again: after each success it is elsewhere.",
     "button": "Press the marked button (orange cylinder), again and again: each success draws another.",
@@ -62,12 +69,28 @@ def prose(docstring: str) -> tuple[str, str]:
     return title, "\n\n".join(blocks)
 
 
+def comments_of(cls: type) -> dict[str, str]:
+    """Field -> its comment: the lines of comment above the field and the one after its default."""
+    text = textwrap.dedent(inspect.getsource(cls))
+    tokens = [*tokenize.generate_tokens(io.StringIO(text).readline)]
+    notes = {t.start[0]: t.string.lstrip("# ") for t in tokens if t.type == tokenize.COMMENT}
+    alone = {line for line in notes if text.splitlines()[line - 1].startswith("    #")}
+    (tree,) = ast.parse(text).body
+    found = {}
+    for field in (node for node in ast.walk(tree) if isinstance(node, ast.AnnAssign)):
+        first = field.lineno
+        while first - 1 in alone:
+            first -= 1
+        lines = range(first, (field.end_lineno or field.lineno) + 1)
+        found[ast.unparse(field.target)] = " ".join(notes[line] for line in lines if line in notes)
+    return found
+
+
 def settings(config: type) -> str:
-    """A row a field: its default, and the comment beside it in the class that defines it."""
-    comments = {}
+    """A row a field: its default, and the comment in the class that defines it."""
+    comments: dict[str, str] = {}
     for cls in reversed(config.__mro__[:-1]):
-        for name, comment in re.findall(r"^    (\w+): .*?(?:  # (.*))?$", inspect.getsource(cls), re.M):
-            comments[name] = comment or comments.get(name, "")
+        comments |= {name: note or comments.get(name, "") for name, note in comments_of(cls).items()}
     rows = ["| setting | default | |", "|---|---|---|"]
     for field in dataclasses.fields(config):
         note = comments[field.name].replace("|", "\\|")
@@ -75,52 +98,59 @@ def settings(config: type) -> str:
     return "\n".join(rows)
 
 
-def published(entry: Entry) -> str:
+def published(row: Row) -> str:
     """What `preset=published` and `compat=omnisafe` change."""
     lines = []
-    for origin, options in entry.published.items():
+    for i, (origin, options) in enumerate(row.published.items()):
         changed = ", ".join(f"`{name}={value}`" for name, value in options.items())
-        lines.append(f"`preset=published` ({origin}): {changed}.")
-    conventions = compat.overrides("omnisafe", entry.config)
-    changed = ", ".join(f"`{name}={value}`" for name, value in conventions.items())
-    if changed:
+        preset = f"`preset={origin}`" if i else f"`preset=published` ({origin})"
+        lines.append(f"{preset}: {changed}.")
+    if conventions := compat.overrides("omnisafe", row.config):
+        changed = ", ".join(f"`{name}={value}`" for name, value in conventions.items())
         lines.append(f"`compat=omnisafe` ([why](../howto/migrate.md#conventions)): {changed}.")
     return "\n\n".join(lines)
+
+
+@functools.cache
+def trained() -> list[Run]:
+    """The runs of the tables of results, by task and then by whose settings they have."""
+
+    def place(run: Run) -> tuple[str, str]:
+        preset, compat = run.config["preset"], run.config["compat"]
+        return run.env, compat if compat != "none" else preset if preset != "fast" else ""
+
+    folders = [HERE / "results" / name for name in ("goal", "button", "push", "omnisafe")]
+    return sorted(read(folders), key=place)
 
 
 def measured(name: str) -> str:
     """The runs of this algorithm in docs/results."""
     rows = []
-    for folder in sorted((HERE / "results").glob(f"*-{name}*/")):
-        env, algo, *_ = folder.name.split("-")
-        if algo != name:
+    known = read_published(HERE / "results" / "published.csv")
+    for run in trained():
+        if run.config["algo.name"] != name:
             continue
-        metrics = run_folder.read_metrics(folder)
-        ret, cost = (results.last_tenth(metrics, f"train/{k}") for k in ("return", "cost"))
-        config = run_folder.read_config(folder)
-        rules = config["env"].get("rules", "safety_gym")
-        which, seeds = config["preset"], len(set(metrics["seed"]))
-        how = f"`{env}`, preset {which}, {seeds} seeds"
-        how += f", `compat={config['compat']}`" if config.get("compat", "none") != "none" else ""
+        ret, cost = (report.cell(stats.estimate(run.values[k]), ".2f") for k in ("return", "cost"))
+        rules, compat = run.config["env.rules"], run.config["compat"]
+        how = f"`{run.env}`, preset {run.config['preset']}, {len(run.seeds)} seeds"
+        how += f", `compat={compat}`" if compat != "none" else ""
         how += f", `env.rules={rules}`" if rules != "safety_gym" else ""
-        options = {k: x for k, x in config["algo"].items() if k != "name"}
-        given = dataclasses.asdict(from_dict(ALGOS[name].config, options, "algo."))
-        usual = algo_options(ALGOS[name], config["preset"], config.get("compat", "none"))
-        how += "".join(f", `algo.{k}={given[k]}`" for k in options if given[k] != usual[k])
-        rows.append(f"| {how} | {ret} | {cost} | {results.published(config)} |")
+        unusual = {k: v for k, v in studies.unusual(run.config).items() if k.startswith("algo.")}
+        how += "".join(f", `{k}={v}`" for k, v in unusual.items())
+        rows.append(f"| {how} | {ret} | {cost} | {studies.published_cell(run.config, known)} |")
     if not rows and issubclass(ALGOS[name].config, OfflineConfig):
         return "Not run at length yet."
     if not rows:
-        return "Not run at length yet; it learns the small exact problem of tests/test_on_policy.py."
+        return "Not run at length yet; it learns the small exact problem of tests/toys.py, Lever."
     head = "| 1e7 steps a seed, limit 25 | return, last 10% | cost | published |\n|---|---|---|---|\n"
     return head + "\n".join(rows)
 
 
 def page(name: str) -> str:
-    entry = ALGOS[name]
-    title, text = prose(importlib.import_module(entry.make.__module__).__doc__ or "")
-    module = entry.make.__module__.rsplit(".", 1)[1]
-    data = " dataset=data.npz" if issubclass(entry.config, OfflineConfig) else ""
+    row = ALGOS[name]
+    title, text = prose(row.config.__doc__ or "")
+    module = row.config.__module__.rsplit(".", 1)[1]
+    data = " dataset=data.npz" if issubclass(row.config, OfflineConfig) else ""
     return f"""# {title.removesuffix(".")}
 
     python scripts/train.py env=point_goal1 algo={name}{data}
@@ -131,16 +161,14 @@ The code: [algos/{module}.py](../../algos/{module}.py).
 
 ## Settings
 
-[O] is OmniSafe's default, [S] that of safety-starter-agents.
+{settings(row.config)}
 
-{settings(entry.config)}
-
-{published(entry)}
+{published(row)}
 
 ## Results
 
 {measured(name)}
-"""
+""".replace("\n\n\n", "\n\n")
 
 
 def fidelity(name: str) -> list[str]:
@@ -240,12 +268,16 @@ of boxes, vases and gremlins; those of Point's task. An episode has {env.episode
 """.replace("\n\n\n", "\n\n")
 
 
+def algorithms() -> str:
+    """The index of the algorithms' pages."""
+    lines = [f"| [`{name}`]({name}.md) | {row.summary} |" for name, row in ALGOS.items()]
+    return "# Algorithms\n\n| | |\n|---|---|\n" + "\n".join(lines) + "\n"
+
+
 def pages() -> dict[Path, str]:
     """Every page that is made, by its path."""
     found = {HERE / "algorithms" / f"{name}.md": page(name) for name in ALGOS}
-    lines = [f"| [`{name}`]({name}.md) | {entry.summary} |" for name, entry in ALGOS.items()]
-    index = "# Algorithms\n\n| | |\n|---|---|\n" + "\n".join(lines) + "\n"
-    found[HERE / "algorithms" / "README.md"] = index
+    found[HERE / "algorithms" / "README.md"] = algorithms()
     tasks = list(dict.fromkeys(name.split("_")[1] for name in ENVS))
     found |= {HERE / "environments" / f"{task}.md": task_page(task) for task in tasks}
     lines = ["| task | | costs |", "|---|---|---|"]

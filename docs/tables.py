@@ -4,13 +4,13 @@ Each table stands between <!-- table: NAME --> and <!-- end -->; a test holds th
 """
 
 import functools
-from collections.abc import Mapping
 from pathlib import Path
 
-from jaxsafe.algos import ALGOS
+from jaxsafe import algos
 from jaxsafe.envs import ENVS, SafetyGym, make
-from jaxsafe.interop.migrate import ALGORITHMS, OMNISAFE
-from jaxsafe.run import compat
+from jaxsafe.interop import migrate
+from jaxsafe.learn.conventions import Convention, conventions
+from jaxsafe.report.tables import between_marks
 
 HERE = Path(__file__).parent
 ROBOTS = ("point", "car", "doggo")
@@ -34,29 +34,36 @@ def environments() -> str:
 
 def algorithms() -> str:
     lines = ["| algorithm | what it does |", "|---|---|"]
-    return "\n".join(lines + [f"| `{name}` | {entry.summary} |" for name, entry in ALGOS.items()])
+    return "\n".join(lines + [f"| `{name}` | {row.summary} |" for name, row in algos.ALGOS.items()])
 
 
 def omnisafe_algorithms() -> str:
     lines = ["| OmniSafe | here |", "|---|---|"]
-    return "\n".join(lines + [f"| `{theirs}` | `{ours}` |" for theirs, ours in ALGORITHMS.items()])
+    names = migrate.algorithms().items()
+    return "\n".join(lines + [f"| `{theirs}` | `{ours}` |" for theirs, ours in names])
 
 
 def omnisafe_conventions() -> str:
-    """What jaxsafe/compat.py reproduces, with the algorithms that have it."""
+    """What `compat=omnisafe` reproduces, with the algorithms that have it."""
+    taken: list[tuple[Convention, list[str]]] = []
+    for name, row in algos.ALGOS.items():
+        for convention in conventions(row.config):
+            names = next((names for known, names in taken if known == convention), [])
+            if not names:
+                taken.append((convention, names))
+            names.append(f"`{name}`")
     lines = ["| OmniSafe | here | options | algorithms |", "|---|---|---|---|"]
-    for c in compat.OMNISAFE:
+    for c, names in sorted(taken, key=lambda item: -len(item[1])):
         options = ", ".join(f"`algo.{k}={str(v).lower()}`" for k, v in c.options.items())
-        takers = [f"`{name}`" for name, entry in ALGOS.items() if c.applies(entry.config)]
-        which = "all" if len(takers) == len(ALGOS) else ", ".join(takers)
+        which = "all" if len(names) == len(algos.ALGOS) else ", ".join(names)
         lines.append(f"| {c.theirs} | {c.ours} | {options} | {which} |")
     return "\n".join(lines)
 
 
 def omnisafe_keys() -> str:
-    """What jaxsafe/migrate.py makes of each key of OmniSafe's configs."""
+    """What scripts/migrate.py makes of each key of OmniSafe's configs."""
     lines = ["| OmniSafe | here | |", "|---|---|---|"]
-    for key, rule in OMNISAFE.items():
+    for key, rule in migrate.OMNISAFE.items():
         ours = ", ".join(f"`{option}`" for option in rule.ours.split()) or "no option"
         lines.append(f"| `{key}` | {ours} | {rule.note} |")
     return "\n".join(lines)
@@ -72,21 +79,9 @@ TABLES = {
 }
 
 
-def replaced(text: str, written: Mapping[str, str], mark: str = "table") -> str:
-    """`text` with what stands between the marks of these tables."""
-    for name, table in written.items():
-        begin, end = f"<!-- {mark}: {name} -->\n", "<!-- end -->"
-        before, begun, rest = text.partition(begin)
-        _, ended, after = rest.partition(end)
-        if not (begun and ended):
-            raise ValueError(f"no {begin.strip()} with {end} after it")
-        text = before + begin + table + "\n" + end + after
-    return text
-
-
 def filled(path: Path) -> str:
     """The file's text with its tables made anew."""
-    return replaced(path.read_text(), {name: table() for name, table in TABLES[path].items()})
+    return between_marks(path.read_text(), {name: table() for name, table in TABLES[path].items()})
 
 
 if __name__ == "__main__":

@@ -17,11 +17,11 @@ import jax
 import numpy as np
 
 from jaxsafe import algos, envs
-from jaxsafe.algos import Entry as Row
+from jaxsafe.algos import Row
 from jaxsafe.config import ConfigError, flat, nearest
 from jaxsafe.envs import SafetyGym, SafetyGymConfig
 from jaxsafe.envs.check import check_env
-from jaxsafe.envs.engines.physics import default_engine
+from jaxsafe.envs.engines import default_engine
 from jaxsafe.learn.acting import Player
 from jaxsafe.report import evaluation, film, sweep_summary
 from jaxsafe.report.evaluation import Scores
@@ -240,7 +240,7 @@ def train(env: str | Env | None = None, algo: Any = None, **options: Any) -> Run
         env: a name, default 'point_goal1'; an environment from `make`; or any `Env` of yours
             (jaxsafe.types), which is recorded under the name of its class.
         algo: a name, default 'ppo_lag'; or one of yours: an object with `config`, a class under
-            `jaxsafe.config.config`, and `make(env, axis_name=None)`, such as `jaxsafe.algos.Entry`,
+            `jaxsafe.config.config`, and `make(env, axis_name=None)`, such as `jaxsafe.algos.Row`,
             which is recorded under the name of that class.
         options: settings of the run as on the command line (`total_steps` of each seed, `num_envs`,
             `num_seeds`, `seed`, `devices`, `preset`, `compat`, `run_dir`, `resume`, `init_from`,
@@ -462,7 +462,7 @@ def choose_algo(algo: Any) -> tuple[dict[str, Any], dict[str, Row]]:
                 f"algo: expected a name or an object with a config class and make, not {one!r}"
             )
         name = kind.__name__.removesuffix("Config")
-        own[name] = Row(kind, make_algo, "", {})
+        own[name] = Row(kind, make_algo)
         names.append(name)
     return {"algo": names if several else names[0]}, own
 

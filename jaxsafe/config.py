@@ -2,10 +2,13 @@
 
 import dataclasses
 import difflib
+import importlib
 import math
+import sys
 import types
 import typing
 from collections import Counter
+from pathlib import Path
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
@@ -145,3 +148,30 @@ def describe(kind: Any) -> str:
     return {int: "a whole number", float: "a number", str: "a string", bool: "true or false"}.get(
         kind, str(kind)
     )
+
+
+def named_object(option: str, address: str) -> Any:
+    """What 'module:name' names, imported from the working directory or from what is installed.
+
+    This executes the module, so an address comes from the user, never from a file.
+
+    Args:
+        option: whose value the address is, for messages: 'env' or 'algo'.
+    Raises:
+        ConfigError: no such module, or nothing of that name in it.
+    """
+    module, _, name = address.partition(":")
+    if not (module and name):
+        raise ConfigError(f"{option}={address}: expected module:name")
+    if (here := str(Path.cwd())) not in sys.path:
+        sys.path.insert(0, here)
+    try:
+        found = importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if not error.name or not f"{module}.".startswith(f"{error.name}."):  # a module that it imports
+            raise
+        raise ConfigError(f"{option}={address}: no module {module!r} in {here} or installed") from error
+    if name not in vars(found):
+        public = [key for key in vars(found) if not key.startswith("_")]
+        raise ConfigError(f"{option}={address}: {module} has no {name!r}{nearest(name, public)}")
+    return vars(found)[name]

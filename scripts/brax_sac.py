@@ -29,8 +29,7 @@ def main() -> None:
         name, _, value = text.partition("=")
         options[name] = yaml.safe_load(value)
     env = from_brax(brax.envs.get_environment(args.task, backend=args.backend), costs=())
-    run = jaxsafe.train(env, options.pop("algo", "sac"), **options)
-    print(jaxsafe.evaluate(run))
+    jaxsafe.train(env, options.pop("algo", "sac"), **options)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,6 @@ import numpy as np
 
 from jaxsafe import envs
 from jaxsafe.config import ConfigError
-from jaxsafe.envs.engines.physics import contact_budget
 from jaxsafe.envs.safety_gym import scene as scenes
 from jaxsafe.envs.safety_gym import sleeping
 
@@ -74,16 +73,17 @@ def main() -> int:
     import warp as wp
     from mujoco.mjx.third_party import mujoco_warp
 
-    from jaxsafe.envs.engines import dynamics_warp
+    from jaxsafe.envs.engines.warp import dynamics
 
     worlds = args.num_envs
     small = scenes.build(sleeping.small_config(env.config, sleeping.awake(env.config, "warp")))
     start = states(env, small, worlds)
-    contacts, rows = contact_budget(small)
+    contacts, rows = small.room()
+    simulated = small.simulation(env.config).compile(count=True)
     sensors_off = mujoco.mjtDisableBit.mjDSBL_SENSOR.value
 
     def build(options: dict, less_contacts: float, less_rows: float):
-        model = mujoco_warp.put_model(small.model)
+        model = mujoco_warp.put_model(simulated)
         model.opt.warn_overflow = 0
         for name, value in options.items():
             setattr(model.opt, name, value)
@@ -93,8 +93,9 @@ def main() -> int:
             "naconmax": int(contacts * less_contacts) * worlds + 128,
             "njmax": int(rows * less_rows),
         }
-        data = mujoco_warp.make_data(small.model, nworld=worlds, **room)
-        dynamics_warp.adopt(small.model, model, data)
+        data = mujoco_warp.make_data(simulated, nworld=worlds, **room)
+        pillars = small.simulation(env.config).pillars
+        dynamics.adopt(simulated, model, data, pillars)
         return model, blind, data
 
     def load(data) -> None:
@@ -105,11 +106,11 @@ def main() -> int:
         for name, variant in VARIANTS.items():
             model, blind, data = build(*variant)
             load(data)
-            dynamics_warp.step(blind, data)  # compiles
+            dynamics.step(blind, data)  # compiles
             with wp.ScopedCapture() as capture:
                 for _ in range(10):
-                    dynamics_warp.step(blind, data)
-                dynamics_warp.forward(model, data)
+                    dynamics.step(blind, data)
+                dynamics.forward(model, data)
             graph: Any = capture.graph
             seconds = []
             for _ in range(7):
@@ -125,14 +126,14 @@ def main() -> int:
         _, blind, data = build({}, 1.0, 1.0)
         load(data)
         for _ in range(3):
-            dynamics_warp.step(blind, data)
+            dynamics.step(blind, data)
         for name, x in (("rows", data.nefc), ("solver iterations", data.solver_niter)):
             x = x.numpy()
             print(f"{name}: mean {x.mean():.1f}, 99.9% {np.quantile(x, 0.999):.0f}, most {x.max()}")
         steps, spent = 3, collections.defaultdict(list)
         wp.timing_begin(cuda_filter=wp.TIMING_ALL)
         for _ in range(steps):
-            dynamics_warp.step(blind, data)
+            dynamics.step(blind, data)
         for kernel in wp.timing_end():
             spent[kernel.name].append(kernel.elapsed)
         total = sum(map(sum, spent.values())) / steps

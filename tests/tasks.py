@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsafe.envs import SafetyGym, make
+from jaxsafe.envs.safety_gym.task import in_parts
 from jaxsafe.types import State
 
 FAST = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}  # to compile
@@ -42,8 +43,7 @@ class Task:
 @functools.cache
 def task(name: str, engine: str = "c", **overrides: Any) -> Task:
     env = make(name, engine=engine, **overrides)
-    reset, step = jax.vmap(env.reset), jax.vmap(env.step)
-    return Task(env, jax.jit(reset, compiler_options=FAST), jax.jit(step, compiler_options=FAST))
+    return Task(env, *in_parts(env, compiler_options=FAST))
 
 
 def change(state: State, physics: dict[str, Any] | None = None, **world: Any) -> State:

@@ -7,17 +7,18 @@ step is replayed on its own: set the recorded state, apply the recorded action, 
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxsafe.config import ConfigError
-from jaxsafe.envs.engines.physics import Physics
+from jaxsafe.envs.engines import Physics, Readings
 from jaxsafe.envs.safety_gym import scene as scenes
+from jaxsafe.envs.safety_gym.arena import World
 from jaxsafe.envs.safety_gym.config import read
-from jaxsafe.envs.safety_gym.task import SafetyGym, World
+from jaxsafe.envs.safety_gym.task import Drive, SafetyGym, physics_of
 from jaxsafe.types import State
 
 # Velocities and poses of a well-conditioned step agree this well (m and rad, per s).
@@ -52,6 +53,13 @@ class Recording:
         return self.arrays.get(key, np.full(len(self.rows), default))
 
 
+class Given(NamedTuple):
+    """What the recorded step led to, by chance."""
+
+    goal: Any  # [2], m
+    button: Any  # int32 []
+
+
 class Replay(SafetyGym):
     """The environment, with the next goal given instead of drawn."""
 
@@ -62,13 +70,15 @@ class Replay(SafetyGym):
         config = read(recording.meta["config"] | {"awake": awake})
         super().__init__(config, engine, recording.name)
 
-    def replay(self, world: World, action: jax.Array, goal: jax.Array, button: jax.Array) -> State:
-        self._given = goal, button
+    def after(self, world: World, given: Given, drive: Drive, moved: Physics, seen: Readings) -> State:
+        """The state after a step whose physics made `moved` and `seen`."""
+        self._given = given.goal, given.button
         zero = jnp.zeros(())
         obs = jnp.zeros(self.obs_size)  # `compare` refuses dicts
         costs = jnp.zeros(len(self.cost_names))
         info = {"goal_met": zero, "exception": zero, "overflow": zero}
-        return self.step(State(world, obs, zero, zero, costs, jnp.bool_(False), info), action)
+        before = State(world, obs, zero, zero, costs, jnp.bool_(False), info)
+        return self.judge(before, drive, moved, seen)
 
     def _next_goal(self, world: World, key: jax.Array, wanted: jax.Array) -> tuple[World, jax.Array]:
         place, button = self._given
@@ -220,13 +230,25 @@ def replay(env: Replay, recording: Recording, before: World) -> State:
     goal = f32(recording["state.goal_pos"][rows][:, :2])
     button = i32(np.maximum(recording["state.goal_button"][rows], 0))
 
+    # in parts, as `in_parts` has them
     @jax.jit
     @jax.vmap
-    def step(world: World, action: jax.Array, goal: jax.Array, button: jax.Array) -> State:
-        after = env.replay(world.replace(key=jax.random.key(0)), action, goal, button)
+    def drive(world: World, action: jax.Array) -> Drive:
+        return env.drive(world.replace(key=jax.random.key(0)), action)
+
+    @jax.jit
+    @jax.vmap
+    def judge(world: World, given: Given, drive: Drive, moved: Physics, seen: Readings) -> State:
+        after = env.after(world, given, drive, moved, seen)
         return after.replace(physics=after.physics.replace(key=world.key))
 
-    inputs = (before, f32(recording["step.action"]), goal, button)
+    run, _ = physics_of(env._engine)
+
+    def step(world: World, action: jax.Array, given: Given) -> State:
+        driven = drive(world, action)
+        return judge(world, given, driven, *run(world.physics, driven.ctrl, driven.substeps))
+
+    inputs = (before, f32(recording["step.action"]), Given(goal, button))
     count = len(rows)
     padding = -count % BATCH
     inputs = jax.tree.map(lambda x: np.concatenate([x, np.repeat(x[-1:], padding, 0)]), inputs)

@@ -6,6 +6,7 @@ one compiled model serves every layout. `drawn=True` adds light, cameras and col
 which draws the arrays over it.
 """
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import mujoco
 import numpy as np
 
 from jaxsafe.config import ConfigError, nearest
+from jaxsafe.envs.engines import Room, Simulation
 from jaxsafe.envs.safety_gym.config import SafetyGymConfig
 
 ASSETS = Path(__file__).parent / "assets"
@@ -49,6 +51,7 @@ FREES = ("vases", "gremlins", "box")  # in the order of their free joints
 class Scene:
     """A compiled task. Counts are those of the config; addresses index the model's arrays."""
 
+    spec: mujoco.MjSpec  # what `model` was compiled from
     model: mujoco.MjModel
     planar: bool  # the robot slides and turns (Point), else it has a free joint
     robot_height: float  # of body `robot` at the start, m
@@ -58,6 +61,35 @@ class Scene:
     mocaps: dict[str, int]  # kind -> number of mocap bodies
     orbit: np.ndarray  # [nmocap] radius of each mocap body's circle; 0 for those at rest
     watched: dict[str, list[str]]  # kind -> bodies whose contacts with the robot are counted
+
+    def simulation(self, cfg: SafetyGymConfig, fields: tuple[str, ...] = ()) -> Simulation:
+        """What an engine simulates and reports; `fields` are poses that the task asks for."""
+        return Simulation(
+            spec=self.spec,
+            substeps=cfg.frameskip_binom_n,
+            varied=cfg.frameskip_binom_p < 1,
+            fields=fields,
+            contacts=tuple(("robot", name) for names in self.watched.values() for name in names),
+            orbits=self.orbit,
+            pillars=tuple(f"pillar{i}" for i in range(self.mocaps["pillars"])),
+            room=self.room(cfg.contact_room),
+        )
+
+    def room(self, factor: float = 1.0) -> Room:
+        """Memory for contacts, times `factor`.
+
+        A resting cube touches the floor in 4 points, and so do a box's four columns. A robot on wheels
+        or legs touches it with some of its geoms. Cubes that meet share up to 8 points. Each contact
+        takes 10 rows (condim 6, pyramidal cone), a weld takes 6.
+        """
+        model = self.model
+        resting = 4 * sum(self.frees.values()) + 16 * self.frees["box"]
+        robot = int((model.body_rootid[model.geom_bodyid] == model.body("robot").id).sum())
+        standing = 0 if self.planar else robot
+        average = resting + standing + (8 if self.frees["box"] else 4)
+        fullest = 10 * (resting + 2 * standing + 16) + 6 * self.frees["gremlins"]
+        rows = math.ceil(factor * fullest) + int(model.jnt_limited.sum())
+        return Room(math.ceil(factor * average), rows)
 
     @property
     def contact_count(self) -> int:
@@ -96,9 +128,9 @@ def build(cfg: SafetyGymConfig, mjx: bool = False, drawn: bool = False) -> Scene
     """Compile the scene of `cfg`.
 
     Args:
-        mjx: for MJX in JAX, which has no contact sensors, collides a capsule better than a cylinder
-            (pillars become capsules, with caps out of reach), would let what is fixed meet what is
-            fixed, and has room for `MJX_LIMITS` only.
+        mjx: for MJX in JAX, which collides a capsule better than a cylinder (pillars become capsules,
+            with caps out of reach), would let what is fixed meet what is fixed, and has room for
+            `MJX_LIMITS` only.
         drawn: add what only rendering needs (light, cameras, colours, the gremlins' guides).
     Raises:
         ConfigError: an unknown robot, sensor or body.
@@ -170,21 +202,11 @@ def build(cfg: SafetyGymConfig, mjx: bool = False, drawn: bool = False) -> Scene
     if mjx:
         for name, value in MJX_LIMITS.items():
             spec.add_numeric(name=name, data=[value], size=1)
-    elif not drawn:
-        for name in (name for names in watched.values() for name in names):
-            spec.add_sensor(
-                name=f"contact_{name}",
-                type=mujoco.mjtSensor.mjSENS_CONTACT,
-                objtype=mujoco.mjtObj.mjOBJ_XBODY,
-                objname="robot",
-                reftype=mujoco.mjtObj.mjOBJ_BODY,
-                refname=name,
-                intprm=[1 << mujoco.mjtConDataField.mjCONDATA_FOUND.value, 0, 1],
-            )
     model = spec.compile()
     orbit = np.zeros(model.nmocap)
     orbit[: cfg.gremlins_num] = cfg.gremlins_travel
     return Scene(
+        spec=spec,
         model=model,
         planar=bool(planar),
         robot_height=float(robot.body("robot").pos[2]),

@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 
 from jaxsafe.config import ConfigError
-from jaxsafe.envs.engines.physics import Engine, Physics, Readings, Run
+from jaxsafe.envs.engines import Engine, Physics, Readings, Run
 from jaxsafe.envs.safety_gym import scene as scenes
 from jaxsafe.envs.safety_gym.config import SafetyGymConfig
 from jaxsafe.envs.safety_gym.scene import Scene
@@ -78,13 +78,12 @@ def with_sleepers(engine: Engine, small: Scene, scene: Scene, cfg: SafetyGymConf
                 substeps=few.substeps,
             )
             contacts = jnp.zeros(scene.contact_count).at[at.contact].set(readings.contacts)
-            robot = scene.model.nsensordata - scene.contact_count
-            sensors = jnp.concatenate([readings.sensors[:robot], contacts])
-            return physics, dataclasses.replace(readings, sensors=sensors, contacts=contacts)
+            return physics, dataclasses.replace(readings, contacts=contacts)
 
         return woken
 
-    return Engine(engine.name, wake(engine.run), wake(engine.forward))
+    advance, show = wake(engine.advance), wake(engine.show)
+    return Engine(engine.name, scene.model, engine.substeps, advance, show)
 
 
 class Places(NamedTuple):

@@ -24,10 +24,12 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from jaxsafe.config import ConfigError, nearest
-from jaxsafe.envs.engines import physics as engines
+from jaxsafe.envs import engines
 from jaxsafe.envs.safety_gym import scene as scenes
+from jaxsafe.envs.safety_gym.arena import World
 from jaxsafe.envs.safety_gym.config import SafetyGymConfig
-from jaxsafe.envs.safety_gym.task import SafetyGym, World
+from jaxsafe.envs.safety_gym.task import SafetyGym
+from jaxsafe.envs.wrap import innermost, raw_steps
 from jaxsafe.learn.acting import Player
 from jaxsafe.types import PyTree, State
 
@@ -59,8 +61,7 @@ class Stage:
     """
 
     def __init__(self, env: SafetyGym):
-        check_drawable(env)
-        self.env = env
+        self.env = env = drawable(env)
         self.scene = scenes.build(env.config, drawn=True)
         self.model = self.scene.model
         self.data = mujoco.MjData(self.model)
@@ -203,7 +204,8 @@ def render_episode(
     steps = len(states.terminated)
     ends = np.flatnonzero(states.terminated)
     last = int(ends[0]) if len(ends) else steps - 1
-    every = every or max(1, round(1 / (FPS * env.step_seconds)))
+    seconds = drawable(env).step_seconds * raw_steps(env)
+    every = every or max(1, round(1 / (FPS * seconds)))
     times = range(0, last + 1, every)
     frames = [draw.frame(jax.tree.map(lambda x, t=t: x[t], states)) for t in times]
     if label is None:
@@ -311,10 +313,16 @@ def works(backend: str) -> bool:
 # Small parts -----------------------------------------------------------------------------------------
 
 
-def check_drawable(env: Any) -> None:
-    """Raise ConfigError unless `env` is one of Safety Gym's."""
-    if not isinstance(env, SafetyGym):
-        raise ConfigError(f"only Safety Gym's environments can be drawn, not a {type(env).__name__}")
+def drawable(env: Any) -> SafetyGym:
+    """The environment of Safety Gym that `env` is, without its wrappers.
+
+    Raises:
+        ConfigError: it is none.
+    """
+    inside = innermost(env)
+    if not isinstance(inside, SafetyGym):
+        raise ConfigError(f"only Safety Gym's environments can be drawn, not a {type(inside).__name__}")
+    return inside
 
 
 def named_camera(model: mujoco.MjModel, name: str) -> mujoco.MjvCamera:

@@ -21,6 +21,7 @@ from jaxsafe.config import ConfigError
 from jaxsafe.envs.safety_gym.task import SafetyGym
 from jaxsafe.envs.view import render
 from jaxsafe.envs.view.driving import FRONT, drive, robot_of
+from jaxsafe.envs.wrap import raw_steps
 from jaxsafe.learn.acting import Player
 from jaxsafe.types import PyTree, State
 
@@ -67,9 +68,9 @@ class Session:
         player: Player | None = None,
         seed: int = 0,
     ):
-        render.check_drawable(env)
-        robot_of(env)  # raises where no keys could drive
-        self.env, self.playing, self.held = env, True, set[str]()
+        self.env, self.playing, self.held = render.drawable(env), True, set[str]()
+        robot_of(self.env)  # raises where no keys could drive
+        self.limit, self.seconds = env.episode_length, self.env.step_seconds * raw_steps(env)
         self.ended: list[Ended] = []  # the last `LAST`, newest first
         self._lock = threading.Lock()
         world = player.task if player else env
@@ -108,7 +109,7 @@ class Session:
             self.ret += float(self.state.reward)
             self.cost += float(self.state.cost)
             self.costs = self.costs + self.state.costs
-            if self.state.terminated or self.steps >= self.env.episode_length:
+            if self.state.terminated or self.steps >= self.limit:
                 ended = Ended(self.seed, self.steps, self.ret, self.cost)
                 self.ended = [ended, *self.ended][:LAST]
                 self._begin(self.seed + 1)
@@ -127,7 +128,7 @@ class Session:
             due = max(due, now - BEHIND)
             while self.playing and now >= due:
                 self.step()
-                due += self.env.step_seconds
+                due += self.seconds
             if now >= shown:
                 show()
                 shown = now + 1 / FPS
@@ -146,7 +147,7 @@ def figures(session: Session) -> dict[str, str]:
     named = zip(session.env.cost_names, session.costs, strict=True)
     return {
         "seed": f"{session.seed}",
-        "step": f"{session.steps} of {session.env.episode_length}",
+        "step": f"{session.steps} of {session.limit}",
         "return": f"{session.ret:.2f}",
         "cost": f"{session.cost:.0f}",
         **{f"cost {name}": f"{value:.4g}" for name, value in named},

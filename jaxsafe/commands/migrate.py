@@ -30,7 +30,7 @@ def command() -> int:
     args = parser.parse_args()
     tree = migrate.read(args.config)
     if args.source == "omnisafe":
-        algo = args.algo or (args.config.stem if args.config.stem in migrate.ALGORITHMS else "")
+        algo = args.algo or (args.config.stem if args.config.stem in migrate.algorithms() else "")
         found = migrate.omnisafe(tree, algo, args.env)
     else:
         found = migrate.safety_gym(tree)

@@ -14,7 +14,7 @@ Source: the configs of OmniSafe after 0.5.0 (2025), and Safety Gym's Engine.
 import dataclasses
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,31 +27,6 @@ from jaxsafe.envs.safety_gym.config import defaults
 from jaxsafe.envs.safety_gym.config import read as read_config
 from jaxsafe.run.settings import algo_options, as_text
 
-ALGORITHMS = {
-    "CPO": "cpo",
-    "CPPOPID": "cppo_pid",
-    "CUP": "cup",
-    "FOCOPS": "focops",
-    "IPO": "ipo",
-    "NaturalPG": "npg",
-    "OnCRPO": "crpo",
-    "P3O": "p3o",
-    "PCPO": "pcpo",
-    "PDO": "pdo",
-    "PPO": "ppo",
-    "PPOEarlyTerminated": "ppo_early_terminated",
-    "PPOLag": "ppo_lag",
-    "PPOSaute": "ppo_saute",
-    "PPOSimmerPID": "ppo_simmer_pid",
-    "PolicyGradient": "pg",
-    "RCPO": "rcpo",
-    "TRPO": "trpo",
-    "TRPOEarlyTerminated": "trpo_early_terminated",
-    "TRPOLag": "trpo_lag",
-    "TRPOPID": "trpo_pid",
-    "TRPOSaute": "trpo_saute",
-    "TRPOSimmerPID": "trpo_simmer_pid",
-}
 MISSING = {  # OmniSafe's others
     "off-policy": "DDPG DDPGLag DDPGPID TD3 TD3Lag TD3PID SAC SACLag SACPID CRABS",
     "model-based": "PETS CAPPETS CCEPETS RCEPETS LOOP SafeLOOP",
@@ -64,8 +39,12 @@ class Facts(NamedTuple):
     """What the meaning of a key may depend on."""
 
     values: Mapping[str, Any]  # all keys of the file
-    algo: str  # ours
-    trust_region: bool  # else the policy moves by epochs of Adam
+    options: Collection[str]  # of our algorithm: 'algo.epochs', ...
+
+    @property
+    def trust_region(self) -> bool:
+        """Whether the policy moves by natural gradients, not by epochs of Adam."""
+        return "algo.epochs" not in self.options
 
     def batch(self) -> dict[str, Any]:
         """steps_per_epoch as environments side by side, batch_size as a divisor of the batch, and
@@ -133,7 +112,7 @@ def passes(value: Any, facts: Facts) -> dict[str, Any]:
 
 
 def budget(value: Any, facts: Facts) -> dict[str, Any]:
-    if "simmer" not in facts.algo:
+    if "algo.budget_init" not in facts.options:
         return {"algo.cost_limit": value}
     upper = convert(facts.values.get("algo_cfgs.upper_budget", 25.0), float, "algo_cfgs.upper_budget")
     return {"algo.budget_init": convert(value, float, "algo_cfgs.safety_budget") / upper}
@@ -318,7 +297,7 @@ def omnisafe(config: dict[str, Any], algo: str = "", env: str = "") -> Migrated:
     preset = algo_options(entry, "published", "omnisafe")
     start = {f"algo.{k}": v for k, v in preset.items()}
     start |= {"num_envs": preset["num_envs"], "seed": 0, "total_steps": 10_000_000}
-    facts = Facts(values, name, "epochs" not in preset)
+    facts = Facts(values, start)
     found: dict[str, Any] = {}
     lines = [Line("algo", algo or values.get("algo"), f"algo={name} {DEFAULTS}")]
     lines.append(Line("env_id", env or values.get("env_id"), " ".join(target)))
@@ -350,15 +329,21 @@ def omnisafe(config: dict[str, Any], algo: str = "", env: str = "") -> Migrated:
     return Migrated([*target, f"algo={name}", *DEFAULTS.split(), *changed], lines)
 
 
+def algorithms() -> dict[str, str]:
+    """OmniSafe's names of the algorithms, and ours."""
+    return dict(sorted((row.omnisafe, name) for name, row in algos.ALGOS.items() if row.omnisafe))
+
+
 def find_algorithm(theirs: Any) -> str:
+    known = algorithms()
     if not theirs:
-        raise ConfigError(f"no algorithm in the file: add --algo, one of {', '.join(ALGORITHMS)}")
+        raise ConfigError(f"no algorithm in the file: add --algo, one of {', '.join(known)}")
     for kind, names in MISSING.items():
         if theirs in names.split():
             raise ConfigError(f"{theirs} has no counterpart: it is {kind}, ours are on-policy")
-    if theirs not in ALGORITHMS:
-        raise ConfigError(f"unknown algorithm {theirs} of OmniSafe{nearest(str(theirs), ALGORITHMS)}")
-    return ALGORITHMS[theirs]
+    if theirs not in known:
+        raise ConfigError(f"unknown algorithm {theirs} of OmniSafe{nearest(str(theirs), known)}")
+    return known[theirs]
 
 
 def find_environment(theirs: Any) -> list[str]:

@@ -7,12 +7,13 @@ networks see, what the learner is paid and where its episodes end may differ.
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from jaxsafe.config import config
+from jaxsafe.learn.conventions import Convention
 from jaxsafe.learn.rollout import Episode, Trajectory, never
 from jaxsafe.learn.treatments import Treatment
 from jaxsafe.types import Env, PyTree, State
@@ -96,9 +97,22 @@ class Budget:
 
 @config
 class SauteConfig:
-    saute_discount: float = 0.9999  # gamma_n; OmniSafe on Goal and Circle, on Button 0.999
-    unsafe_reward: float = -0.2  # n, of a step without budget left; OmniSafe likewise, on Button -1
-    full_at_end: bool = False  # the value at a time limit is of z = 1; OmniSafe
+    """For `saute`."""
+
+    CONVENTIONS: ClassVar = (
+        Convention(
+            {"full_at_end": True},
+            "the value at a time limit is of a full budget, the next episode's",
+            "of what the episode left",
+        ),
+    )
+
+    # gamma_n, the discount of the budget, as OmniSafe's on Goal and Circle. On Button it has 0.999.
+    saute_discount: float = 0.9999
+    # n, the reward of a step that ends without budget, as OmniSafe's on Goal. On Button it has -1.
+    unsafe_reward: float = -0.2
+    # Whether the value at a time limit is that of a full budget, z = 1. OmniSafe's is.
+    full_at_end: bool = False
 
 
 def full_budget(env: Env, cfg: Any) -> jax.Array:
@@ -125,21 +139,9 @@ saute = nothing._replace(
 )
 
 
-@config
-class SimmerConfig(SauteConfig):
-    budget_init: float = 0.5  # d_1, share of cost_limit; 0.57 in the authors' pendulum
-    budget_ramp: float = 200.0  # iterations until d = cost_limit; the authors' last sixth of training
-    budget_reach: float = 0.15  # largest |u|, share of cost_limit; 0.14 in the authors' pendulum
-    simmer_kp: float = 0.1  # of the smoothed error
-    simmer_ki: float = 0.01  # of the sum of smoothed errors; the authors' 0.005 to 0.04
-    simmer_kaw: float = 0.01  # of what clipping took from the last u; the authors' 0 to 0.04
-    simmer_smoothing: float = 0.9  # share of the past in the error; the authors' 0 to 0.999
-    simmer_window: int = 100  # errors in the sum; the authors' code
-    simmer_adds: bool = False  # u is added to the last B, not to d; OmniSafe
-    simmer_full: bool = False  # z is the share of B that is left, and starts at 1; OmniSafe
-
-
-# OmniSafe @15603dd, PPOSimmerPID.yaml and TRPOSimmerPID.yaml: a budget that starts at its bound, and
+# OmniSafe @15603dd, what PPOSaute.yaml and the three like it add to those of PPO and TRPO.
+OMNISAFE_SAUTE: dict[str, Any] = {"saute_discount": 0.999, "unsafe_reward": -1.0}
+# The same, PPOSimmerPID.yaml and TRPOSimmerPID.yaml: a budget that starts at its bound, and
 # steps of at most 1 of 25. With `simmer_adds` far larger gains drive the budget to 0 for good.
 OMNISAFE_SIMMER: dict[str, Any] = {
     "budget_init": 1.0,
@@ -150,6 +152,36 @@ OMNISAFE_SIMMER: dict[str, Any] = {
     "simmer_smoothing": 0.995,
     "simmer_window": 10,
 }
+
+
+@config
+class SimmerConfig(SauteConfig):
+    """For `simmer` with `schedule`."""
+
+    CONVENTIONS: ClassVar = (
+        Convention(
+            {"simmer_adds": True, "simmer_full": True, **OMNISAFE_SIMMER},
+            "the controller's u is added to the last budget, with small gains, and episodes (but the "
+            "first of 20) start with z = 1, the share of it",
+            "u is added to the scheduled budget, with larger ones, and z is a share of the whole one",
+        ),
+    )
+
+    # The budget d at the start, as a share of cost_limit. The authors' pendulum has 0.57.
+    budget_init: float = 0.5
+    # Iterations until d is cost_limit. The authors' d arrives in the last sixth of training.
+    budget_ramp: float = 200.0
+    # The most that u changes the budget, as a share of cost_limit. The authors' pendulum has 0.14.
+    budget_reach: float = 0.15
+    simmer_kp: float = 0.1  # K_p, the gain of the smoothed error.
+    simmer_ki: float = 0.01  # K_i, the gain of the sum of errors. The authors have 0.005 to 0.04.
+    # K_aw, the gain of what clipping took from the last u. The authors have 0 to 0.04.
+    simmer_kaw: float = 0.01
+    simmer_smoothing: float = 0.9  # Share of the past in the error. The authors have 0 to 0.999.
+    simmer_window: int = 100  # Errors in the sum, as in the authors' code.
+    simmer_adds: bool = False  # Whether u is added to the last B, not to d. OmniSafe's is.
+    # Whether z is the share of B that is left, and starts at 1. OmniSafe's does.
+    simmer_full: bool = False
 
 
 class Schedule(NamedTuple):
@@ -219,8 +251,19 @@ simmer = saute._replace(
 
 @config
 class EarlyConfig:
-    termination_reward: float = 0.0  # r_e, of the step that breaks the limit; OmniSafe
-    keep_cost: bool = False  # cost counts on through episodes that time ends; OmniSafe
+    """For `early`."""
+
+    CONVENTIONS: ClassVar = (
+        Convention(
+            {"keep_cost": True},
+            "the cost that ends an episode is counted on from the last one, if time ended that",
+            "each episode's own",
+        ),
+    )
+
+    termination_reward: float = 0.0  # r_e, the reward of the step that breaks the limit.
+    # Whether the count of cost goes on after an episode that time ends. OmniSafe's does.
+    keep_cost: bool = False
 
 
 def broken(episode: Episode, cfg: Any) -> jax.Array:

@@ -22,7 +22,8 @@ Names = tuple[str, ...]
 class LimitsConfig:
     """For algorithms that take several constraints."""
 
-    cost_limits: dict[str, float] | None = None  # per episode, by names of costs; null: cost_limit
+    # Limits of named costs, per episode, in place of `cost_limit`. null: only `cost_limit`.
+    cost_limits: dict[str, float] | None = None
 
 
 def unnamed(cfg: Any) -> Names:

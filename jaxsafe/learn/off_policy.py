@@ -32,33 +32,42 @@ from jaxsafe.types import Algorithm, Clocks, Env, Metrics, Policy, PyTree, Share
 
 @config
 class OffPolicyConfig:
-    """What the off-policy algorithms share. [O] OmniSafe's default."""
+    """What the off-policy algorithms share."""
 
-    num_envs: int = 1024  # of all devices together
-    horizon: int = 16  # steps of each environment in an update
-    learn_every: int = 1  # steps of each environment between two rounds of gradient steps
-    stagger: bool = True  # spread the first episodes' ends over time
-    total_iterations: float = float("inf")  # where what decays reaches 0; inf: total_steps' end
-    replay_size: int = 1_000_000  # transitions kept, rounded to whole updates [O]
-    replay_ratio: int = 16  # transitions replayed for each environment step; [O] 256
-    batch_size: int = 4096  # transitions of a gradient step; [O] 256
-    learning_starts: int = 10_000  # environment steps of random actions, before learning [O]
-    n_step: int = 1  # rewards summed before the critic's value [O]
-    hidden: tuple[int, ...] = (256, 256)  # units of each network [O]
-    activation: Literal["relu", "tanh"] = "relu"  # [O]
-    init: Literal["torch", "orthogonal"] = "torch"  # weights; [O] torch, its kaiming_uniform
-    layer_norm: bool = True  # in the critics, which steadies them at large batches; [O] False
-    obs_normalize: bool = True  # by running mean and variance; [O] False
-    discount: float = 0.99  # [O]
-    cost_discount: float = 0.99  # [O]
-    cost_limit: float = (
-        25.0  # undiscounted cost of an episode [O]; unconstrained algorithms only draw it
-    )
-    tau: float = 0.05  # share of the critics that their targets take on at a step; [O] 0.005
-    lr: float = 3e-4  # of the policy, by Adam [O]
-    critic_lr: float = 3e-4  # of the critics, by Adam [O]
-    lr_decay: bool = False  # of both, linearly to 0 at total_iterations [O]
-    max_grad_norm: float = 40.0  # of each network's gradient [O]
+    # Environments side by side, of all devices together. OmniSafe has 1.
+    num_envs: int = 1024
+    horizon: int = 16  # Steps of each environment in an update.
+    # Steps of each environment between two rounds of gradient steps.
+    learn_every: int = 1
+    stagger: bool = True  # Whether the first episodes start at different ages, so that ends spread out.
+    # The iteration at which whatever decays reaches 0. inf: the last one of `total_steps`.
+    total_iterations: float = float("inf")
+    # Transitions kept, rounded to whole updates. As in OmniSafe.
+    replay_size: int = 1_000_000
+    replay_ratio: int = 16  # Transitions replayed for each environment step. OmniSafe has 256.
+    batch_size: int = 4096  # Transitions of a gradient step, of all devices together. OmniSafe has 256.
+    # Environment steps with random actions and without learning, as in OmniSafe.
+    learning_starts: int = 10_000
+    n_step: int = 1  # Rewards summed before the critics' value. OmniSafe has 1.
+    hidden: tuple[int, ...] = (256, 256)  # Units of the hidden layers of each network, as in OmniSafe.
+    activation: Literal["relu", "tanh"] = "relu"  # Of the hidden layers, as in OmniSafe.
+    # The first weights. torch: uniform as in PyTorch, OmniSafe's choice. orthogonal: with gains.
+    init: Literal["torch", "orthogonal"] = "torch"
+    # Whether the critics normalise their layers, which steadies large batches. OmniSafe does not.
+    layer_norm: bool = True
+    # Whether observations are normalised by a running mean and variance. OmniSafe does not.
+    obs_normalize: bool = True
+    discount: float = 0.99  # The discount of rewards, as in OmniSafe.
+    cost_discount: float = 0.99  # The discount of costs, as in OmniSafe.
+    # The undiscounted cost that an episode may have. Unconstrained algorithms only draw it in plots.
+    cost_limit: float = 25.0
+    # The share of the critics that their targets take on at each step. OmniSafe has 0.005.
+    tau: float = 0.05
+    lr: float = 3e-4  # The policy's learning rate, by Adam, as in OmniSafe.
+    critic_lr: float = 3e-4  # The critics' learning rate, by Adam, as in OmniSafe.
+    # Whether both learning rates fall linearly to 0 at `total_iterations`. OmniSafe keeps them.
+    lr_decay: bool = False
+    max_grad_norm: float = 40.0  # The largest norm of each network's gradient, as in OmniSafe.
 
 
 @flax.struct.dataclass

@@ -10,7 +10,7 @@ import dataclasses
 import operator
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import flax.struct
 import jax
@@ -21,6 +21,7 @@ from jaxsafe.learn.acting import begun_anew
 from jaxsafe.learn.augment import Augmentation, nothing
 from jaxsafe.learn.batch import all_finite, batch_mean, centre, masked_mean, psum, select, standardise
 from jaxsafe.learn.constraints import Names, check_names, each, limit, signal, spread, unnamed
+from jaxsafe.learn.conventions import Convention
 from jaxsafe.learn.normalise import init_normaliser, merge, normalise
 from jaxsafe.learn.returns import Estimator, Window, advantages, empty_window, mean_length, window_mean
 from jaxsafe.learn.rollout import RolloutState, Trajectory, collect, init_rollout
@@ -43,43 +44,76 @@ from jaxsafe.types import Algorithm, Clocks, Env, Metrics, Policy, PyTree, Share
 
 @config
 class OnPolicyConfig:
-    """What the on-policy algorithms share. [O] OmniSafe's default, [S] safety-starter-agents'."""
+    """What the on-policy algorithms share."""
 
-    num_envs: int = 512  # per device; with horizon 20,480 steps a batch, near the 20,000 of [O]
-    horizon: int = 40  # steps of each environment per iteration; shorter ones learn less from a step
-    stagger: bool = True  # spread the first episodes' ends over time
-    total_iterations: float = float("inf")  # where what decays reaches 0; inf: total_steps' end
-    hidden: tuple[int, ...] = (64, 64)  # units of each network [O]
-    # networks of their own [O, S], one with common hidden layers, or one with a memory
-    trunk: Literal["separate", "shared", "gru"] = "separate"
-    value_coef: float = (
-        0.5  # of each critic's squared error in the loss of a shared trunk; else unused; SB3
+    CONVENTIONS: ClassVar = (
+        Convention(
+            {"cost_window": 5},
+            "J_c is the mean of the last 100 episodes, those of 5 iterations (of 50 in release 0.5.0 "
+            "and in the published figures)",
+            "of the last iteration",
+        ),
     )
-    activation: Literal["tanh", "relu"] = "tanh"  # [O, S]
-    init: Literal["orthogonal", "torch"] = "orthogonal"  # weights; [O] torch, its kaiming_uniform
-    init_log_std: float = -0.5  # of the actions' standard deviation [S]
-    std: Literal["free", "state"] = "free"  # a parameter of its own [O, S], or a function of the state
-    obs_normalize: bool = True  # by running mean and variance [O]
-    reward_normalize: bool = False  # likewise, for the learner alone [O]
-    cost_normalize: bool = False  # likewise [O]; limits and metrics are of costs as they are
-    entropy_coef: float = 0.0  # times the policy's entropy, added to what it maximises [O]
-    entropy_decay: bool = False  # of entropy_coef, linearly to 0 at total_iterations
-    estimator: Estimator = "gae"  # of advantages and of the critics' targets [O]
-    discount: float = 0.99  # [O, S]
-    gae_lambda: float = 0.95  # [O]
-    cost_discount: float = 0.99  # [O, S], who name it but use `discount`
-    cost_gae_lambda: float = 0.95  # [O]
-    cost_limit: float = 25.0  # undiscounted cost per episode [O, S]; without constraint only a mark
-    cost_window: int = 1  # iterations that J_c is a mean over; [O] the last 100 episodes, 5 of its own
-    minibatches: int = 8  # a pass over the batch, for policy and critics
-    critic_lr: float = 1e-3  # [S]; Adam; unused with a shared trunk, as are the next two
-    critic_epochs: int = 10  # passes of each critic; with 8 minibatches the 80 steps of [S]
-    critic_norm_coef: float = 1e-3  # times the sum of squared parameters [O]
-    max_grad_norm: float = 40.0  # of each network's gradient [O]
+
+    # Environments side by side, per device. With `horizon` a batch has 20,480 steps, near OmniSafe's
+    # 20,000.
+    num_envs: int = 512
+    # Steps of each environment in an iteration. Shorter ones learn less from a step.
+    horizon: int = 40
+    stagger: bool = True  # Whether the first episodes start at different ages, so that ends spread out.
+    # The iteration at which whatever decays reaches 0. inf: the last one of `total_steps`.
+    total_iterations: float = float("inf")
+    hidden: tuple[int, ...] = (64, 64)  # Units of the hidden layers of each network, as in OmniSafe.
+    # separate: a network each for policy and critics, as in OmniSafe. shared: one network for all.
+    # gru: one network for all, with a memory.
+    trunk: Literal["separate", "shared", "gru"] = "separate"
+    # Weight of each critic's squared error in the loss of a shared trunk, as in Stable-Baselines3.
+    # Separate networks do not use it.
+    value_coef: float = 0.5
+    activation: Literal["tanh", "relu"] = "tanh"  # Of the hidden layers, as in OmniSafe.
+    # How weights are drawn. torch is PyTorch's default (Kaiming, uniform), which OmniSafe has.
+    init: Literal["orthogonal", "torch"] = "orthogonal"
+    # Log of the actions' standard deviation at the start, as in safety-starter-agents.
+    init_log_std: float = -0.5
+    # free: the standard deviation is a parameter, as in OmniSafe. state: the network computes it.
+    std: Literal["free", "state"] = "free"
+    # Whether observations are scaled by their running mean and variance, as in OmniSafe.
+    obs_normalize: bool = True
+    # Whether the learner sees rewards scaled by their running mean and variance.
+    reward_normalize: bool = False
+    # The same for costs. Limits and metrics keep the costs as they are.
+    cost_normalize: bool = False
+    # Weight of the policy's entropy, which is added to what the policy maximises.
+    entropy_coef: float = 0.0
+    entropy_decay: bool = False  # Whether entropy_coef falls on a line to 0 at `total_iterations`.
+    estimator: Estimator = "gae"  # Of advantages and of the critics' targets, as in OmniSafe.
+    # Discount of rewards, as in OmniSafe. It only affects the critic and the advantages.
+    discount: float = 0.99
+    gae_lambda: float = 0.95  # Decay of the reward advantages (lambda of GAE), as in OmniSafe.
+    # Discount of costs. It only affects the critic and the advantages: the limit is on undiscounted
+    # cost. OmniSafe names this setting and uses `discount` instead.
+    cost_discount: float = 0.99
+    cost_gae_lambda: float = 0.95  # Decay of the cost advantages, as in OmniSafe.
+    # Cost that an episode may have, undiscounted, as in OmniSafe. Unconstrained algorithms only draw
+    # it in plots.
+    cost_limit: float = 25.0
+    # J_c is the mean cost over this many iterations. OmniSafe has the last 100 episodes, which are 5
+    # of its iterations.
+    cost_window: int = 1
+    minibatches: int = 8  # Parts that a batch is split into for each pass, of policy and critics.
+    # Adam's step of the critics, as in safety-starter-agents. A shared trunk does not use it.
+    critic_lr: float = 1e-3
+    # Passes of each critic over a batch. With 8 minibatches they are the 80 steps of
+    # safety-starter-agents. A shared trunk does not use it.
+    critic_epochs: int = 10
+    # Weight of the sum of squared parameters in a critic's loss, as in OmniSafe. A shared trunk does
+    # not use it.
+    critic_norm_coef: float = 1e-3
+    max_grad_norm: float = 40.0  # Longer gradients of a network are cut to this norm, as in OmniSafe.
 
 
-# The settings that all of [O]'s on-policy algorithms share (@15603dd, configs/on-policy) and that
-# differ from the defaults above. Its 20 episodes run one after the other, these side by side.
+# The settings that all on-policy algorithms of OmniSafe share (@15603dd, configs/on-policy) and that
+# differ from the defaults above. OmniSafe's 20 episodes run one after the other, these side by side.
 OMNISAFE: dict[str, Any] = {
     "num_envs": 20,
     "horizon": 1000,

@@ -6,14 +6,15 @@ passes alone. OmniSafe alternates them on each minibatch and stops all three tog
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 
-from jaxsafe.config import ConfigError
+from jaxsafe.config import ConfigError, config
 from jaxsafe.learn.batch import batch_mean, pmean, select
+from jaxsafe.learn.conventions import Convention
 from jaxsafe.nn.gaussian import Gaussian, kl
 from jaxsafe.nn.networks import outputs, policy, value
 from jaxsafe.types import Count, Metrics, PyTree
@@ -63,6 +64,29 @@ class Step(NamedTuple):
 
     init: Callable[[PyTree, Any], PyTree]
     update: Callable[..., tuple[PyTree, PyTree, Metrics]]
+
+
+@config
+class AdamConfig:
+    """For algorithms whose policy moves by epochs of Adam."""
+
+    CONVENTIONS: ClassVar = (
+        Convention(
+            {"critics_stop": True},
+            "where the KL stops the policy's passes over a batch, the critics' passes stop too",
+            "critics make all their passes",
+        ),
+    )
+
+    lr: float = 3e-4  # Adam's step of the policy, as in OmniSafe and safety-starter-agents.
+    # Whether lr falls on a line to 0 at `total_iterations`. OmniSafe's does.
+    lr_decay: bool = False
+    # Passes of the policy over a batch. With 8 minibatches they are the 80 steps of
+    # safety-starter-agents.
+    epochs: int = 10
+    target_kl: float = 0.02  # Passes stop when KL(old || new) is above this (nats), as in OmniSafe.
+    # Whether the critics stop when the policy does. OmniSafe's do.
+    critics_stop: bool = False
 
 
 def adam(lr: jax.Array | float, cfg: Any) -> optax.GradientTransformation:
@@ -250,4 +274,4 @@ def fit_critic(
 
 def stops_critics(cfg: Any) -> bool:
     """Whether the critics stop with a policy that Adam moves; other policies have no passes."""
-    return getattr(cfg, "critics_stop", False)
+    return isinstance(cfg, AdamConfig) and cfg.critics_stop

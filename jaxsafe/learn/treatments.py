@@ -35,9 +35,12 @@ none = Treatment(
 
 @config
 class LagrangianConfig(LimitsConfig):
-    lam_init: float = 0.001  # OmniSafe
-    lam_max: float = float("inf")  # OmniSafe
-    dual_lr: float = 0.1  # Adam's step, whatever the size of the violation; OmniSafe 0.035
+    """For `lagrangian`."""
+
+    lam_init: float = 0.001  # The price on cost at the start, as in OmniSafe.
+    lam_max: float = float("inf")  # The highest price. As in OmniSafe there is no bound.
+    # Adam's step of the price, whatever the size of the violation. OmniSafe's is 0.035.
+    dual_lr: float = 0.1
 
 
 class Multiplier(NamedTuple):
@@ -80,12 +83,16 @@ lagrangian = Treatment(
 
 @config
 class PIDConfig(LimitsConfig):
-    lam_init: float = 0.001  # OmniSafe
-    pid_kp: float = 0.1  # of the smoothed error; OmniSafe
-    pid_ki: float = 0.01  # of the error, each iteration; OmniSafe
-    pid_kd: float = 0.01  # of the smoothed cost's rise; OmniSafe
-    pid_smoothing: float = 0.95  # share of the past in what is smoothed; OmniSafe
-    pid_delay: int = 10  # iterations over which a rise is taken; OmniSafe
+    """For `pid`."""
+
+    lam_init: float = 0.001  # The price on cost at the start, as in OmniSafe.
+    pid_kp: float = 0.1  # Price for each unit of the smoothed violation, as in OmniSafe.
+    # Price that each unit of violation adds in each iteration, as in OmniSafe.
+    pid_ki: float = 0.01
+    pid_kd: float = 0.01  # Price for each unit that the smoothed cost rose, as in OmniSafe.
+    # Share of the past in the smoothed violation and the smoothed cost, as in OmniSafe.
+    pid_smoothing: float = 0.95
+    pid_delay: int = 10  # Iterations over which the rise is measured, as in OmniSafe.
 
 
 class PID(NamedTuple):
@@ -130,6 +137,15 @@ pid = Treatment(
 )
 
 
+@config
+class BarrierConfig:
+    """For `barrier`."""
+
+    barrier: float = 0.01  # Height of the barrier, 1 / t in the paper, as in OmniSafe.
+    # The highest price, in standard deviations of A_r per unit of cost, as in OmniSafe.
+    price_max: float = 1.0
+
+
 def barrier_price(dual: jax.Array, episode_cost: jax.Array, cfg: Any) -> jax.Array:
     """The slope of the barrier -barrier log(cost_limit - J_c), or price_max where there is none."""
     slack = cfg.cost_limit - episode_cost
@@ -146,12 +162,30 @@ barrier = Treatment(
     metrics=lambda price: {"train/lam": price},
 )
 
+
+@config
+class PenaltyConfig:
+    """For `penalty`."""
+
+    # Standard deviations of A_r that a unit of cost costs. The number is ours; nobody published one.
+    price: float = 0.5
+
+
 penalty = Treatment(
     init=lambda cfg: jnp.asarray(cfg.price, jnp.float32),
     update=lambda price, episode_cost, cfg: price,
     advantage=lambda price, adv_r, adv_c: adv_r - price * adv_c,
     metrics=lambda price: {"train/lam": price},
 )
+
+
+@config
+class SwitchConfig:
+    """For `switch`."""
+
+    # Cost per episode by which the limit may be exceeded before a step lowers cost, as in OmniSafe.
+    tolerance: float = 2.0
+
 
 # Xu, Liang and Lan (2021), "CRPO: A New Approach for Safe Reinforcement Learning with Convergence
 # Guarantee", arXiv:2011.05869, algorithm 1

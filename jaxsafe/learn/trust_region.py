@@ -5,19 +5,52 @@ Vectors are flat, float [P]: the policy's parameters through `ravel_pytree`.
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
+from jaxsafe.config import config
 from jaxsafe.learn.batch import all_finite, pmean
+from jaxsafe.learn.conventions import Convention
 from jaxsafe.learn.steps import Context, Objective, Step, mean_kl, own_trunk
 from jaxsafe.nn.gaussian import Gaussian, kl
 from jaxsafe.nn.networks import policy
 from jaxsafe.types import Metrics, PyTree
 
 Matvec = Callable[[jax.Array], jax.Array]
+
+
+@config
+class NaturalConfig:
+    """For algorithms whose policy moves along natural gradients."""
+
+    CONVENTIONS: ClassVar = (
+        Convention(
+            {"kl_per_action": True, "target_kl": 0.01},
+            "the KL of the trust region, and H with it, is a mean over action dimensions",
+            "their sum, with a bound for 2 dimensions; beside H our damping is then half as large",
+        ),
+    )
+
+    # delta, the KL of a step (nats). OmniSafe's 0.01 is a mean over the action's dimensions, of which
+    # Point and Car have 2.
+    target_kl: float = 0.02
+    # Whether the KL is a mean over the action's dimensions, not their sum. OmniSafe's is.
+    kl_per_action: bool = False
+    # Added to the diagonal of the Fisher matrix, as in OmniSafe and safety-starter-agents.
+    damping: float = 0.1
+    cg_iterations: int = 15  # Iterations of conjugate gradients, as in OmniSafe.
+
+
+@config
+class TrustRegionConfig(NaturalConfig):
+    """For those that search the largest safe step along them."""
+
+    line_search_tries: int = 15  # Steps that the line search tries at most, as in OmniSafe.
+    # Each step tried is this much of the one before, as in OmniSafe and safety-starter-agents.
+    line_search_shrink: float = 0.8
 
 
 def fisher_product(

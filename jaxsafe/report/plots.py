@@ -17,6 +17,7 @@ from jaxsafe.report import stats
 from jaxsafe.run import run_folder
 
 FORMATS = ("png", "svg")
+LONG = 30  # letters of a name in the legend that leave the panels too little room
 MARKERS = {"-": "o", "--": "s", ":": "^", "-.": "v"}  # by the kind of line that goes with it
 PANELS = (("train/return", "return of an episode"), ("train/cost", "cost of an episode"))
 
@@ -152,23 +153,27 @@ def front(points: Sequence[tuple[float, float]]) -> tuple[list[float], list[floa
 
 
 def learning(groups: Sequence[Any]) -> Figure:
-    """Return, cost and cost rate so far over training: a row a task, a line a setting.
+    """Return, cost and, where it is known, cost rate so far over training: a row a task, a line a
+    setting.
 
     A point is the mean over one of at most 50 equal stretches of training; the band is the 95 %
     interval over seeds. A line ends where the first of its seeds does.
     """
     envs = sorted({g.env for g in groups})
+    names = ["train/return", "train/cost"]
+    names += ["train/cost_rate"] * any("train/cost_rate" in run.table for g in groups for run in g.runs)
     figure = Figure(figsize=(13, 3.4 * len(envs)), layout="constrained")
     FigureCanvasAgg(figure)
     looks = styles(groups)
-    rows = figure.subplots(len(envs), 3, squeeze=False)
-    for env, (ret, cost, rate) in zip(envs, rows, strict=True):
+    rows = figure.subplots(len(envs), len(names), squeeze=False)
+    for env, panels in zip(envs, rows, strict=True):
+        cost = panels[1]
         shown = [g for g in groups if g.env == env]
         runs = [run for g in shown for run in g.runs]
         count = min(50, *(len(np.unique(run.table["iteration"])) for run in runs))
         edges = np.linspace(0, max(run.steps for run in runs), count + 1)
         for g in shown:
-            for axes, name in ((ret, "train/return"), (cost, "train/cost"), (rate, "train/cost_rate")):
+            for axes, name in zip(panels, names, strict=True):
                 if all(name in run.table for run in g.runs):
                     values = np.concatenate([stretches(run.table, name, edges) for run in g.runs])
                     band(axes, edges[1:], values, g.name, **looks[g.name])
@@ -178,12 +183,12 @@ def learning(groups: Sequence[Any]) -> Figure:
             if own or g is shown[limits.index(g.cost_limit)]:
                 color = looks[g.name]["color"] if own else "0.4"
                 cost.axhline(g.cost_limit, color=color, ls="--", lw=1)
-        for axes, label in zip((ret, cost, rate), ("return", "cost", "cost rate so far"), strict=True):
+        for axes, label in zip(panels, ("return", "cost", "cost rate so far"), strict=False):
             axes.set(title=f"{env}, {label}")
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-        names = dict.fromkeys(axis_of(run.table) for run in runs)
-        for axes in (ret, cost, rate):
-            axes.set_xlabel(" or ".join(names))
+        clocks = dict.fromkeys(axis_of(run.table) for run in runs)
+        for axes in panels:
+            axes.set_xlabel(" or ".join(clocks))
     legend(figure, rows.ravel(), looks)
     return figure
 
@@ -295,7 +300,7 @@ def grid(count: int, size: tuple[float, float]) -> tuple[Figure, list[Axes]]:
 
 
 def legend(figure: Figure, panels: Iterable[Axes], names: Iterable[str] = ()) -> None:
-    """One for all panels, on the right: `names` first."""
+    """One for all panels, on the right or, of long names, below: `names` first."""
     entries: dict[str, Any] = dict.fromkeys(names)
     for axes in panels:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
@@ -304,6 +309,9 @@ def legend(figure: Figure, panels: Iterable[Axes], names: Iterable[str] = ()) ->
     if entries:
         columns = -(-len(entries) // int(4 * figure.get_figheight()))
         place = {"loc": "outside right upper", "ncols": columns, "frameon": False}
+        if (longest := max(map(len, entries))) > LONG:
+            fitting = int(figure.get_figwidth() * 10 / longest)  # ten letters take about an inch
+            place |= {"loc": "outside lower center", "ncols": max(1, fitting)}
         figure.legend(entries.values(), entries.keys(), **place)
 
 

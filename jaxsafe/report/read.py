@@ -12,10 +12,10 @@ import numpy as np
 import jaxsafe
 from jaxsafe.config import ConfigError, flat
 from jaxsafe.learn.constraints import limits_of, written
-from jaxsafe.report import scores
+from jaxsafe.report import condensed, scores
 from jaxsafe.report.evaluation import cost_rate
 from jaxsafe.run import run_folder
-from jaxsafe.run.settings import NOT_COMPARED, REGISTERED, Entries, settle
+from jaxsafe.run.settings import NOT_COMPARED, REGISTERED, Entries, ask, settle
 from jaxsafe.run.spread import members
 
 # Fields that do not make another setting.
@@ -49,13 +49,14 @@ class Run(NamedTuple):
     @property
     def ended(self) -> bool:
         """Whether training is at the end that its config gives."""
-        if (updates := self.config["total_updates"]) is not None:
+        updates = self.config.get("total_updates")  # a study of an older version has none
+        if updates is not None:
             return int(self.table["updates"].max()) >= updates
         return self.steps >= self.config["total_steps"]
 
 
 def read(paths: Iterable[Path]) -> list[Run]:
-    """Every setting that has begun, of run folders, sweeps, and folders that hold them.
+    """Every setting that has begun, of run folders, sweeps, studies, and folders that hold them.
 
     Raises:
         ConfigError: no run; one that this version cannot read; or the same run twice.
@@ -76,14 +77,14 @@ def read(paths: Iterable[Path]) -> list[Run]:
 
 
 def find(path: Path) -> list[Path]:
-    """The run folders at or under `path`."""
+    """The run folders and studies at or under `path`."""
     path = path.expanduser()
     if not path.is_dir():
         raise ConfigError(f"{path} is not a folder")
     found = []
     for folder, inside, files in os.walk(path):
         inside.sort()
-        if "config.yaml" in files:
+        if "config.yaml" in files or "final.csv" in files:
             found.append(Path(folder))
             inside.clear()
         inside[:] = [name for name in inside if not name.startswith(".")]
@@ -93,7 +94,9 @@ def find(path: Path) -> list[Path]:
 
 
 def read_one(folder: Path, entries: Entries = REGISTERED) -> list[Run]:
-    """The settings of a run folder; none if it has no iteration yet."""
+    """The settings of a run folder, none if it has no iteration yet; or the runs of a study."""
+    if condensed.there(folder):
+        return read_study(folder)
     plain = run_folder.read_config(folder)
     try:
         saved = settle(plain, entries)
@@ -128,6 +131,40 @@ def read_one(folder: Path, entries: Entries = REGISTERED) -> list[Run]:
     return runs
 
 
+def read_study(folder: Path) -> list[Run]:
+    """The runs of a study. `run_dir` ends in the name of each, and tables hold a hundred points a seed.
+
+    Options that did not exist when a run was trained have their defaults of today.
+    """
+    rows, curves, settings = study = condensed.read(folder)
+    runs = []
+    for run, options in settings.items():
+        own = [row for row in rows if row["run"] == run]
+        env, algo = options["env.name"], options["algo.name"]
+        config = defaults(env, algo) | options
+        config["run_dir"] = str(folder / condensed.name_of(run))
+        named = {k: v for k, v in config.items() if k.startswith("algo.cost_limits.") and v is not None}
+        limits = {k.removeprefix("algo.cost_limits."): float(v) for k, v in named.items()}
+        limits = limits or {"": float(config["algo.cost_limit"])}
+        always = ("return", "cost")  # NaN where no episode was whole
+        figures = [k for k in study.figures() if k in always or any(row[k] for row in own)]
+        values = {k: np.array([float(row[k] or "nan") for row in own]) for k in figures}
+        values |= normalised(env, values, limits)
+        table = condensed.table(own, [curves[run, row["seed"]] for row in own])
+        seeds = np.array([float(row["seed"]) for row in own])
+        runs.append(Run(folder, env, config, limits, table, seeds, values))
+    return runs
+
+
+def defaults(env: str, algo: str, preset: str = "fast", compat: str = "none") -> dict[str, Any]:
+    """Today's settings by their names in `flat`; none where this version lacks the names."""
+    named = {"env": {"name": env}, "algo": {"name": algo}, "preset": preset, "compat": compat}
+    try:
+        return flat(ask(named).plain())
+    except ConfigError:
+        return {}
+
+
 def measured(
     env: str, table: Mapping[str, np.ndarray], limits: Mapping[str, float]
 ) -> dict[str, np.ndarray]:
@@ -152,14 +189,22 @@ def measured(
         values["cost rate"] = rate
     for name in cost_names(table):
         values[written(name)] = late(f"train/cost_{name}")
-    if env in scores.CHARACTERISTIC:
-        values["normalised return"] = scores.normalized_return(env, values["return"])
-        if "" in limits:
-            excess = scores.normalized_violation(env, values["cost"], limits[""])
-            values["normalised violation"] = excess
-        if rate is not None:
-            values["normalised cost rate"] = scores.normalized_cost_rate(env, rate)
-    return values
+    return values | normalised(env, values, limits)
+
+
+def normalised(
+    env: str, values: Mapping[str, np.ndarray], limits: Mapping[str, float]
+) -> dict[str, np.ndarray]:
+    """Safety Gym's normalised scores of each seed, as far as there are any, [S]."""
+    if env not in scores.CHARACTERISTIC:
+        return {}
+    found = {"normalised return": scores.normalized_return(env, values["return"])}
+    if "" in limits:
+        excess = scores.normalized_violation(env, values["cost"], limits[""])
+        found["normalised violation"] = excess
+    if "cost rate" in values:
+        found["normalised cost rate"] = scores.normalized_cost_rate(env, values["cost rate"])
+    return found
 
 
 def cost_names(columns: Iterable[str]) -> list[str]:

@@ -181,8 +181,8 @@ def notes(groups: Sequence[Group]) -> list[str]:
         lines.append(f"averaged over {name} ({', '.join(map(str, values))})")
     for run in (run for g in groups for run in g.runs):
         if not run.ended:
-            total = run.config["total_updates"] or run.config["total_steps"]
-            lines.append(f"unfinished: {run.folder}, at {run.steps:,} of {total:,} steps")
+            total = run.config.get("total_updates") or run.config["total_steps"]
+            lines.append(f"unfinished: {run.config['run_dir']}, at {run.steps:,} of {total:,} steps")
     envs = tasks_of(groups)
     if left := [env for env in envs if env not in suite(groups).tasks]:
         lines.append(f"not in comparisons across tasks, as a setting lacks them: {', '.join(left)}")

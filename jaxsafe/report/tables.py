@@ -1,6 +1,7 @@
 """Tables of text in Markdown and LaTeX, from one notation: `code`, **bold**, ± and the arrows."""
 
 import re
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -62,3 +63,19 @@ def escaped(text: str) -> str:
     text = "".join(LATEX.get(c, c) for c in text)
     text = re.sub(r"`(.+?)`", r"\\texttt{\1}", text)
     return re.sub(r"\*\*(.+?)\*\*", r"\\textbf{\1}", text)
+
+
+def between_marks(text: str, written: Mapping[str, str], mark: str = "table") -> str:
+    """`text` with these parts between the lines <!-- MARK: NAME --> and <!-- end -->.
+
+    Raises:
+        ValueError: a name has no such lines.
+    """
+    for name, part in written.items():
+        begin, end = f"<!-- {mark}: {name} -->\n", "<!-- end -->"
+        before, begun, rest = text.partition(begin)
+        _, ended, after = rest.partition(end)
+        if not (begun and ended):
+            raise ValueError(f"no {begin.strip()} with {end} after it")
+        text = before + begin + part + "\n" + end + after
+    return text

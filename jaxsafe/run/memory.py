@@ -7,6 +7,7 @@ from typing import Any
 import jax
 
 from jaxsafe.config import ConfigError
+from jaxsafe.envs.wrap import raw_steps
 from jaxsafe.run import checkpoint, spread
 from jaxsafe.run.settings import TrainConfig
 from jaxsafe.run.spread import Program
@@ -26,7 +27,7 @@ def check_memory(env: Env, program: Program, settings: TrainConfig) -> None:
     """
     limit, what = device_memory()
     step = 4 * (2 * env.obs_size + env.action_size + 8 + len(env.cost_names))  # bytes
-    steps, members = program.clocks.steps, len(program.members)
+    steps, members = program.clocks.steps // raw_steps(env), len(program.members)  # rows kept of each
     need = step * steps * members // settings.devices
     if need > limit:
         raise TooLarge(

@@ -12,6 +12,7 @@ import numpy as np
 
 import jaxsafe
 from jaxsafe.config import ConfigError, flat
+from jaxsafe.envs.wrap import innermost
 from jaxsafe.run import checkpoint, clock, dataset, distributed, loop, run_folder
 from jaxsafe.run.devices import check_devices, device_name, use_compilation_cache
 from jaxsafe.run.interrupts import Interrupts
@@ -156,7 +157,7 @@ def run(session: Session, report: Report, finish: Finish) -> int:
     begun = distributed.first(np.array(run_folder.progress(folder) is not None))
     if train.init_from is not None and not begun:
         adapt = warm_start(settings, program, report.line)
-    engine = getattr(env, "engine", None)  # Safety Gym's environments have one
+    engine = getattr(innermost(env), "engine", None)  # Safety Gym's environments have one
     try:
         if distributed.leads():
             folder.mkdir(parents=True, exist_ok=True)

@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from jaxsafe import algos, envs
-from jaxsafe.algos import Entry as Row
+from jaxsafe.algos import Row
 from jaxsafe.config import ConfigError, flat, from_dict, is_float, nearest
 from jaxsafe.learn.constraints import check_names, own_limits
 from jaxsafe.run import distributed, run_folder
@@ -283,14 +283,15 @@ def load(kind: str, name: str) -> None:
 
 def algo_options(row: Row, preset: str = "fast", compat: str = "none") -> dict[str, Any]:
     """The defaults of an algorithm; those of `preset` if it has that one."""
-    options = presets(row).get(preset, {}) | overrides(compat, row.config)
+    options = {**presets(row).get(preset, {}), **overrides(compat, row.config)}
     return dataclasses.asdict(row.config(**options))
 
 
-def presets(row: Row) -> dict[str, dict[str, Any]]:
+def presets(row: Row) -> dict[str, Mapping[str, Any]]:
     """Overrides by name: 'fast' has none, 'published' is the first of the published settings."""
     first = next(iter(row.published.values()), None)
-    return {"fast": {}, **({} if first is None else {"published": first}), **row.published}
+    named = {} if first is None else {"published": first}
+    return {name: dict(options) for name, options in ({"fast": {}} | named | {**row.published}).items()}
 
 
 def make_env(settings: Settings) -> Env:

@@ -15,6 +15,7 @@ import numpy as np
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
 from jaxsafe.config import ConfigError, flat
+from jaxsafe.envs.wrap import raw_steps
 from jaxsafe.run import checkpoint, clock, run_folder
 from jaxsafe.run.settings import TrainConfig
 from jaxsafe.types import Algorithm, Clocks, Env, PyTree, Shared
@@ -87,6 +88,7 @@ def build(
         )
     algo: Algorithm = make(env, AXIS if share > 1 else None)
     clocks = algo.clocks(configs[0])
+    clocks = clocks._replace(steps=clocks.steps * raw_steps(env))
     if data and clocks.steps:
         raise ConfigError(f"dataset={settings.dataset}: this algorithm learns from no data set")
     if not data and not clocks.steps:

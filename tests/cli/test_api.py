@@ -40,7 +40,7 @@ class PricedConfig(PPOConfig):
     price: float = 0.5
 
 
-PRICED = algos.Entry(
+PRICED = algos.Row(
     PricedConfig, lambda env, axis_name=None: on_policy(env, penalty, clipped, adam_epochs, axis_name)
 )
 

@@ -481,14 +481,10 @@ def test_the_critics_find_the_values_of_a_chain(circle, n_step):
     assert metrics["train/nonfinite"].sum() == 0
 
 
-def test_sac_pulls_levers():
+@pytest.mark.parametrize("name", [name for name in NAMES if ALGOS[name].holds == "nothing"])
+def test_without_a_constraint_all_the_reward_is_taken_and_the_cost_paid(name):
     """20 at best, 12.5 by chance."""
-    algo = ALGOS["sac"].make(Lever())
-    cfg = ALGOS["sac"].config(
-        num_envs=32, horizon=8, learn_every=2, batch_size=256, replay_size=20_000, learning_starts=256,
-        hidden=(32,), discount=0.9, lr=3e-3, critic_lr=3e-3, alpha_init=0.1, alpha_lr=3e-3,
-        target_entropy=-2.0,
-    )  # fmt: skip
+    algo, cfg = ALGOS[name].make(Lever()), ALGOS[name].config(**ALGOS[name].lever)
 
     def train(key):
         ts = algo.init(key, cfg, FIRST)

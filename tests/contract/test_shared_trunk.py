@@ -7,23 +7,17 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from tasks import FAST
 from toys import FIRST, Clock, Lever
 
 from jaxsafe.algos import ALGOS
-from jaxsafe.config import ConfigError
 from jaxsafe.learn.normalise import normalise
-from jaxsafe.learn.on_policy import Batch, OnPolicyConfig
+from jaxsafe.learn.on_policy import Batch
 from jaxsafe.learn.steps import with_values
 from jaxsafe.learn.surrogates import clipped
 from jaxsafe.nn.gaussian import log_prob, sample
 from jaxsafe.nn.networks import init_params, policy, share_trunk, value, values
 
-BY_ADAM = {
-    "cppo_pid", "cup", "focops", "ipo", "p3o", "pdo", "pg", "ppo", "ppo_early_terminated", "ppo_lag",
-    "ppo_penalty", "ppo_saute", "ppo_simmer_pid",
-}  # fmt: skip
 CFG = ALGOS["ppo_lag"].config(hidden=(4,), trunk="shared", value_coef=0.3)
 
 
@@ -107,26 +101,6 @@ def test_the_joint_objective_by_hand():
     losses = {"train/value_loss_r": 2.0, "train/value_loss_c": 4.5}
     assert metrics == {"a": 1.0, "train/objective": 7.0, **losses}
     np.testing.assert_allclose(gain, 7 - 0.3 * (2 + 4.5), rtol=1e-6)
-
-
-@pytest.mark.parametrize("name", [n for n in ALGOS if issubclass(ALGOS[n].config, OnPolicyConfig)])
-def test_the_algorithms_by_adam_share_a_trunk_and_the_others_say_that_they_do_not(name):
-    algo = ALGOS[name].make(Clock())
-    cfg = ALGOS[name].config(num_envs=8, horizon=10, minibatches=2, hidden=(8,), trunk="shared")
-
-    def init():
-        return jax.eval_shape(lambda: algo.init(jax.random.key(0), cfg, FIRST))
-
-    if name not in BY_ADAM:
-        with pytest.raises(ConfigError, match="trunk=shared: expected separate"):
-            init()
-        return
-    before = init()
-    after, metrics = jax.eval_shape(algo.update, before, FIRST)
-    assert jax.tree.structure(before) == jax.tree.structure(after)
-    assert [*before.params] == ["actor"] and before.opt_state["critics"] == ()
-    assert before.params["actor"]["mean"]["params"]["Dense_1"]["bias"].shape == (1 + 2,)
-    assert {"train/value_loss_r", "train/value_loss_c", "train/nonfinite"} <= metrics.keys()
 
 
 def test_each_value_on_a_shared_trunk_learns_its_own_cost():

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from jaxsafe.report.tables import between_marks
+
 ROOT = Path(__file__).parent.parent.parent
 DOCS = ROOT / "docs"
 sys.path.insert(0, str(DOCS))
@@ -92,13 +94,12 @@ def test_links_of_the_readme_work_on_a_page(link, expected):
 
 
 def test_a_table_replaces_what_stands_between_its_marks_alone():
-    tables = importlib.import_module("tables")
     for old in ("", "| old |\n", "| old |\n\nmore\n"):
         text = f"before\n<!-- table: a -->\n{old}<!-- end -->\nafter\n<!-- end -->\n"
-        new = tables.replaced(text, {"a": "| new |"})
+        new = between_marks(text, {"a": "| new |"})
         assert new == "before\n<!-- table: a -->\n| new |\n<!-- end -->\nafter\n<!-- end -->\n"
     with pytest.raises(ValueError, match="no <!-- table: a -->"):
-        tables.replaced("<!-- table: a -->\n", {"a": "| new |"})
+        between_marks("<!-- table: a -->\n", {"a": "| new |"})
 
 
 def test_files_that_pages_link_to_are_there():

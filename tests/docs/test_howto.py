@@ -41,15 +41,17 @@ def blocks(page: Path) -> list[tuple[bool, str, str]]:
 
 
 @pytest.fixture
-def page(request, tmp_path, monkeypatch) -> Path:
+def page(request, tmp_path, monkeypatch) -> Iterator[Path]:
     """A page whose files lie in the working directory."""
     for _, _, text in blocks(request.param):
         if name := FILE.match(text):
             (tmp_path / name[1]).write_text(text)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
-    monkeypatch.setattr(envs, "ENVS", {**envs.ENVS})
-    return request.param
+    known = {**envs.ENVS}
+    yield request.param
+    envs.ENVS.clear()
+    envs.ENVS.update(known)
 
 
 def named(path: Path) -> str:

@@ -31,6 +31,19 @@ def test_the_tables_of_the_readme_and_the_docs_are_those_of_the_code():
         assert tables.filled(path) == path.read_text(), f"{path.name}: run python docs/tables.py"
 
 
+def test_the_tables_of_measurements_are_those_of_the_studies_and_the_data():
+    for path, text in script("measured").pages().items():
+        assert path.read_text() == text, f"{path}: run python docs/measured.py"
+
+
+def test_studies_are_small():
+    folders = [path.parent for path in (ROOT / "docs" / "results").glob("*/study.yaml")]
+    assert len(folders) >= 7
+    for folder in folders:
+        files = list(folder.iterdir())
+        assert len(files) <= 4 and sum(file.stat().st_size for file in files) < 600_000, folder
+
+
 def test_every_link_of_the_readme_leads_somewhere():
     for path in re.findall(r"\]\(([^)#]+)\)|src=\"([^\"]+)\"", (ROOT / "README.md").read_text()):
         target = "".join(path)

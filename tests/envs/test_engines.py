@@ -18,7 +18,10 @@ from tasks import FAST, task
 
 from jaxsafe import envs
 from jaxsafe.config import ConfigError
-from jaxsafe.envs.engines import physics
+from jaxsafe.envs import engines
+from jaxsafe.envs.engines.jax import contacts as jax_contacts
+from jaxsafe.envs.engines.jax import engine as jax_engine
+from jaxsafe.envs.engines.jax import solver as jax_solver
 from jaxsafe.envs.safety_gym import recording, scene
 from jaxsafe.envs.safety_gym.config import read as read_config
 from jaxsafe.learn.rollout import collect, init_rollout, memoryless
@@ -44,9 +47,9 @@ def test_the_warp_engine_says_what_to_install(monkeypatch):
 
 
 def test_an_engine_that_nobody_knows_is_refused_by_the_maker():
-    scene = envs.make("point_goal0", engine="c").scene
+    env = envs.make("point_goal0", engine="c")
     with pytest.raises(ConfigError, match=r"valid: auto, c, jax, warp|did you mean"):
-        physics.make_engine("gazebo", scene, 10)
+        engines.make_engine("gazebo", env.scene.simulation(env.config))
 
 
 def agree(name: str, steps: int, tolerance: float) -> None:
@@ -114,8 +117,6 @@ def separated(model: mujoco.MjModel, data: mujoco.MjData, wanted: float) -> np.n
 )
 def test_a_rod_and_a_box_are_as_far_apart_as_mujoco_says(rod):
     """Pillar, wheel, torso and leg, against a vase that lies anyhow, or beside one that stands."""
-    from jaxsafe.envs.engines import physics_jax
-
     spec = mujoco.MjSpec()
     body = spec.worldbody.add_body()
     body.add_freejoint()
@@ -142,7 +143,7 @@ def test_a_rod_and_a_box_are_as_far_apart_as_mujoco_says(rod):
     @jax.vmap
     def contacts(qpos):
         moved = mjx.kinematics(mjx_model, mjx.make_data(mjx_model).replace(qpos=qpos))
-        collide = getattr(physics_jax, f"{shape}_box")
+        collide = getattr(jax_contacts, f"{shape}_box")
         return collide(mjx_model, moved, None, jnp.array([[0, 1]]))
 
     dist, _, frame = contacts(qpos)
@@ -162,8 +163,6 @@ def test_a_rod_and_a_box_are_as_far_apart_as_mujoco_says(rod):
 @pytest.mark.parametrize("other", ["sphere .1", "capsule .2 .5", "capsule .032 .07"])
 def test_a_wheel_or_torso_is_as_far_from_a_round_shape_as_mujoco_says(other, cylinder):
     """Buttons, pillars and legs; half of them upright with the cylinder's axis level, a wheel's."""
-    from jaxsafe.envs.engines import physics_jax
-
     shape, *size = other.split()
     model = pair(f'type="{shape}" size="{" ".join(size)}"', f'type="cylinder" size="{cylinder}"')
     data, rng = mujoco.MjData(model), np.random.default_rng(0)
@@ -181,7 +180,7 @@ def test_a_wheel_or_torso_is_as_far_from_a_round_shape_as_mujoco_says(other, cyl
     @jax.vmap
     def contact(qpos):
         moved = mjx.kinematics(mjx_model, mjx.make_data(mjx_model).replace(qpos=qpos))
-        return getattr(physics_jax, f"{shape}_cylinder")(mjx_model, moved, None, jnp.array([[0, 1]]))
+        return getattr(jax_contacts, f"{shape}_cylinder")(mjx_model, moved, None, jnp.array([[0, 1]]))
 
     dist, pos, frame = map(np.array, contact(jnp.asarray(np.array(poses), jnp.float32)))
     dist, pos, normal = dist.reshape(-1), pos.reshape(-1, 3), frame.reshape(-1, 3, 3)[:, 0]
@@ -210,8 +209,6 @@ def pair(first: str, second: str) -> mujoco.MjModel:
 
 def agree_on_contacts(collide: str, model: mujoco.MjModel, poses: np.ndarray) -> np.ndarray:
     """Every contact that MuJoCo finds in these poses, and no other; how many there are in each."""
-    from jaxsafe.envs.engines import physics_jax
-
     mjx_model = mjx.put_model(model, impl="jax")
     data, poses = mujoco.MjData(model), poses.astype(np.float32)
 
@@ -219,7 +216,7 @@ def agree_on_contacts(collide: str, model: mujoco.MjModel, poses: np.ndarray) ->
     @jax.vmap
     def contacts(qpos):
         moved = mjx.kinematics(mjx_model, mjx.make_data(mjx_model).replace(qpos=qpos))
-        return getattr(physics_jax, collide)(mjx_model, moved, None, jnp.array([[0, 1]]))
+        return getattr(jax_contacts, collide)(mjx_model, moved, None, jnp.array([[0, 1]]))
 
     counts = []
     for qpos, dist, pos, frame in zip(poses, *jax.device_get(contacts(poses)), strict=True):
@@ -342,8 +339,6 @@ def test_an_observation_after_a_reset_is_that_of_the_new_episode(rollout):
 
 def test_jax_solves_contacts_as_c_does():
     """MJX's own solver gives up on some of these states, with velocities 0.03 to 0.2 off."""
-    from jaxsafe.envs.engines import physics_jax
-
     record = recording.Recording(DATA / "doggo_goal1.npz")
     config = read_config(record.meta["config"])
     model, mjx_model = (scene.build(config, for_mjx).model for for_mjx in (False, True))
@@ -354,7 +349,7 @@ def test_jax_solves_contacts_as_c_does():
     @jax.jit
     @jax.vmap
     def step(state, ctrl):
-        return forward.euler(m, physics_jax.forward_pass(m, d.replace(ctrl=ctrl, **state))).qvel
+        return forward.euler(m, jax_engine.forward_pass(m, d.replace(ctrl=ctrl, **state))).qvel
 
     data = mujoco.MjData(model)
     for _ in range(3):
@@ -377,17 +372,15 @@ def test_the_jax_engine_refuses_what_it_cannot_solve(option, tmp_path):
     robot = tmp_path / "mine.xml"
     robot.write_text(text.replace("<option ", f"<option {option} "))
     assert option in robot.read_text()
-    with pytest.raises(ConfigError, match="integrator Euler or implicitfast, pyramidal"):
+    with pytest.raises(ConfigError, match="integrator Euler or implicitfast and pyramidal"):
         envs.make("point_goal0", engine="jax", robot_base=str(robot))
 
 
 def test_dry_friction_that_turns_round_is_not_taken_for_one_piece_of_the_cost():
     """A stiff equality draws one degree of freedom; the other, held by dry friction, stays."""
-    from jaxsafe.envs.engines import solver_jax
-
     least, most = np.array([-np.inf, -1e-4]), np.array([np.inf, 1e-4])
-    bounds = solver_jax.Rows(least, most, 1e-8, 0.01, iterations=100, trials=50)
-    problem = solver_jax.Problem(
+    bounds = jax_solver.Rows(least, most, 1e-8, 0.01, iterations=100, trials=50)
+    problem = jax_solver.Problem(
         J=jnp.eye(2),
         D=jnp.array([1e4, 1e4]),
         aref=jnp.array([1000.0, 0]),
@@ -395,14 +388,12 @@ def test_dry_friction_that_turns_round_is_not_taken_for_one_piece_of_the_cost():
         smooth=jnp.zeros(2),
         guess=jnp.array([0.0, 0.05]),
     )
-    end = solver_jax.minimise(bounds, jax.tree.map(lambda x: x[None], problem))
+    end = jax_solver.minimise(bounds, jax.tree.map(lambda x: x[None], problem))
     np.testing.assert_allclose(end.x[0], [1000 * 1e4 / (1e4 + 1), 0], rtol=1e-5, atol=1e-6)
 
 
 def test_jax_solves_equalities_dry_friction_limits_and_contacts_as_c_does():
     """A chain of two hinges with all of these, its end tied to a cube that lies on the floor."""
-    from jaxsafe.envs.engines import physics_jax
-
     model = mujoco.MjModel.from_xml_string("""
     <mujoco>
       <option cone="pyramidal"/>
@@ -440,6 +431,6 @@ def test_jax_solves_equalities_dry_friction_limits_and_contacts_as_c_does():
     model.opt.tolerance = 1e-8
     m, d = mjx.put_model(model, impl="jax"), mjx.make_data(model, impl="jax")
     batch = jax.tree.map(lambda *x: np.stack(x), *states)
-    solved = jax.jit(jax.vmap(lambda state: physics_jax.forward_pass(m, d.replace(**state))))(batch)
+    solved = jax.jit(jax.vmap(lambda state: jax_engine.forward_pass(m, d.replace(**state))))(batch)
     size = np.abs(accelerations).max(1, keepdims=True)
     np.testing.assert_allclose(solved.qacc / size, accelerations / size, rtol=0, atol=1e-4)

@@ -15,8 +15,8 @@ from tasks import FAST, HERE, change, moved, put, task
 from jaxsafe import envs
 from jaxsafe.config import ConfigError
 from jaxsafe.envs.safety_gym import layout as layouts
+from jaxsafe.envs.safety_gym.arena import World
 from jaxsafe.envs.safety_gym.config import defaults, read
-from jaxsafe.envs.safety_gym.task import World
 
 DATA = Path(__file__).parent.parent / "data"
 RECORDED = ("point_goal2", "car_push2", "doggo_button2")
@@ -31,8 +31,7 @@ def recorded(name: str) -> dict[str, np.ndarray]:
 
 @functools.cache
 def begun(name: str) -> World:
-    reset = jax.jit(jax.vmap(task(name).env.reset))
-    return reset(jax.random.split(jax.random.key(11), COUNT)).physics
+    return task(name).reset(jax.random.split(jax.random.key(11), COUNT)).physics
 
 
 @functools.cache
@@ -42,12 +41,17 @@ def starts(name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.asarray(world.layout), np.asarray(world.start), np.asarray(world.goal_button)
 
 
+def sampled(place: layouts.Placement, count: int, seed: int = 0) -> tuple[jax.Array, jax.Array]:
+    """Layouts [count, n, 2], and whether each is valid."""
+    sample = jax.jit(jax.vmap(lambda k: layouts.sample_layout(place, k)), compiler_options=FAST)
+    return sample(jax.random.split(jax.random.key(seed), count))
+
+
 @functools.cache
 def first_layouts(name: str) -> np.ndarray:
     """Layouts as they are before the goal is drawn anew."""
     place = task(name).env.place
-    sample = jax.jit(jax.vmap(lambda key: layouts.sample_layout(place, key)))
-    xy, found = sample(jax.random.split(jax.random.key(5), COUNT))
+    xy, found = sampled(place, COUNT, seed=5)
     assert found.all()
     return np.asarray(xy)
 
@@ -141,9 +145,7 @@ def test_objects_keep_apart_and_inside_the_extents(name):
 
 def test_a_margin_is_added_to_every_distance():
     place = layouts.placement(envs.make("point_goal1", engine="c", placements_margin=0.2).config)
-    xy, found = jax.vmap(lambda k: layouts.sample_layout(place, k))(
-        jax.random.split(jax.random.key(0), 64)
-    )
+    xy, found = sampled(place, 64)
     i, j = np.triu_indices(len(place.names), 1)
     apart = distances(np.asarray(xy)) - (place.keepouts[i] + place.keepouts[j])
     assert found.all() and 0.2 - 1e-6 <= apart.min() < 0.25
@@ -151,9 +153,7 @@ def test_a_margin_is_added_to_every_distance():
 
 def test_a_negative_margin_lets_objects_overlap():
     place = layouts.placement(envs.make("point_goal1", engine="c", placements_margin=-2.0).config)
-    xy, found = jax.vmap(lambda k: layouts.sample_layout(place, k))(
-        jax.random.split(jax.random.key(0), 64)
-    )
+    xy, found = sampled(place, 64)
     assert found.all() and layouts.feasible(place) and distances(np.asarray(xy)).min() < 0.1
 
 
@@ -179,8 +179,7 @@ def test_placements_are_chosen_by_their_shrunken_areas():
     place = layouts.placement(
         envs.make("point_goal1", engine="c", hazards_placements=rectangles, hazards_num=1).config
     )
-    sample = jax.jit(jax.vmap(lambda key: layouts.sample_layout(place, key)[0]))
-    xy = np.asarray(sample(jax.random.split(jax.random.key(1), 4000)))[:, place.names.index("hazard0")]
+    xy = np.asarray(sampled(place, 4000, seed=1)[0])[:, place.names.index("hazard0")]
     first = xy[:, 0] < 0
     share = 0.64**2 / (0.64**2 + 0.14 * 0.64)
     assert abs(first.mean() - share) < 4 * np.sqrt(share * (1 - share) / 4000)
@@ -248,8 +247,7 @@ def test_trying_layouts_side_by_side_favours_none(lanes):
         margin=0.0,
     )
     vars(place)["lanes"] = lanes
-    sample = jax.jit(jax.vmap(lambda key: layouts.sample_layout(place, key)))
-    xy, found = sample(jax.random.split(jax.random.key(2), 10_000))
+    xy, found = sampled(place, 10_000, seed=2)
     grid = np.linspace(0, 1, 2001)
     free = (grid + 1 - gap + np.maximum(1 - gap - grid, 0)) / 2
     law = np.cumsum(1 - (1 - free) ** layouts.DRAWS_PER_OBJECT)

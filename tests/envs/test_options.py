@@ -14,7 +14,7 @@ from tasks import FAST, HERE, change, task
 from jaxsafe import envs
 from jaxsafe.config import ConfigError
 from jaxsafe.envs import SafetyGym, SafetyGymConfig
-from jaxsafe.types import State
+from jaxsafe.envs.safety_gym.task import in_parts
 
 native: Any = mujoco  # its functions are not known to type checkers
 
@@ -192,22 +192,14 @@ def facts(env: SafetyGym) -> tuple:
 
 def outcome(env: SafetyGym) -> list[np.ndarray]:
     """All that a reset and three steps show."""
-
-    def advance(state: State, _: None) -> tuple[State, State]:
-        state = env.step(state, jnp.ones(env.action_size))
-        return state, state
-
-    def episode(key: jax.Array) -> Any:
-        states = [env.reset(key)]
-        state, after = jax.lax.scan(advance, states[0], length=3)
-        return [(s.obs, s.reward, s.cost, s.costs, s.terminated, s.info) for s in (states[0], after)], (
-            state.physics.physics,
-            state.physics.layout,
-            state.physics.buttons_timer,
-        )
-
-    found = jax.jit(episode, compiler_options=FAST)(jax.random.key(4))
-    return [np.asarray(x) for x in jax.tree.leaves(found)]
+    reset, step = in_parts(env, compiler_options=FAST)
+    states = [reset(jax.random.split(jax.random.key(4), 1))]
+    for _ in range(3):
+        states.append(step(states[-1], jnp.ones((1, env.action_size))))
+    shown = [(s.obs, s.reward, s.cost, s.costs, s.terminated, s.info) for s in states]
+    world: Any = states[-1].physics
+    kept = world.physics, world.layout, world.buttons_timer
+    return [np.asarray(x) for x in jax.tree.leaves((shown, kept))]
 
 
 def build(base: str, **changes: Any) -> SafetyGym:

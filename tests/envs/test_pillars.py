@@ -11,15 +11,18 @@ from mujoco import mjx
 from mujoco.mjx.third_party import mujoco_warp
 
 from jaxsafe import envs
-from jaxsafe.envs.engines import physics_jax, pillars_warp
+from jaxsafe.envs.engines.jax import contacts as jax_contacts
+from jaxsafe.envs.engines.warp import pillars as warp_pillars
 from jaxsafe.envs.safety_gym import scene
 
 XML = """
 <mujoco>
   <worldbody>
-    <body mocap="true" pos="0.3 -0.2 0.5"><geom type="cylinder" size="0.2 0.5"/></body>
+    <body name="upright" mocap="true" pos="0.3 -0.2 0.5"><geom type="cylinder" size="0.2 0.5"/></body>
     <body><freejoint/><geom type="box" size="0.1 0.05 0.08"/></body>
-    <body mocap="true" pos="9 9 0.5"><geom type="cylinder" size="0.2 0.5" quat="1 0.2 0 0"/></body>
+    <body name="leaning" mocap="true" pos="9 9 0.5">
+      <geom type="cylinder" size="0.2 0.5" quat="1 0.2 0 0"/>
+    </body>
   </worldbody>
 </mujoco>
 """
@@ -41,7 +44,7 @@ def by_warp(poses):
     model = mujoco.MjModel.from_xml_string(XML)
     m = mujoco_warp.put_model(model)
     d = mujoco_warp.make_data(model, nworld=len(poses), naconmax=4 * len(poses), njmax=64)
-    pillars = pillars_warp.adopt(model, m, d)
+    pillars = warp_pillars.adopt(model, m, d, ["upright", "leaning"])
     assert pillars and pillars.pairs.numpy().tolist() == [[0, 1]]
     assert [0, 1] not in m.nxn_geom_pair_filtered.numpy().tolist()  # no longer MuJoCo Warp's
     d.qpos.assign(poses.astype(np.float32))
@@ -62,7 +65,7 @@ def by_jax(poses):
     @jax.vmap
     def contacts(qpos):
         moved = mjx.kinematics(model, mjx.make_data(model).replace(qpos=qpos))
-        return physics_jax.capsule_box(model, moved, None, jnp.array([[0, 1]]))
+        return jax_contacts.capsule_box(model, moved, None, jnp.array([[0, 1]]))
 
     found = jax.device_get(contacts(jnp.asarray(poses, jnp.float32)))
     touching = found[0] < 0
@@ -170,12 +173,13 @@ def test_boxes_apart_do_not_touch(engine):
 
 def test_only_pillars_and_boxes_are_taken():
     for task, some in (("car_push2", True), ("car_goal2", False), ("doggo_button2", False)):
-        model = scene.build(envs.make(task).config).model
-        model.opt.disableflags &= ~mujoco.mjtDisableBit.mjDSBL_AUTORESET.value
+        config = envs.make(task).config
+        simulation = scene.build(config).simulation(config)
+        model = simulation.compile(count=True)
         m = mujoco_warp.put_model(model)
         before = m.nxn_geom_pair_filtered.numpy().tolist()
         d = mujoco_warp.make_data(model, nworld=1, naconmax=100, njmax=100)
-        pillars = pillars_warp.adopt(model, m, d)
+        pillars = warp_pillars.adopt(model, m, d, simulation.pillars)
         after = m.nxn_geom_pair_filtered.numpy().tolist()
         assert bool(pillars) == some
         taken = [pair for pair in before if pair not in after]

@@ -246,7 +246,7 @@ def test_a_process_that_drew_ends_quietly(display):
     script = """if True:
         import jax
         from jaxsafe import envs
-        from jaxsafe.envs import render
+        from jaxsafe.envs.view import render
         env = envs.make("point_goal0", engine="c")
         renderer = render.Renderer(env, 64, 48)
         print(renderer.frame(env.reset(jax.random.key(0))).shape)

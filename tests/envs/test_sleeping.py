@@ -7,6 +7,7 @@ import pytest
 from tasks import HERE, Task, change, moved, task
 
 from jaxsafe import envs
+from jaxsafe.config import ConfigError
 from jaxsafe.envs.safety_gym import sleeping
 
 
@@ -115,7 +116,7 @@ def test_how_many_are_awake_by_default():
 
 
 def test_settings_that_need_everyone_are_refused():
-    with pytest.raises(envs.ConfigError, match=r"env.awake=0: expected at least 1, or null"):
+    with pytest.raises(ConfigError, match=r"env.awake=0: expected at least 1, or null"):
         envs.make("point_goal2", engine="c", awake=0)
-    with pytest.raises(envs.ConfigError, match=r"env.awake=2: expected 10 or null with .*natural"):
+    with pytest.raises(ConfigError, match=r"env.awake=2: expected 10 or null with .*natural"):
         envs.make("point_goal2", engine="c", awake=2, lidar_type="natural")

@@ -77,7 +77,7 @@ TABLED = sorted(itertools.product(SENSORS, LIDARS))
 
 @pytest.mark.parametrize("robot, name", TABLED)
 def test_observations_have_the_order_and_sizes_of_the_original(robot, name):
-    env = envs.make(f"{robot}_{name}", engine="c")
+    env = task(f"{robot}_{name}").env
     parts = SENSORS[robot] | {f"{kind}_lidar": 16 for kind in LIDARS[name]}
     spec = {k: int(np.prod(shape)) for k, shape in env.observation_spec.items()}
     assert list(spec.items()) == sorted(parts.items())
@@ -88,7 +88,7 @@ def test_observations_have_the_order_and_sizes_of_the_original(robot, name):
 
 @pytest.mark.parametrize("robot, name", TABLED)
 def test_costs_and_objects_are_those_of_the_table(robot, name):
-    env = envs.make(f"{robot}_{name}", engine="c")
+    env = task(f"{robot}_{name}").env
     assert env.cost_names == COSTS.get(name, ())
     half, objects = OBJECTS[name]
     assert env.config.placements_extents == (-half, -half, half, half)
@@ -136,7 +136,7 @@ def test_costs_and_objects_are_those_of_the_table(robot, name):
     ],
 )
 def test_options_are_those_of_the_table(name, option, value):
-    assert getattr(envs.make(name, engine="c").config, option) == value
+    assert getattr(task(name).env.config, option) == value
     assert envs.env_defaults(name)[option] == value
 
 
@@ -160,7 +160,7 @@ def test_27_tasks_run_circle_and_five_grids_are_registered_for_each_robot():
 def test_the_original_ids_name_the_same_environments(name, identity):
     assert envs.canonical(identity) == name == envs.canonical(name)
     assert envs.ALIASES[identity] == name
-    assert envs.make(identity, engine="c").config == envs.make(name, engine="c").config
+    assert envs.make(identity, engine="c").config == task(name).env.config
 
 
 def test_every_name_has_one_alias():
@@ -184,13 +184,13 @@ def test_env_defaults_build_the_same_environment():
 
 
 def test_a_config_can_be_made_and_overridden():
-    config = envs.make("point_goal1", engine="c").config
+    config = task("point_goal1").env.config
     env = envs.make(config, engine="c", hazards_num=3)
     assert (env.name, env.place.kinds.count("hazards")) == ("custom", 3)
 
 
 def test_only_what_the_original_senses_is_sensed():
-    doggo, car = (envs.make(f"{r}_goal0", engine="c").scene.model for r in ("doggo", "car"))
+    doggo, car = (task(f"{r}_goal0").env.scene.model for r in ("doggo", "car"))
     waist = [doggo.joint(i).name for i in range(doggo.njnt)]
     sensed = {doggo.sensor(i).name.removeprefix("jointpos_") for i in range(doggo.nsensor)}
     driven = {doggo.joint(i).name for i in doggo.actuator_trnid[:, 0]}
@@ -203,7 +203,7 @@ def test_only_what_the_original_senses_is_sensed():
     "name, half, mass", [("point_push1", 0.2, 1.28e-4), ("car_push1", 0.125, 1.5625e-5)]
 )
 def test_the_box_has_four_corner_posts_and_their_mass_counts(name, half, mass):
-    model = envs.make(name, engine="c").scene.model
+    model = task(name).env.scene.model
     body = model.body("box")
     assert body.mass[0] == pytest.approx(mass)
     geoms = np.flatnonzero(model.geom_bodyid == body.id)

@@ -12,7 +12,7 @@ import pytest
 from tasks import task
 
 from jaxsafe import envs
-from jaxsafe.envs.engines import physics
+from jaxsafe.config import ConfigError
 from jaxsafe.envs.safety_gym import scene, sleeping, suite
 
 
@@ -72,7 +72,7 @@ def test_sensors_of_what_the_dynamics_do_not_write():
 def test_contacts_without_room_are_counted():
     t = task("point_goal1", engine="warp", contact_room=0.01)
     assert (t.idle(t.begin(64)).info["overflow"] == 1).all()
-    with pytest.raises(envs.ConfigError, match=r"env.contact_room=0.0: expected above 0"):
+    with pytest.raises(ConfigError, match=r"env.contact_room=0.0: expected above 0"):
         envs.make("point_goal1", contact_room=0.0)
 
 
@@ -124,14 +124,14 @@ def test_the_solver_finds_what_mujocos_finds(lanes):
     """Contacts, limits, equalities and dry friction, from the states on the way of 30 steps."""
     from mujoco.mjx.third_party import mujoco_warp
 
-    from jaxsafe.envs.engines import physics_warp, solver_warp
+    from jaxsafe.envs.engines.warp import engine, solver
 
-    assert physics_warp.solver.solve is solver_warp.solve
-    assert physics_warp.constraint.make_constraint is solver_warp.make_constraint
+    assert engine.solver.solve is solver.solve
+    assert engine.constraint.make_constraint is solver.make_constraint
     model = compiled(ROOM)
     m, worlds = mujoco_warp.put_model(model), 16
     d = mujoco_warp.make_data(model, nworld=worlds, nconmax=40, njmax=160)
-    assert solver_warp.adopt(model, m, d)
+    assert solver.adopt(model, m, d)
     rng = np.random.default_rng(0)
     d.qpos.assign(np.tile(model.qpos0, (worlds, 1)) + np.r_[0, 0, 0.05, np.zeros(18), 0.3, 0.3, 0.3])
     d.qvel.assign(rng.normal(size=(worlds, model.nv)))
@@ -141,11 +141,11 @@ def test_the_solver_finds_what_mujocos_finds(lanes):
         mujoco_warp.forward(m, d)
         found = {}
         for make, solve in (
-            (solver_warp.their_constraints, solver_warp.theirs),
-            (solver_warp.make_constraint, solver_warp.solve),
+            (solver.their_constraints, solver.theirs),
+            (solver.make_constraint, solver.solve),
         ):
             make(m, d)
-            if solve is solver_warp.theirs:
+            if solve is solver.theirs:
                 kinds |= {
                     int(k)
                     for row, n in zip(d.efc.type.numpy(), d.nefc.numpy(), strict=True)
@@ -175,13 +175,14 @@ def simulated(name: str, worlds: int, **options):
 
     env = task(name, **options).env
     small = scene.build(sleeping.small_config(env.config, 2))
-    m = mujoco_warp.put_model(small.model)
-    contacts, rows = physics.contact_budget(small)
+    model = small.simulation(env.config).compile(count=True)
+    m = mujoco_warp.put_model(model)
+    contacts, rows = small.room()
     data = [
-        mujoco_warp.make_data(small.model, nworld=worlds, naconmax=contacts * worlds, njmax=rows)
+        mujoco_warp.make_data(model, nworld=worlds, naconmax=contacts * worlds, njmax=rows)
         for _ in range(2)
     ]
-    return small.model, m, *data
+    return model, m, *data
 
 
 WRITTEN = (  # by the dynamics, for what comes after them
@@ -196,11 +197,11 @@ def test_the_dynamics_are_mujocos(name, lanes):
     from mujoco.mjx.third_party import mujoco_warp
     from mujoco.mjx.third_party.mujoco_warp._src.forward import euler
 
-    from jaxsafe.envs.engines import dynamics_warp
+    from jaxsafe.envs.engines.warp import dynamics
 
     worlds = 9  # not a multiple of those that share a block
     model, m, theirs, ours = simulated(name, worlds)
-    assert dynamics_warp.adopt(model, m, ours) and dynamics_warp.solver_warp.adopt(model, m, theirs)
+    assert dynamics.adopt(model, m, ours) and dynamics.solver.adopt(model, m, theirs)
     ours.dynamics.pillars = None  # whose contacts `theirs` does not get: they left the model's list
     rng = np.random.default_rng(0)
     theirs.qvel.assign(rng.normal(size=(worlds, model.nv)))
@@ -212,7 +213,7 @@ def test_the_dynamics_are_mujocos(name, lanes):
         for k in ("qpos", "qvel", "qacc_warmstart", "ctrl", "mocap_pos"):
             getattr(ours, k).assign(getattr(theirs, k).numpy().copy())
         mujoco_warp.forward(m, theirs)
-        dynamics_warp.forward(m, ours)
+        dynamics.forward(m, ours)
         for k in WRITTEN:
             a, b = getattr(ours, k).numpy(), getattr(theirs, k).numpy()
             if k in ("cinert", "cvel", "subtree_com"):  # others' are not written
@@ -226,18 +227,18 @@ def test_the_dynamics_are_mujocos(name, lanes):
             getattr(ours, k).assign(getattr(theirs, k).numpy().copy())
         ours.efc.Ma.assign(theirs.efc.Ma.numpy().copy())
         euler(m, theirs)
-        dynamics_warp.advance(m, ours)
+        dynamics.advance(m, ours)
         for k in ("qpos", "qvel", "qacc_warmstart", "time"):
             a, b = getattr(ours, k).numpy(), getattr(theirs, k).numpy()
             assert np.abs(a - b).max() < 2e-6 * np.abs(b).max(), k
 
 
 def test_the_dynamics_are_for_every_task():
-    from jaxsafe.envs.engines import dynamics_warp
+    from jaxsafe.envs.engines.warp import dynamics
 
     for name in (f"{robot}_{kind}2" for robot in suite.ROBOTS for kind in ("goal", "button", "push")):
         model, m, ours, _ = simulated(name, 1)
-        assert dynamics_warp.adopt(model, m, ours), name
+        assert dynamics.adopt(model, m, ours), name
 
 
 ARM = """
@@ -266,21 +267,21 @@ def beside_c(xml: str, steps: int = 20, worlds: int = 2, **options):
     """(adopted, our data, MuJoCo's) after steps that do not read sensors and a pass that does."""
     from mujoco.mjx.third_party import mujoco_warp
 
-    from jaxsafe.envs.engines import dynamics_warp
+    from jaxsafe.envs.engines.warp import dynamics
 
     model = compiled(xml)
     m, off = mujoco_warp.put_model(model), int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
     blind = dataclasses.replace(m, opt=dataclasses.replace(m.opt, disableflags=off))
     d = mujoco_warp.make_data(model, nworld=worlds, nconmax=40, njmax=160)
-    adopted = dynamics_warp.adopt(model, m, d)
+    adopted = dynamics.adopt(model, m, d)
     c = mujoco.MjData(model)
     if model.nu:
         c.ctrl[:] = 0.5
         d.ctrl.fill_(0.5)
     for _ in range(steps):
-        dynamics_warp.step(blind, d)
+        dynamics.step(blind, d)
         mujoco.mj_step(model, c)
-    dynamics_warp.forward(m, d)
+    dynamics.forward(m, d)
     mujoco.mj_forward(model, c)
     return adopted, d, c
 
@@ -335,15 +336,15 @@ def test_models_that_the_dynamics_are_not_for_keep_mujocos(change):
 def test_a_world_without_constraints_forgets_its_warmstart():
     from mujoco.mjx.third_party import mujoco_warp
 
-    from jaxsafe.envs.engines import dynamics_warp
+    from jaxsafe.envs.engines.warp import dynamics
 
     model = compiled(ARM)
     m, d = mujoco_warp.put_model(model), mujoco_warp.make_data(model, nworld=3, nconmax=40, njmax=160)
-    assert dynamics_warp.adopt(model, m, d)
+    assert dynamics.adopt(model, m, d)
     warmstart = np.zeros((3, model.nv))
     warmstart[1], warmstart[2] = np.nan, 1e6
     d.qacc_warmstart.assign(warmstart)
-    dynamics_warp.forward(m, d)
+    dynamics.forward(m, d)
     c = mujoco.MjData(model)
     mujoco.mj_forward(model, c)
     np.testing.assert_allclose(d.qacc.numpy(), np.tile(c.qacc, (3, 1)), rtol=1e-4)
@@ -352,11 +353,11 @@ def test_a_world_without_constraints_forgets_its_warmstart():
 def test_models_that_the_solver_is_not_for_keep_mujocos():
     from mujoco.mjx.third_party import mujoco_warp
 
-    from jaxsafe.envs.engines import solver_warp
+    from jaxsafe.envs.engines.warp import solver
 
     model = compiled(ROOM.replace("<option", '<option cone="elliptic"'))
     m, d = mujoco_warp.put_model(model), mujoco_warp.make_data(model, nconmax=40, njmax=160)
-    assert not solver_warp.adopt(model, m, d)
+    assert not solver.adopt(model, m, d)
     mujoco_warp.forward(m, d)
     assert np.isfinite(d.qacc.numpy()).all() and d.solver_niter.numpy()[0] > 0
 
@@ -364,14 +365,14 @@ def test_models_that_the_solver_is_not_for_keep_mujocos():
 def test_the_solver_stops_where_numbers_have_ended():
     from mujoco.mjx.third_party import mujoco_warp
 
-    from jaxsafe.envs.engines import solver_warp
+    from jaxsafe.envs.engines.warp import solver
 
     model = compiled(ROOM)
     m, d = mujoco_warp.put_model(model), mujoco_warp.make_data(model, nworld=2, nconmax=40, njmax=160)
-    assert solver_warp.adopt(model, m, d)
+    assert solver.adopt(model, m, d)
     mujoco_warp.forward(m, d)
     right = d.qacc.numpy().copy()
     d.qfrc_smooth.assign(np.stack([np.full(model.nv, np.nan), d.qfrc_smooth.numpy()[1]]))
-    solver_warp.solve(m, d)
+    solver.solve(m, d)
     assert np.isnan(d.qacc.numpy()[0]).any() and d.solver_niter.numpy()[0] < 3
     np.testing.assert_allclose(d.qacc.numpy()[1], right[1], rtol=1e-3, atol=1e-3)

@@ -67,7 +67,7 @@ def driven(env: envs.SafetyGym, ask: tuple[int, int], steps: int) -> tuple[float
 
 def test_no_keys_drive_a_robot_of_ones_own(tmp_path):
     own = tmp_path / "rover.xml"
-    own.write_text((ROOT / "envs" / "assets" / "point.xml").read_text())
+    own.write_text((ROOT / "envs" / "safety_gym" / "assets" / "point.xml").read_text())
     env = envs.make("point_goal0", engine="c", robot_base=str(own))
     with pytest.raises(ConfigError, match=r"rover\.xml'?: keys drive point, car, doggo alone"):
         watch.Session(env)

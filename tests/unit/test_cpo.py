@@ -1,9 +1,12 @@
+from functools import cache, partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 from scipy.optimize import minimize
+from tasks import FAST
 from toys import context
 
 from jaxsafe.algos.cpo import BOUNDED, FREE, RECOVER, RETURN, CPOConfig, Margin, cpo_step, dual
@@ -161,28 +164,38 @@ def test_the_dual_is_finite_everywhere():
 KEYS = jax.random.split(jax.random.key(0), 3)
 
 
-def learner(**options):
-    """One CPO step on a fixed batch: (violation, margin, axis_name, batch) -> actor, state, metrics."""
-    cfg = CPOConfig(hidden=(8,), **options)
+@cache
+def problem():
+    """A policy, and a batch of its actions, of which both together earn and the first costs."""
+    cfg = CPOConfig(hidden=(8,))
     actor = init_params(KEYS[0], 3, 2, cfg)["actor"]
     obs = jax.random.normal(KEYS[1], (256, 3))
     old = policy(actor, obs, cfg)
     action = sample(old, KEYS[2])
     adv_r, adv_c = action.sum(-1), 0.5 * action[:, 0]
     adv_r, adv_c = (x - x.mean() for x in (adv_r, adv_c))
-    batch = Batch(obs, action, log_prob(old, action), old, adv_r, adv_c, adv_r, adv_c)
+    return actor, Batch(obs, action, log_prob(old, action), old, adv_r, adv_c, adv_r, adv_c)
+
+
+def moved(cfg, actor, violation, margin, batch, axis_name=None):
+    """(actor, margin, metrics) after a step; floats of the config are arguments of one program."""
 
     def objective(adv):
         return lambda actor, batch: plain(policy(actor, batch.obs, cfg), batch, adv(batch), cfg)
 
     pair = Pair(objective(lambda batch: batch.adv_r), objective(lambda batch: batch.adv_c))
+    told = context(cfg, axis_name=axis_name, excess=LENGTH * violation, length=LENGTH)
+    return cpo_step.update(actor, margin, pair, batch, told)
 
-    def step(violation, margin, batch=batch, axis_name=None):
-        excess = LENGTH * jnp.float32(violation)
-        told = context(cfg, axis_name=axis_name, excess=excess, length=LENGTH)
-        return cpo_step.update(actor, margin, pair, batch, told)
 
-    return step, batch, cfg
+one_step = jax.jit(moved, compiler_options=FAST)
+
+
+def learner(**options):
+    """(violation, margin) -> one_step from the problem's policy."""
+    actor, batch = problem()
+    cfg = CPOConfig(hidden=(8,), **options)
+    return lambda violation, margin: one_step(cfg, actor, jnp.float32(violation), margin, batch)
 
 
 START = Margin(jnp.zeros(()))
@@ -190,7 +203,7 @@ LENGTH = 1024  # steps of an episode; a power of 2 loses no digits
 
 
 def test_the_margin_adds_up_violations_and_is_never_negative():
-    step = jax.jit(learner(margin_lr=0.1)[0])
+    step = learner(margin_lr=0.1)
     margin, seen = START, []
     for violation in (0.1, 0.2, -0.1, -0.3, -0.2, 0.1):
         _, margin, metrics = step(violation, margin)
@@ -201,9 +214,9 @@ def test_the_margin_adds_up_violations_and_is_never_negative():
 
 
 def test_the_margin_is_bounded_by_what_a_step_can_promise():
-    step, batch, cfg = learner(margin_max=1.5)
-    _, margin, metrics = jax.jit(step)(9.0, START)
-    actor, unravel = ravel_pytree(init_params(KEYS[0], 3, 2, cfg)["actor"])
+    cfg, (actor, batch) = CPOConfig(hidden=(8,)), problem()
+    _, margin, metrics = learner(margin_max=1.5)(9.0, START)
+    actor, unravel = ravel_pytree(actor)
 
     def divergence(params):
         return mean_kl(batch.old, policy(unravel(params), batch.obs, cfg), None)
@@ -219,9 +232,7 @@ def test_the_margin_is_bounded_by_what_a_step_can_promise():
 
 
 def test_a_margin_counts_as_violation_and_without_its_rate_there_is_none():
-    plain_step, with_margin = (
-        jax.jit(learner(margin_lr=lr, violation_gain=1.0)[0]) for lr in (0.0, 0.5)
-    )
+    plain_step, with_margin = (learner(margin_lr=lr, violation_gain=1.0) for lr in (0.0, 0.5))
     assert plain_step(0.02, START)[1] == START
     for violation in (0.02, -0.02):
         after, margin, _ = with_margin(violation, Margin(jnp.float32(0.03)))
@@ -234,7 +245,7 @@ def test_a_margin_counts_as_violation_and_without_its_rate_there_is_none():
 
 def test_a_gain_multiplies_the_violation_and_not_the_margin():
     plain_step, with_gain = (
-        jax.jit(learner(margin_lr=lr, violation_gain=gain)[0]) for lr, gain in ((0.0, 1.0), (0.5, 4.0))
+        learner(margin_lr=lr, violation_gain=gain) for lr, gain in ((0.0, 1.0), (0.5, 4.0))
     )
     for violation in (2**-8, -(2**-8)):
         after, margin, metrics = with_gain(violation, Margin(jnp.float32(2**-7)))
@@ -245,19 +256,27 @@ def test_a_gain_multiplies_the_violation_and_not_the_margin():
 
 
 def test_a_violation_per_episode_leaves_nothing_between_all_reward_and_all_cost():
-    step = jax.jit(learner(per_step=False, margin_lr=0.0)[0])
+    step = learner(per_step=False, margin_lr=0.0)
     for violation, case in ((-0.02, FREE), (0.02, RECOVER)):
         _, _, metrics = step(violation, START)
         assert metrics["train/case"] == case
         assert metrics["train/violation"] == np.float32(violation) * LENGTH
 
 
+@partial(jax.jit, compiler_options=FAST)
+def on_two_devices(cfg, actor, violation, halves):
+    def on_one(half):
+        return moved(cfg, actor, violation, START, half, "devices")
+
+    return jax.vmap(on_one, axis_name="devices")(halves)
+
+
 @pytest.mark.parametrize(
     "violation, case", [(-9.0, FREE), (-0.02, BOUNDED), (0.02, RETURN), (9.0, RECOVER)]
 )
 def test_a_step_keeps_its_promises_and_two_devices_take_it_as_one(violation, case):
-    step, batch, cfg = learner(violation_gain=1.0)
-    after, _, metrics = jax.jit(step)(violation, START, batch)
+    cfg, (actor, batch) = CPOConfig(hidden=(8,), violation_gain=1.0), problem()
+    after, _, metrics = one_step(cfg, actor, jnp.float32(violation), START, batch)
     m = {name.removeprefix("train/"): float(x) for name, x in metrics.items()}
     assert m["case"] == case and m["accepted"] == 1 and m["nonfinite"] == 0
     assert 0.002 < m["kl"] <= cfg.target_kl and max(m["cg_residual_r"], m["cg_residual_c"]) < 0.01
@@ -266,9 +285,7 @@ def test_a_step_keeps_its_promises_and_two_devices_take_it_as_one(violation, cas
     assert m["objective_c"] < 0 or case in (FREE, BOUNDED)
 
     halves = jax.tree.map(lambda x: x.reshape(2, 128, *x.shape[1:]), batch)
-    parts, _, _ = jax.jit(
-        jax.vmap(lambda half: step(violation, START, half, "devices"), axis_name="devices")
-    )(halves)
+    parts, _, _ = on_two_devices(cfg, actor, jnp.float32(violation), halves)
     for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(parts), strict=True):
         np.testing.assert_allclose(b[0], b[1], rtol=1e-6)
         np.testing.assert_allclose(a, b[0], rtol=1e-3, atol=1e-4)

@@ -1,10 +1,12 @@
 import dataclasses
+from functools import cache, partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from tasks import FAST
 from toys import context
 
 from jaxsafe.algos.ppo import PPOConfig
@@ -17,28 +19,36 @@ from jaxsafe.nn.networks import init_params, policy, value
 SMALL: dict[str, Any] = {"hidden": (8,), "num_envs": 8, "horizon": 8, "minibatches": 4}
 
 
-def problem(cfg, seed=0, size=64):
-    """A policy, a batch of its actions, and the objective of earning more for large actions."""
-    keys = jax.random.split(jax.random.key(seed), 3)
+@cache
+def problem(size=64):
+    """A policy, and a batch of its actions."""
+    cfg = PPOConfig(**SMALL)
+    keys = jax.random.split(jax.random.key(0), 3)
     params = init_params(keys[0], 3, 2, cfg)
     obs = jax.random.normal(keys[1], (size, 3))
     old = policy(params["actor"], obs, cfg)
     action = sample(old, keys[2])
     adv = action.sum(-1)
-    batch = Batch(obs, action, log_prob(old, action), old, adv, -adv, adv, obs[:, 0])
-
-    def objective(actor, batch):
-        return clipped(policy(actor, batch.obs, cfg), batch, batch.adv_r, cfg)
-
-    return params, batch, objective
+    return params, Batch(obs, action, log_prob(old, action), old, adv, -adv, adv, obs[:, 0])
 
 
-def improve(cfg, objective=None, seed=0, iteration=0):
-    params, batch, default = problem(cfg, seed)
+def earn(actor, batch, cfg):
+    """The objective of earning more for large actions."""
+    return clipped(policy(actor, batch.obs, cfg), batch, batch.adv_r, cfg)
+
+
+def moved(actor, state, batch, cfg, objective=earn, iteration=0, axis_name=None):
+    told = context(cfg, iteration=iteration, axis_name=axis_name)
+    return adam_epochs.update(actor, state, partial(objective, cfg=cfg), batch, told)
+
+
+step = jax.jit(moved, static_argnames=("objective", "axis_name"), compiler_options=FAST)
+
+
+def improve(cfg, objective=earn, iteration=0):
+    params, batch = problem()
     state = adam_epochs.init(params["actor"], cfg)
-    actor, _, metrics = adam_epochs.update(
-        params["actor"], state, objective or default, batch, context(cfg, iteration=iteration)
-    )
+    actor, _, metrics = step(params["actor"], state, batch, cfg, objective, iteration)
     return params["actor"], actor, metrics
 
 
@@ -79,9 +89,11 @@ def test_the_learning_rate_falls_to_zero_at_the_last_iteration():
 def test_steps_with_gradients_that_are_not_finite_are_skipped_and_counted():
     cfg = PPOConfig(**SMALL)
 
-    def broken(actor, batch):
-        bad = jnp.isin(batch.obs[:, 0], problem(cfg)[1].obs[:1, 0]).any()  # one minibatch of a pass
-        return jnp.where(bad, jnp.nan, 1.0) * problem(cfg)[2](actor, batch)[0], {}
+    first = problem()[1].obs[0, 0].item()
+
+    def broken(actor, batch, cfg):
+        bad = (batch.obs[:, 0] == first).any()  # one minibatch of a pass
+        return jnp.where(bad, jnp.nan, 1.0) * earn(actor, batch, cfg)[0], {}
 
     before, after, metrics = improve(cfg, broken)
     assert metrics["train/nonfinite"] == cfg.epochs
@@ -91,24 +103,25 @@ def test_steps_with_gradients_that_are_not_finite_are_skipped_and_counted():
 
 def test_two_devices_take_the_step_of_one():
     cfg = dataclasses.replace(PPOConfig(**SMALL, lr=1e-2), minibatches=1)
-    params, batch, objective = problem(cfg)
-    args = (params["actor"], adam_epochs.init(params["actor"], cfg), objective)
-    whole = adam_epochs.update(*args, batch, context(cfg))
+    params, batch = problem()
+    args = (params["actor"], adam_epochs.init(params["actor"], cfg))
+    whole = step(*args, batch, cfg)
     halves = jax.tree.map(lambda x: x.reshape(2, -1, *x.shape[1:]), batch)
-    parts = jax.vmap(
-        lambda half: adam_epochs.update(*args, half, context(cfg, axis_name="devices")),
-        axis_name="devices",
-    )(halves)
+    on_two = jax.vmap(lambda half: moved(*args, half, cfg, axis_name="devices"), axis_name="devices")
+    parts = jax.jit(on_two, compiler_options=FAST)(halves)
     for a, b in zip(jax.tree.leaves(whole), jax.tree.leaves(parts), strict=True):
         np.testing.assert_allclose(b[0], b[1], rtol=1e-6)
         np.testing.assert_allclose(a, b[0], rtol=1e-3, atol=1e-5)
 
 
+fit_jitted = jax.jit(fit_critic, static_argnums=7, compiler_options=FAST)
+
+
 def test_a_critic_learns_its_targets():
     cfg = PPOConfig(**SMALL, critic_epochs=200, critic_lr=1e-2, critic_norm_coef=0.0)
-    params, batch, _ = problem(cfg)
+    params, batch = problem()
     state = adam(cfg.critic_lr, cfg).init(params["critic_c"])
-    critic, _, error, skipped = fit_critic(
+    critic, _, error, skipped = fit_jitted(
         params["critic_c"], state, batch.obs, batch.ret_c, 200, jax.random.key(0), cfg, None
     )
     assert error < 0.01 and skipped == 0
@@ -117,15 +130,17 @@ def test_a_critic_learns_its_targets():
 
 def test_passes_of_a_critic_beyond_those_that_count_change_nothing():
     cfg = PPOConfig(**SMALL, critic_epochs=5)
-    params, batch, _ = problem(cfg)
+    params, batch = problem()
     start = params["critic_c"], adam(cfg.critic_lr, cfg).init(params["critic_c"])
 
     def fit(passes, cfg):
         arrays = batch.obs, batch.ret_c, passes, jax.random.key(0)
-        return fit_critic(*start, *arrays, cfg, None)[:2]
+        return fit_jitted(*start, *arrays, cfg, None)[:2]
 
     for passes in (0, 2, 5):
-        few = fit(passes, dataclasses.replace(cfg, critic_epochs=passes)) if passes else start
+        few = (
+            fit(jnp.int32(passes), dataclasses.replace(cfg, critic_epochs=passes)) if passes else start
+        )
         for a, b in zip(*map(jax.tree.leaves, (fit(jnp.int32(passes), cfg), few)), strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-6)
 
@@ -135,7 +150,7 @@ def test_passes_of_a_critic_beyond_those_that_count_change_nothing():
 )
 def test_the_clipped_surrogate_by_hand(w, advantage, expected):
     cfg = PPOConfig(**SMALL, clip=0.2)
-    params, batch, _ = problem(cfg, size=1)
+    params, batch = problem(size=1)
     batch = dataclasses.replace(batch, log_prob=batch.log_prob - jnp.log(w))
     adv = jnp.array([advantage], jnp.float32)
     objective, metrics = clipped(policy(params["actor"], batch.obs, cfg), batch, adv, cfg)
@@ -149,7 +164,7 @@ def test_the_clipped_surrogate_by_hand(w, advantage, expected):
 )
 def test_the_entropy_bonus_by_hand(iteration, decay, share):
     cfg = PPOConfig(**SMALL, entropy_coef=0.2, entropy_decay=decay, total_iterations=10.0)
-    params, batch, _ = problem(cfg)
+    params, batch = problem()
 
     def bonus(log_std):
         dist = policy(params["actor"] | {"log_std": log_std}, batch.obs, cfg)

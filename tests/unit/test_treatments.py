@@ -3,11 +3,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsafe.algos.cppo_pid import CPPOPIDConfig
-from jaxsafe.algos.crpo import CRPOConfig
-from jaxsafe.algos.ipo import IPOConfig
-from jaxsafe.algos.ppo_lag import PPOLagConfig
-from jaxsafe.algos.ppo_penalty import PPOPenaltyConfig
+from jaxsafe.algos.ppo import CPPOPIDConfig, IPOConfig, PPOLagConfig, PPOPenaltyConfig
+from jaxsafe.algos.trpo import CRPOConfig
 from jaxsafe.learn.treatments import barrier, lagrangian, none, penalty, pid, switch
 
 

@@ -1,8 +1,11 @@
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
+from tasks import FAST
 from toys import context
 
 from jaxsafe.algos.cpo import CPOConfig
@@ -25,13 +28,17 @@ def spd(rng, n):
     return root @ root.T / n + 0.1 * np.eye(n)
 
 
+@partial(jax.jit, static_argnums=2)
+def solve(a, b, iterations):
+    return conjugate_gradient(lambda v: a @ v, b, iterations)
+
+
 @pytest.mark.parametrize("n", [1, 4, 12])
 @pytest.mark.parametrize("scale", [1e-8, 1.0, 1e6])
 def test_conjugate_gradients_solve_as_numpy_does(n, scale):
     rng = np.random.default_rng(n)
     a, b = spd(rng, n), scale * rng.standard_normal(n)
-    matrix = jnp.array(a, jnp.float32)
-    x, residual = conjugate_gradient(lambda v: matrix @ v, jnp.array(b, jnp.float32), 40)
+    x, residual = solve(jnp.array(a, jnp.float32), jnp.array(b, jnp.float32), 40)
     np.testing.assert_allclose(x / scale, np.linalg.solve(a, b) / scale, rtol=2e-3, atol=1e-4)
     assert residual < 1e-4
 
@@ -40,13 +47,13 @@ def test_the_residual_reported_is_the_residual_left():
     rng = np.random.default_rng(0)
     a, b = jnp.array(spd(rng, 30), jnp.float32), jnp.array(rng.standard_normal(30), jnp.float32)
     for iterations in (0, 3, 8):
-        x, residual = conjugate_gradient(lambda v: a @ v, b, iterations)
+        x, residual = solve(a, b, iterations)
         left = jnp.linalg.norm(b - a @ x) / jnp.linalg.norm(b)
         np.testing.assert_allclose(residual, left, rtol=1e-2)
 
 
 def test_no_gradient_gives_no_direction():
-    x, residual = conjugate_gradient(lambda v: 2 * v, jnp.zeros(3), 15)
+    x, residual = solve(2 * jnp.eye(3), jnp.zeros(3), 15)
     assert not x.any() and residual == 0
 
 
@@ -83,7 +90,7 @@ def test_a_kl_per_action_is_half_the_kl_of_two_actions():
         def objective(actor, batch):
             return plain(policy(actor, batch.obs, cfg), batch, batch.adv_r, cfg)
 
-        update = jax.jit(trust_region.update, static_argnums=2)
+        update = jax.jit(trust_region.update, static_argnums=2, compiler_options=FAST)
         return update(actor, (), objective, batch, context(cfg))
 
     mean, _, metrics = step(target_kl=0.01, damping=0.1, kl_per_action=True)
@@ -94,10 +101,15 @@ def test_a_kl_per_action_is_half_the_kl_of_two_actions():
     np.testing.assert_allclose(twice["train/kl"], 2 * metrics["train/kl"], rtol=1e-3)
 
 
+@jax.jit
+def search_below(bound):
+    start, step = jnp.array([2.0]), jnp.array([1.0])
+    return line_search(lambda x: x[0] - 2.0 <= bound, start, step, 5, 0.5)
+
+
 @pytest.mark.parametrize("bound, index", [(1.0, 0), (0.5, 1), (0.2, 3), (0.0, 5)])
 def test_the_line_search_takes_the_first_step_that_is_accepted(bound, index):
-    start, step = jnp.array([2.0]), jnp.array([1.0])
-    x, accepted, i = line_search(lambda x: x[0] - 2.0 <= bound, start, step, 5, 0.5)
+    x, accepted, i = search_below(bound)
     assert i == index and accepted == (index < 5)
     assert x[0] == 2.0 + (0.5**index if accepted else 0.0)
 
@@ -108,8 +120,13 @@ def test_the_line_search_stays_where_it_is_when_nothing_is_finite():
 
 
 def natural(step, **options):
-    """A policy, the flat step taken, its gradient and Fisher matrix (dense), and the metrics."""
+    """The flat step taken, its gradient and Fisher matrix (dense), the metrics, and the config."""
     cfg = TRPOConfig(hidden=(4,), cg_iterations=60, **options)
+    return *taken(step, cfg), cfg
+
+
+@partial(jax.jit, static_argnums=0, compiler_options=FAST)
+def taken(step, cfg):
     keys = jax.random.split(jax.random.key(0), 3)
     actor = init_params(keys[0], 3, 2, cfg)["actor"]
     obs = jax.random.normal(keys[1], (256, 3))
@@ -125,7 +142,7 @@ def natural(step, **options):
     start, unravel = ravel_pytree(actor)
     g = jax.grad(lambda x: objective(unravel(x), batch)[0])(start)
     hessian = jax.hessian(lambda x: kl(old, policy(unravel(x), obs, cfg)).mean())(start)
-    return ravel_pytree(after)[0] - start, g, hessian + cfg.damping * jnp.eye(len(g)), metrics, cfg
+    return ravel_pytree(after)[0] - start, g, hessian + cfg.damping * jnp.eye(len(g)), metrics
 
 
 def test_the_natural_gradient_is_numpys_and_as_long_as_the_trust_region():

@@ -1,0 +1,333 @@
+"""Write the tables and figures that are made from measurements: python docs/measured.py
+
+Those of docs/results come from its studies (see jaxsafe/report/studies.py), those on speed from
+docs/data. Each table stands between <!-- measured: NAME --> and <!-- end -->.
+"""
+
+import csv
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from jaxsafe.report import plots, stats, studies
+from jaxsafe.report.group import Group, group, ordered
+from jaxsafe.report.published import beside, read_published
+from jaxsafe.report.read import Run, read
+from jaxsafe.report.tables import between_marks, cell
+
+HERE = Path(__file__).parent
+RESULTS, DATA = HERE / "results", HERE / "data"
+STUDIES = sorted(RESULTS.glob("*/study.yaml"))
+TABLE = ("goal", "button", "push")  # the studies that together are the table of results
+EXTRA = ("crpo", "ipo", "pdo", "ppo_penalty")  # trained on two tasks alone, so in no table of ten
+# OmniSafe: evaluated policies. We know of no constrained table of Push.
+PUBLISHED = read_published(RESULTS / "published.csv")
+SWEEP = "jaxsafe, and dynamics"  # `solver` of the rows that are compared with each other
+# Why cells lie outside the published spread, by algorithm, or of one task alone.
+FIRST = "first-order learners earn less there (see below)"
+SAMPLED = "sampled actions while training; the final policy is within"
+BUTTON = "not known; unconstrained learners earn up to 3 more here on Button, and cost less on Car's"
+PRICE = "OmniSafe's conventions, which make up most of it on Goal 1 (see below)"
+UNSAFE = "at these settings nobody earns on Button: theirs lose 0.6 to 3.1, ours 1.3 at most"
+WHOLE = "training ends an episode once its cost exceeds the limit; their evaluation, once it reaches it"
+BUTTONS = [f"{robot}_button{level}" for robot in ("point", "car") for level in (1, 2)]
+REASONS = {
+    "cpo": "here the cost is [held at the limit](margin/README.md), there it stays above",
+    "pcpo": "there the reward's step lacks H^-1; here the cost [comes down](margin/README.md)",
+    "cppo_pid": FIRST,
+    "p3o": f"{FIRST}, and little of that is the penalty per episode",
+    "ppo_saute": FIRST,
+    "ppo_simmer_pid": FIRST,
+    "ppo_early_terminated": WHOLE,
+    "trpo_early_terminated": WHOLE,
+    "trpo": SAMPLED,
+    "npg": SAMPLED,
+    "trpo_lag": PRICE,
+    "trpo_pid": PRICE,
+    "focops": "its multiplier is at its bound of 2 (`algo.lam_max`)",
+    "pg": "a slip there: their training curve costs 58",
+    "cup": FIRST,
+    "car_goal1 rcpo": "the crest of a swing of 4 million steps: the last 40% make 21.3 at a cost of 25",
+    "point_button2 rcpo": "within their training curve; the policies of their table cost 45",
+    "car_button1 trpo_lag": "here as their curve, which is that of RCPO, too: 0.7 at cost 23",
+    "car_goal1 trpo_lag": "here above their curve, which is that of RCPO, too: 21.8 at cost 24",
+    "car_goal2 trpo_lag": "sampled actions while training; the final policy is within, as theirs",
+    "car_button1 trpo_pid": "within their training curve",
+    "car_goal2 ppo_saute": "few seeds: the interval is 25 to 35",
+    "car_goal2 ppo_simmer_pid": "few seeds",
+}
+REASONS |= {f"{task} {algo}": BUTTON for task in BUTTONS for algo in ("npg", "trpo")}
+REASONS |= {
+    f"{task} {algo}_{kind}": UNSAFE
+    for task in BUTTONS
+    for algo in ("ppo", "trpo")
+    for kind in ("saute", "simmer_pid")
+}
+# Where a run's evaluation.json was not kept: what its command printed.
+PRINTED = {
+    "point_goal1-ppo_lag": "19.21 [15.68, 21.97], cost 22.91 [18.99, 27.05]",
+    "point_goal1-cpo": "20.34 [18.71, 21.86], cost 19.24 [14.78, 23.79]",
+    "point_goal1-cpo-published": "22.64 and 21.11, cost 26.75 and 38.90",  # a command a seed
+}
+
+
+def beyond(value: float, spread: tuple[float, float]) -> float:
+    """By how much `value` is outside mean ± spread; 0 within."""
+    mean, width = spread
+    return float(np.sign(value - mean) * max(0.0, abs(value - mean) - width))
+
+
+def outside(groups: Sequence[Group]) -> str:
+    """The cells whose mean lies outside the published spread, the published training curve, and why."""
+    with (RESULTS / "published_curves.csv").open() as file:
+        curves = {(r["env"], r["algo"]): (r["return"], r["cost"]) for r in csv.DictReader(file)}
+    lines, within, count = ["| run | return | cost | ours | their curve | why |"], 0, 0
+    lines.append("|---|---:|---:|---:|---:|---|")
+    for g in sorted(groups, key=lambda g: (g.name, g.env)):
+        if theirs := beside(g, PUBLISHED):
+            off = beyond(g.ret.mean, theirs.ret), beyond(g.cost.mean, theirs.cost)
+            count, within = count + 1, within + (not any(off))
+            if any(off):
+                figures = (f"{x:+.2g}" if x else "" for x in off)
+                why = REASONS.get(f"{g.env} {g.name}") or REASONS[g.name]
+                ours = f"{g.ret.mean:.1f}, {g.cost.mean:.0f}"
+                curve = ", ".join(x or "-" for x in curves.get((g.env, g.name), ()))
+                lines.append(
+                    f"| `{g.env}` `{g.name}` | {' | '.join(figures)} | {ours} | {curve} | {why} |"
+                )
+    summary = f"{within} of {count} cells lie within the published spreads in both."
+    return "\n".join([summary, "", *lines])
+
+
+def held(groups: Sequence[Group]) -> str:
+    """How many constrained cells cost at most 1.2 times the limit, ours in training and published."""
+    free = {"pg", "npg", "trpo", "ppo"}
+    cells = [(g, beside(g, PUBLISHED)) for g in groups if g.name not in free]
+    kept = [theirs for g, theirs in cells if g.cost.mean <= 30]
+    costs = [theirs.cost[0] for _, theirs in cells if theirs]
+    return (
+        f"While training ours cost at most 30, a fifth over the limit, in {len(kept)} of {len(cells)} "
+        f"constrained cells; of the {len(costs)} with a published figure ours do in "
+        f"{sum(map(bool, kept))}, OmniSafe's evaluated policies in {sum(c <= 30 for c in costs)}."
+    )
+
+
+def conventions(ours: Sequence[Group], theirs: Sequence[Group]) -> str:
+    """Return and cost of the same runs without and with `compat=omnisafe`, and OmniSafe's."""
+    usual = {(g.env, g.name): g for g in ours}
+    lines = ["| | `compat=none` | `compat=omnisafe` | OmniSafe |", "|---|---:|---:|---:|"]
+    for g in sorted(theirs, key=lambda g: (g.name, g.env)):
+        known = PUBLISHED[(g.env, g.name)]
+        cells = [f"{x.ret.mean:.1f}, {x.cost.mean:.1f}" for x in (usual[(g.env, g.name)], g)]
+        cells.append("{:.1f} ± {:.1f}, {:.1f} ± {:.1f}".format(*known.ret, *known.cost))
+        lines.append(f"| `{g.env}` `{g.name}` | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def benchmark_rows(file: str) -> list[dict]:
+    return [json.loads(line) for line in (DATA / file).read_text().splitlines()]
+
+
+def latest(rows: Sequence[dict], *keys: str) -> dict[tuple, dict]:
+    """Of rows that were measured again, the last, by the values of `keys`."""
+    return {tuple(row[key] for key in keys): row for row in rows if all(key in row for key in keys)}
+
+
+def whole_sweep(row: dict) -> bool:
+    """Of settled environments with random actions on one H200, from when all sizes were measured."""
+    return row["algo"] is None and bool(row.get("warmup")) and row.get("solver") == SWEEP
+
+
+def throughput_table() -> str:
+    """Thousands of environment steps a second on one H200, by task and number of environments."""
+    rows = filter(whole_sweep, benchmark_rows("benchmark_h200.jsonl"))
+    found = latest(list(rows), "env", "num_envs")
+    tasks = {env for env, _ in found}
+    sizes = sorted(
+        size for size in {size for _, size in found} if all((env, size) in found for env in tasks)
+    )
+    lines = ["| environments |" + "".join(f" {size:,} |" for size in sizes)]
+    lines.append("|---|" + "---:|" * len(sizes))
+    for env in sorted({env for env, _ in found}):
+        cells = (found.get((env, size)) for size in sizes)
+        texts = (f"{row['env_steps_per_s'] / 1e3:,.0f}" if row else "" for row in cells)
+        lines.append(f"| {env} | {' | '.join(texts)} |")
+    largest = [row for (_, size), row in sorted(found.items()) if size == sizes[-1]]
+    memory = (f"{row['env']} {row['memory_bytes'] / 2**30:.1f}" for row in largest)
+    lines += ["", f"Memory with {sizes[-1]:,}, GiB: {', '.join(memory)}."]
+    return "\n".join(lines)
+
+
+def engine_jax() -> str:
+    """Environment steps a second of engine jax, with MJX's solver and with ours."""
+    lines = [
+        "| | device | environments | MJX's solver | ours | compiled in, s |",
+        "|---|---|---:|---:|---:|---:|",
+    ]
+    files = ("benchmark_h200.jsonl", "benchmark_cpu.jsonl")
+    rows = [r for file in files for r in benchmark_rows(file) if r.get("engine") == "jax"]
+    key = ("env", "device", "num_envs")
+    theirs = latest([r for r in rows if r["solver"].startswith("MJX")], *key)
+    for (env, device, size), r in sorted(latest(rows, *key).items()):
+        before = theirs.get((env, device, size))
+        shown = f"{before['env_steps_per_s']:,.0f}" if before else ""
+        cells = f"{size:,} | {shown} | {r['env_steps_per_s']:,.0f} | {r['compile_s']:.0f}"
+        lines.append(f"| {env} | {device} | {cells} |")
+    return "\n".join(lines)
+
+
+def algorithm_speeds() -> str:
+    """Environment steps a second of every algorithm's training, 16 seeds, and of PPO-Lagrangian's."""
+    rows = [r for r in benchmark_rows("benchmark_h200.jsonl") if r["algo"] and "peer" not in r]
+    rows = [r for r in rows if "xla_flags" not in r]  # without its tuning the learner is half as fast
+    shape = {"env": "point_goal1", "num_seeds": 16, "num_envs": 512, "horizon": 40}
+    rows = [r for r in rows if r.get("warmup") and all(r[k] == v for k, v in shape.items())]
+    found = latest(rows, "algo")
+    beside = found[("ppo_lag",)]["env_steps_per_s"]
+    lines = ["| | steps/s | slowest, fastest run | of `ppo_lag` |", "|---|---:|---:|---:|"]
+    for (algo,), r in sorted(found.items()):
+        rate = r["env_steps_per_s"]
+        ends = f"{r['slowest']:,.0f}, {r['fastest']:,.0f}"
+        lines.append(f"| `{algo}` | {rate:,.0f} | {ends} | {rate / beside:.2f} |")
+    return "\n".join(lines)
+
+
+def throughput(path: Path) -> None:
+    """Environment steps a second, random actions, against the number of environments; on the GPU those
+    of settled environments."""
+    figure, axes = plt.subplots(figsize=(7, 4.5))
+    for file, style in (("benchmark_h200.jsonl", "o-"), ("benchmark_cpu.jsonl", "s--")):
+        found: dict[str, dict[int, float]] = {}
+        for row in benchmark_rows(file):
+            whole = "peer" in row or ("cpu" in file and row["engine"] == "c") or whole_sweep(row)
+            if row["algo"] is None and whole:
+                what = f"{row['peer']}: {row['env']}" if "peer" in row else row["env"]
+                points = found.setdefault(what, {})
+                points[row["num_envs"]] = row["env_steps_per_s"]  # the last, if measured again
+        device = "H200" if "h200" in file else "2 CPU cores"
+        for env, points in sorted(found.items()):
+            axes.loglog(*zip(*sorted(points.items()), strict=True), style, label=f"{env}, {device}")
+    axes.set_xlabel("environments")
+    axes.set_ylabel("environment steps / s")
+    axes.grid(True, which="both", alpha=0.3)
+    axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5))
+    figure.savefig(path, dpi=130, bbox_inches="tight", metadata={"Software": None})
+    plt.close(figure)
+
+
+def gains(algorithms: Sequence[str], tasks: Sequence[str], window: tuple[float, float]) -> str:
+    """Return, cost and its swing by the settings of the margin, between two counts of steps.
+
+    The swing is the standard deviation of means over 20 iterations, for each seed, and then its mean.
+    """
+    names = [f"algo.{name}" for name in ("violation_gain", "margin_lr", "margin_max")]
+    settings: dict[tuple, dict[str, Run]] = {}
+    for run in read([RESULTS / "margin"]):
+        algo = run.config["algo.name"]
+        known = np.isfinite(run.values.get(f"return {studies.window_name(*window)}", np.nan)).all()
+        if algo in algorithms and run.env in tasks and known:
+            key = (algo, *(run.config[name] for name in names))
+            settings.setdefault(key, {})[run.env] = run
+    lines = [f"| | gain | rate | bound | {' | '.join(tasks)} |"]
+    lines.append("|---|---:|---:|---:|" + "---:|" * len(tasks))
+    for (algo, gain, rate, most), by_task in sorted(settings.items(), key=lambda item: item[0]):
+        cells = []
+        for run in map(by_task.get, tasks):
+            what = (f"{k} {studies.window_name(*window)}" for k in ("return", "cost", "swing"))
+            cells.append(
+                "{:.1f}, {:.1f} ± {:.1f}".format(*(run.values[k].mean() for k in what)) if run else ""
+            )
+        bound = "none" if most == float("inf") else f"{most:g}"
+        lines.append(f"| `{algo}` | {gain:g} | {rate:g} | {bound} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def kept(runs: Sequence[Run]) -> str:
+    """How much of the cost that CPO's steps promise to take off comes true, on Goal and Button."""
+    found = [run for run in runs if run.config["algo.name"] == "cpo" and "push" not in run.env]
+    promised = np.concatenate([run.values["promised"] for run in found])
+    shares = [run.values["kept"].mean() for run in found]
+    mean, least, most = (100 * f(shares) for f in (np.mean, min, max))
+    return (
+        f"A step promises {promised.min():.2f} to {promised.max():.2f} less cost a step, of which "
+        f"{mean:.1f}% come true ({least:.1f} to {most:.1f}% by task)."
+    )
+
+
+def attempts() -> str:
+    """What was tried on point_goal1 before the defaults of today, over whole trainings."""
+    lines = ["| run | environments x steps | seeds | return | cost |", "|---|---|---:|---:|---:|"]
+    for run in read([RESULTS / "first_attempts"]):
+        whole = run.steps >= run.config["total_steps"] and run.env == "point_goal1"
+        if whole and run.config["algo.name"] != "trpo_pid":
+            names = {"cpo": ("margin_lr", "target_kl"), "ppo_lag": ("dual_lr",)}
+            algo = run.config["algo.name"]
+            options = "".join(f", `{k}={run.config[f'algo.{k}']:g}`" for k in names[algo])
+            shape = f"{run.config['algo.num_envs']} x {run.config['algo.horizon']}"
+            ret, cost = (cell(stats.estimate(run.values[k]), ".2f") for k in ("return", "cost"))
+            lines.append(f"| `{algo}`{options} | {shape} | {len(run.seeds)} | {ret} | {cost} |")
+    return "\n".join(lines)
+
+
+def devices() -> str:
+    """The same training on one, two and four GPUs."""
+    lines = ["| GPUs | environments of a seed | estimated return | estimated cost | seconds |"]
+    lines.append("|---:|---:|---:|---:|---:|")
+    for run in read([RESULTS / "devices"]):
+        found = (stats.estimate(run.values[f"{k} estimate"]) for k in ("return", "cost"))
+        shape = f"{run.config['devices']} | {run.config['algo.num_envs']:,}"
+        seconds = 60 * run.values["minutes"].max()
+        lines.append(f"| {shape} | {' | '.join(cell(x, '.1f') for x in found)} | {seconds:.1f} |")
+    return "\n".join(lines)
+
+
+def pages() -> dict[Path, str]:
+    """The text of every page with tables of measurements, by its path."""
+    runs = read([RESULTS / name for name in TABLE])
+    runs = [run for run in runs if run.config["algo.name"] not in EXTRA]
+    groups = ordered(group(runs, ["algo.name"]))
+    theirs = read([RESULTS / "omnisafe"])
+    theirs = [run for run in theirs if run.config["compat"] == "omnisafe"]
+    margin = ["car_goal2", "point_button1", "point_goal2"]
+    written = {
+        RESULTS / "README.md": {"matrix": studies.matrix(groups, {})},
+        RESULTS / "published.md": {"outside": outside(groups), "held": held(groups)},
+        RESULTS / "omnisafe" / "README.md": {
+            "conventions": conventions(groups, group(theirs, ["algo.name"]))
+        },
+        RESULTS / "margin" / "README.md": {
+            "kept": kept(runs),
+            "gains": gains(["cpo", "pcpo"], margin, (3e6, 5.4e6)),
+            "slow gains": gains(["pcpo"], ["car_button2", "point_goal2"], (9e6, 1.01e7)),
+        },
+        RESULTS / "first_attempts" / "README.md": {"attempts": attempts()},
+        RESULTS / "devices" / "README.md": {"devices": devices()},
+        HERE / "benchmark.md": {"speeds": algorithm_speeds()},
+        HERE / "performance.md": {"throughput": throughput_table(), "engine jax": engine_jax()},
+        HERE.parent / "README.md": {"results": studies.matrix(groups, PUBLISHED)},
+    }
+    found = {path.parent / "README.md": studies.page(studies.read(path.parent))[0] for path in STUDIES}
+    for path, parts in written.items():
+        found[path] = between_marks(found.get(path) or path.read_text(), parts, "measured")
+    return found
+
+
+def main() -> None:
+    throughput(HERE / "images" / "throughput.png")
+    for path in STUDIES:
+        studies.write_page(studies.read(path.parent))
+    runs = read([RESULTS / name for name in TABLE])
+    groups = ordered(group(runs, ["algo.name"]))
+    groups = [g for g in groups if g.name not in EXTRA]
+    published = {(g.env, g.name): beside(g, PUBLISHED) for g in groups}
+    picture = plots.trade_off(groups, "last 10 % of training", published)
+    studies.save_small(picture, RESULTS / "images" / "trade_off.png")
+    for path, text in pages().items():
+        path.write_text(text)
+
+
+if __name__ == "__main__":
+    main()

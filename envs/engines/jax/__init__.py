@@ -1,0 +1,1 @@
+"""Engine `jax`: MJX in plain JAX, with contacts and a constraint solver of our own."""

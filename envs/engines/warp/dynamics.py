@@ -1,0 +1,356 @@
+"""A physics step of engine `warp` in a dozen kernels, dynamics and Euler's step in one each.
+
+MuJoCo Warp takes some 50 kernels of a few microseconds each to get from positions and velocities to the
+forces without constraints, for robots of 4 to 30 bodies. Here that is one kernel, in which 8, 16 or 32
+threads share a world and keep what they compute in shared memory, and one more moves the state on.
+Between them collisions are MuJoCo Warp's, but for `pillars.py`. Plain constraint rows are MuJoCo Warp's
+too. The solver is `solver.py`.
+
+Of `Data` only what later kernels and this project read is written: no `qacc_smooth`, no parts of
+`qfrc_smooth`, no inertial frames, cameras, lights or energy. A pass whose sensors read more is MuJoCo
+Warp's. Forces are those of gravity, springs, dampers and actuators: `xfrc_applied` and `qfrc_applied`
+count nothing. The rates of axes in equalities are those of the state, as in MuJoCo; MuJoCo Warp's are
+of the state before.
+
+Source: MuJoCo's documentation, Computation; Featherstone (2008), Rigid Body Dynamics Algorithms.
+"""
+# Kernels are Warp's language in Python's syntax, which no type checker of Python knows:
+# pyright: reportIndexIssue=false, reportAssignmentType=false, reportGeneralTypeIssues=false
+# pyright: reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false
+# pyright: reportReturnType=false, reportInvalidTypeForm=false
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import warp as wp
+from mujoco.mjx.third_party import mujoco_warp
+from mujoco.mjx.third_party.mujoco_warp._src import collision_driver, sensor, smooth, types
+
+from jaxsafe.envs.engines.warp import pillars, solver
+from jaxsafe.envs.engines.warp.solver import THREADS, threads
+
+SHARED_MEMORY = 47 * 1024  # bytes of a block; Warp takes one more KiB
+vec10 = types.vec10
+HERE = Path(__file__)
+DYNAMICS, LANES, ADVANCE = (
+    HERE.with_name(f"{name}.cu").read_text() for name in ("dynamics", "lanes", "advance")
+)
+KINDS = ", ".join(f"{kind.name} = {int(kind)}" for kind in types.JointType)
+FULL = ", ".join(f"NO_{kind.name} = {int(kind)}" for kind in types.OverflowType)
+ENUMS = (
+    f"constexpr int {KINDS}, {FULL}, "
+    f"ON_SITE = {int(types.TrnType.SITE)}, AFFINE = {int(types.BiasType.AFFINE)};\n"
+)
+READABLE = [  # sensors that need nothing which is not written
+    getattr(types.SensorType, name)
+    for name in (
+        "TOUCH", "ACCELEROMETER", "VELOCIMETER", "GYRO", "FORCE", "TORQUE", "MAGNETOMETER",
+        "RANGEFINDER", "JOINTPOS", "JOINTVEL", "BALLQUAT", "BALLANGVEL", "JOINTLIMITPOS",
+        "JOINTLIMITVEL", "JOINTLIMITFRC", "GEOMDIST", "GEOMNORMAL", "GEOMFROMTO", "CONTACT", "CLOCK",
+    )
+]  # fmt: skip
+
+
+@wp.struct
+class System:
+    # the model
+    levels: int
+    body_level: wp.array[int]  # ours: how far from the world
+    body_end: wp.array[int]  # ours: after the last body that it carries
+    body_deepest: wp.array[int]  # ours: the last degree of freedom that moves it, or -1
+    body_parentid: wp.array[int]
+    body_rootid: wp.array[int]
+    body_mocapid: wp.array[int]
+    body_jntnum: wp.array[int]
+    body_jntadr: wp.array[int]
+    body_pos: wp.array2d[wp.vec3]
+    body_quat: wp.array2d[wp.quat]
+    body_ipos: wp.array2d[wp.vec3]
+    body_iquat: wp.array2d[wp.quat]
+    body_mass: wp.array2d[float]
+    body_inertia: wp.array2d[wp.vec3]
+    body_subtreemass: wp.array2d[float]
+    jnt_type: wp.array[int]
+    jnt_qposadr: wp.array[int]
+    jnt_dofadr: wp.array[int]
+    jnt_pos: wp.array2d[wp.vec3]
+    jnt_axis: wp.array2d[wp.vec3]
+    jnt_stiffness: wp.array2d[float]
+    qpos0: wp.array2d[float]
+    qpos_spring: wp.array2d[float]
+    dof_before: wp.array[int]  # ours: the last degree of freedom that moves its axis, or -1
+    dof_bodyid: wp.array[int]
+    dof_jntid: wp.array[int]
+    dof_parentid: wp.array[int]
+    dof_armature: wp.array2d[float]
+    dof_damping: wp.array2d[float]
+    M_rownnz: wp.array[int]
+    M_rowadr: wp.array[int]
+    begin: wp.array[int]  # where each row of M begins in `column` and `place`
+    column: wp.array[int]
+    place: wp.array[int]  # in M
+    geom_moves: wp.array[int]  # ours
+    geom_bodyid: wp.array[int]
+    geom_pos: wp.array2d[wp.vec3]
+    geom_quat: wp.array2d[wp.quat]
+    site_bodyid: wp.array[int]
+    site_pos: wp.array2d[wp.vec3]
+    site_quat: wp.array2d[wp.quat]
+    actuator_trntype: wp.array[int]
+    actuator_trnid: wp.array[wp.vec2i]
+    actuator_gear: wp.array2d[wp.spatial_vector]
+    actuator_gainprm: wp.array2d[vec10]
+    actuator_biastype: wp.array[int]
+    actuator_biasprm: wp.array2d[vec10]
+    actuator_ctrllimited: wp.array[bool]
+    actuator_ctrlrange: wp.array2d[wp.vec2]
+    actuator_forcelimited: wp.array[bool]
+    actuator_forcerange: wp.array2d[wp.vec2]
+    gravity: wp.array[wp.vec3]
+    timestep: wp.array[float]
+    # the worlds
+    qpos: wp.array2d[float]
+    qvel: wp.array2d[float]
+    ctrl: wp.array2d[float]
+    mocap_pos: wp.array2d[wp.vec3]
+    mocap_quat: wp.array2d[wp.quat]
+    xpos: wp.array2d[wp.vec3]
+    xquat: wp.array2d[wp.quat]
+    xmat: wp.array2d[wp.mat33]
+    geom_xpos: wp.array2d[wp.vec3]
+    geom_xmat: wp.array2d[wp.mat33]
+    site_xpos: wp.array2d[wp.vec3]
+    site_xmat: wp.array2d[wp.mat33]
+    subtree_com: wp.array2d[wp.vec3]
+    cinert: wp.array2d[vec10]
+    cvel: wp.array2d[wp.spatial_vector]
+    cdof: wp.array2d[wp.spatial_vector]
+    cdof_dot: wp.array2d[wp.spatial_vector]
+    M: wp.array2d[float]
+    qfrc_smooth: wp.array2d[float]
+    qacc: wp.array2d[float]
+    Ma: wp.array2d[float]
+    qacc_warmstart: wp.array2d[float]
+    time: wp.array[float]
+    nefc: wp.array[int]
+    nacon: wp.array[int]
+    ncollision: wp.array[int]
+    overflow: wp.array[int]
+    rows: int
+    contacts: int
+
+
+def shared_size(bodies: int, joints: int, dofs: int, actuators: int) -> int:
+    """Floats of a world in shared memory, which dynamics.cu divides up and holds to this."""
+    return 33 * bodies + 6 * joints + 13 * dofs + actuators
+
+
+@functools.cache
+def dynamics_kernel(
+    bodies: int, joints: int, dofs: int, actuators: int, lanes: int, worlds: int
+) -> Any:
+    sizes = (
+        f"BODIES = {bodies}, JOINTS = {joints}, DOFS = {dofs}, ACTUATORS = {actuators}, "
+        f"LANES = {lanes}, WORLDS = {worlds}, SHARED = {shared_size(bodies, joints, dofs, actuators)}"
+    )
+
+    @wp.func_native(f"constexpr int {sizes};\n{ENUMS}{DYNAMICS}")
+    def dynamics(p: System, for_sensors: bool, block: int, thread: int): ...
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def kernel(p: System, for_sensors: bool):
+        block, thread = wp.tid()
+        dynamics(p, for_sensors, block, thread)
+
+    return kernel
+
+
+@functools.cache
+def advance_kernel(nv: int, damped: bool, lanes: int) -> Any:
+    sizes = f"NV = {nv}, DAMPED = {int(damped)}, LANES = {lanes}"
+
+    @wp.func_native(f"constexpr int {sizes};\n{ENUMS}{LANES}{ADVANCE}")
+    def advance(p: System, world: int, lane: int): ...
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def kernel(p: System):
+        world, lane = wp.tid()
+        advance(p, world, lane)
+
+    return kernel
+
+
+@dataclasses.dataclass
+class Plan:
+    """Of the worlds of one `Data`."""
+
+    system: Any
+    sizes: tuple[int, int, int, int]  # bodies, joints, degrees of freedom, actuators
+    damped: bool
+    readable: bool  # whether its sensors need nothing else
+    pillars: pillars.Pillars | None
+
+
+def tree(model: mujoco.MjModel) -> dict[str, np.ndarray]:
+    """What dynamics.cu asks of the tree of bodies beyond MuJoCo's own fields."""
+    parent, bodies = model.body_parentid, range(1, model.nbody)
+    level, end = np.zeros(model.nbody, int), np.arange(model.nbody) + 1
+    deepest = np.full(model.nbody, -1)
+    for b in bodies:  # a parent comes before its children
+        level[b] = level[parent[b]] + 1
+        own = model.body_dofadr[b] + model.body_dofnum[b] - 1
+        deepest[b] = own if model.body_dofnum[b] else deepest[parent[b]]
+    for b in reversed(bodies):
+        end[parent[b]] = max(end[parent[b]], end[b])
+    first = model.jnt_dofadr[model.dof_jntid]
+    of_free = model.jnt_type[model.dof_jntid] == types.JointType.FREE
+    straight = of_free & (np.arange(model.nv) < first + 3)
+    before = np.where(of_free, first + 2, model.dof_parentid[first])
+    root = model.body_rootid[model.geom_bodyid]
+    moves = (model.body_weldid[model.geom_bodyid] != 0) | (model.body_mocapid[root] >= 0)
+    return {
+        "body_level": level,
+        "body_end": end,
+        "body_deepest": deepest,
+        "dof_before": np.where(straight, -1, before),
+        "geom_moves": moves,
+    }
+
+
+def sizes_of(model: mujoco.MjModel) -> tuple[int, int, int, int]:
+    """Bodies, joints, degrees of freedom, actuators."""
+    return model.nbody, model.njnt, model.nv, model.nu
+
+
+def uncovered(model: mujoco.MjModel, m: Any, d: Any) -> list[str]:
+    """What the kernels are not for, in a few words each: they are for Euler's integrator, motors on
+    joints and sites, linear springs and dampers, and what the solver is for."""
+    turns = np.isin(model.jnt_type, (types.JointType.FREE, types.JointType.BALL))
+    at = model.actuator_trnid[:, 0]
+    on_joint = model.actuator_trntype <= types.TrnType.JOINTINPARENT  # the same for hinges and slides
+    on_site = (model.actuator_trntype == types.TrnType.SITE) & (model.actuator_trnid[:, 1] < 0)
+    bias = model.actuator_biastype
+    motors = on_joint & ~turns[np.where(on_joint, at, 0)] & (bias <= types.BiasType.AFFINE)
+    thrusters = on_site & (bias == types.BiasType.NONE)
+    linear = (motors | thrusters).all() and (model.actuator_gaintype == types.GainType.FIXED).all()
+    shared = 4 * shared_size(*sizes_of(model)) * (THREADS // lanes_of(sizes_of(model)))
+    batched = [getattr(m, name) for name in System.vars if hasattr(m, name)] + [m.opt.gravity]
+    batched = [x for x in batched if x.ndim == 2 or x is m.opt.gravity]
+    stiff = m.jnt_stiffness.numpy()[0, turns].any()
+    found = {
+        "an integrator other than Euler": m.opt.integrator != types.IntegratorType.EULER,
+        "disabled features": m.opt.disableflags & ~int(types.DisableBit.SENSOR),
+        "enabled features": m.opt.enableflags,
+        "no collisions": not m.opt.run_collision_detection,
+        "sensors of forces between bodies": m.opt.run_rne_postconstraint,
+        "a fluid": m.has_fluid,
+        "tendons": model.ntendon,
+        "actuators with a state or a delay": model.na or m.nhistory or m.nactuator != model.nu,
+        "actuators that are no motors on joints or sites": not linear,
+        "limits on the forces of actuators at joints": m.jnt_actfrclimited.numpy().any(),
+        "compensated gravity": m.body_gravcomp.numpy().any(),
+        "springs of ball joints": stiff,
+        "springs or dampers that are not linear": (
+            m.jnt_stiffnesspoly.numpy().any() or m.dof_dampingpoly.numpy().any()
+        ),
+        "callbacks": any(vars(m.callback).values()),
+        "parameters that differ between worlds": any(x.shape[0] != 1 for x in batched),
+        f"{model.nbody} bodies": shared > SHARED_MEMORY,
+    }
+    return [*solver.uncovered(m, d), *(name for name, is_so in found.items() if is_so)]
+
+
+def adopt(model: mujoco.MjModel, m: Any, d: Any, upright: Sequence[str] = ()) -> bool:
+    """Have `step` and `forward` run `d` here, unless something is `uncovered`.
+
+    The solver may adopt `d` even so. The arrays of `m` and `d` are bound now, and options looked at:
+    later only what is written into these arrays counts, and flags of sensors, contacts and the solver.
+
+    Args:
+        model: what `m` and `d` were made of.
+        upright: the model's pillars, see `Simulation.pillars`.
+    """
+    solver.adopt(model, m, d)
+    if uncovered(model, m, d):
+        return False
+    p, extra = System(), tree(model)
+    for name, x in extra.items():
+        setattr(p, name, wp.array(x, dtype=int, device=d.qacc.device))
+    for name in System.vars:
+        for owner in (m, m.opt, d, d.efc):
+            if hasattr(owner, name):
+                setattr(p, name, getattr(owner, name))
+    p.levels = int(extra["body_level"].max()) + 1
+    p.begin, p.column, p.place = m.M_mulm_rowadr, m.M_mulm_col, m.M_mulm_madr
+    p.rows, p.contacts = d.njmax, d.naconmax
+    d.dynamics = Plan(
+        system=p,
+        sizes=sizes_of(model),
+        damped=bool(m.dof_damping.numpy().any()),
+        readable=bool(np.isin(model.sensor_type, READABLE).all()),
+        pillars=pillars.adopt(model, m, d, upright),
+    )
+    return True
+
+
+def lanes_of(sizes: tuple[int, ...]) -> int:
+    """Threads of a world: 8, 16 or 32, at least half of its bodies and of its degrees of freedom."""
+    lanes = 8
+    while lanes < THREADS and 2 * lanes < max(sizes):
+        lanes *= 2
+    return lanes
+
+
+def forward(m: Any, d: Any) -> None:
+    """In place of MuJoCo Warp's, for data that was adopted."""
+    plan = getattr(d, "dynamics", None)
+    sensors = not m.opt.disableflags & types.DisableBit.SENSOR
+    if plan is None or (sensors and not plan.readable):
+        mujoco_warp.forward(m, d)
+        return
+    lanes = min(threads(d), lanes_of(plan.sizes))
+    worlds = threads(d) // lanes  # of a block
+    wp.launch_tiled(
+        dynamics_kernel(*plan.sizes, lanes, worlds),
+        dim=-(-d.nworld // worlds),
+        inputs=[plan.system, sensors],
+        block_dim=threads(d),
+    )
+    collision_driver.collision(m, d)
+    if plan.pillars:
+        plan.pillars.contacts(d.nworld)
+    solver.make_constraint(m, d)
+    if sensors:
+        d.sensordata.zero_()
+        sensor.sensor_pos(m, d)
+        sensor.sensor_vel(m, d)
+    solver.solve(m, d)
+    if sensors:
+        if m.sensor_rne_postconstraint:
+            smooth.rne_postconstraint(m, d)
+        sensor.sensor_acc(m, d, skip_rne_postconstraint=True)
+
+
+def step(m: Any, d: Any) -> None:
+    """In place of MuJoCo Warp's, for data that was adopted."""
+    if getattr(d, "dynamics", None) is None:
+        mujoco_warp.step(m, d)
+        return
+    forward(m, d)
+    advance(m, d)
+
+
+def advance(m: Any, d: Any) -> None:
+    """Euler's step, from the accelerations of `forward`."""
+    plan = d.dynamics
+    wp.launch_tiled(
+        advance_kernel(m.nv, plan.damped, threads(d)),
+        dim=d.nworld,
+        inputs=[plan.system],
+        block_dim=threads(d),
+    )

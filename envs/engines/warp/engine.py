@@ -1,0 +1,275 @@
+"""Engine `warp`: MuJoCo Warp's kernels and ours, all substeps of a batch in one CUDA graph.
+
+MJX calls the same kernels one `mjx.step` at a time and passes all of `mjx.Data` through JAX. Here the
+working data stays in Warp: a step copies one packed row per world in, replays the graph, and copies
+one row out. Sensors are read in the last forward pass alone.
+
+Only `make_engine` imports this module, because it needs Warp.
+"""
+# Kernels are Warp's language in Python's syntax, which no type checker of Python knows:
+# pyright: reportIndexIssue=false, reportAssignmentType=false, reportGeneralTypeIssues=false
+# pyright: reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false
+
+import dataclasses
+import sys
+import threading
+from functools import partial
+from typing import Any
+
+import jax
+import mujoco
+import warp as wp
+from mujoco.mjx.third_party import mujoco_warp
+from mujoco.mjx.third_party.mujoco_warp._src import (
+    collision_primitive,
+    collision_primitive_core,
+    constraint,
+    solver,
+)
+
+from jaxsafe.envs.engines.batching import batched
+from jaxsafe.envs.engines.rows import STATE, columns, pack, unpack, widths
+from jaxsafe.envs.engines.simulation import Engine, Physics, Run, Simulation
+from jaxsafe.envs.engines.warp.dynamics import adopt, forward, step, uncovered
+from jaxsafe.envs.engines.warp.solver import make_constraint, solve
+
+wp.config.log_level = wp.LOG_WARNING  # a line for every kernel otherwise
+
+
+@wp.func
+def plane_capsule(
+    normal: wp.vec3,
+    plane_pos: wp.vec3,
+    pos: wp.vec3,
+    axis: wp.vec3,
+    radius: float,
+    half_length: float,
+) -> tuple[wp.vec2, collision_primitive_core.mat23f, wp.mat33]:
+    """Contacts of a capsule's two ends, with the frame of MuJoCo in C.
+
+    There the first tangent is the capsule's axis, however little of it lies in the plane. MuJoCo Warp
+    takes a fixed tangent once the axis is within 30 degrees of the normal; with pyramidal friction
+    cones the tangents matter, and Doggo's legs are mostly that upright.
+    """
+    tangent = wp.normalize(axis - normal * wp.dot(normal, axis))
+    if wp.length(tangent) < 0.5:
+        tangent = wp.vec3(1.0, 0.0, 0.0)
+    other = wp.cross(normal, tangent)
+    frame = wp.mat33(
+        normal[0], normal[1], normal[2],
+        tangent[0], tangent[1], tangent[2],
+        other[0], other[1], other[2],
+    )  # fmt: skip
+    end1, end2 = pos + axis * half_length, pos - axis * half_length
+    dist1 = wp.dot(end1 - plane_pos, normal) - radius
+    dist2 = wp.dot(end2 - plane_pos, normal) - radius
+    at1 = end1 - normal * (radius + 0.5 * dist1)
+    at2 = end2 - normal * (radius + 0.5 * dist2)
+    at = collision_primitive_core.mat23f(at1[0], at1[1], at1[2], at2[0], at2[1], at2[2])
+    return wp.vec2(dist1, dist2), at, frame
+
+
+# For all users of MuJoCo Warp in the process; before Warp compiles the kernels that name the function.
+collision_primitive.plane_capsule = plane_capsule
+constraint.make_constraint, solver.solve = make_constraint, solve  # ours for data that was `adopt`ed
+
+
+@wp.kernel
+def go_round(
+    base: wp.array2d[wp.vec3],
+    orbits: wp.array[float],
+    done: wp.array2d[float],
+    substeps: wp.array2d[float],
+    timestep: float,
+    k: int,
+    mocap_pos: wp.array2d[wp.vec3],
+):
+    """Mocap bodies at substep k, as `simulation.mocap_at` has them."""
+    world, body = wp.tid()
+    if float(k) < substeps[world, 0]:
+        time = (done[world, 0] + float(k)) * timestep
+        circle = wp.vec3(wp.sin(time), wp.cos(time), 0.0)
+        mocap_pos[world, body] = base[world, body] + orbits[body] * circle
+
+
+@wp.kernel
+def hold(substeps: wp.array2d[float], k: int, before: wp.array2d[float], after: wp.array2d[float]):
+    """Undo substep k in the worlds whose step has fewer."""
+    world, column = wp.tid()
+    if float(k) >= substeps[world, 0]:
+        after[world, column] = before[world, column]
+
+
+@wp.kernel
+def flag(
+    overflow: wp.array[int],
+    mask: int,
+    nacon: wp.array[int],
+    ncollision: wp.array[int],
+    contacts: int,
+    nefc: wp.array[int],
+    rows: int,
+    out: wp.array2d[float],
+):
+    """1 where a substep set a bit of `mask`, or the last forward pass, which sets none, had no room."""
+    world = wp.tid()
+    full = (overflow[world] & mask) != 0 or nefc[world] > rows
+    if full or nacon[0] > contacts or ncollision[0] > contacts:
+        out[world, 0] = 1.0
+    else:
+        out[world, 0] = 0.0
+
+
+Kind = mujoco_warp.OverflowType
+NO_ROOM = int(
+    Kind.NEFC | Kind.NJMAX_NNZ | Kind.BROADPHASE | Kind.NARROWPHASE | Kind.CCD | Kind.CONTACT_MATCH
+)
+FEW_WORLDS = 128  # contacts more: the average of few worlds varies
+# Several devices call from several threads; on a CPU the memory that lanes share is the kernel's.
+one_at_a_time = threading.Lock()
+
+
+def floats(x: wp.array) -> wp.array:
+    """A view of `x` [worlds, n], of floats, vectors or matrices, as floats [worlds, m]."""
+    width = x.size * wp.types.type_size(x.dtype) // x.shape[0]
+    return wp.array(ptr=x.ptr, dtype=float, shape=(x.shape[0], width), device=x.device)
+
+
+@dataclasses.dataclass
+class Worlds:
+    """The working data of a batch on one device, and the graphs that run on it."""
+
+    model: Any
+    blind: Any  # the model without its sensors
+    data: Any
+    orbits: wp.array  # [nmocap], m
+    into: wp.array  # [worlds, columns]
+    out: wp.array
+    graphs: dict[int, Any]  # by the number of substeps
+
+
+def make(simulation: Simulation) -> Engine:
+    """Warp's buffers are sized for a whole batch, so the batch is made explicit.
+
+    The working data of every batch size that was ever stepped is kept.
+    """
+    model = simulation.compile(count=True)
+    kernels = Kernels(simulation, model)
+
+    def runner(substeps: int) -> Run:
+        def launch(packed: wp.array2d[float], result: wp.array2d[float]):
+            with one_at_a_time:
+                kernels.launch(packed, result, substeps)
+
+        call = wp.jax_callable(launch, graph_mode=wp.JaxCallableGraphMode.NONE)
+        width = sum(kernels.results.values())
+
+        def run_batch(physics: Physics, ctrl: jax.Array, taken: jax.Array):
+            packed = jax.vmap(pack)(physics, ctrl, taken)
+            rows = call(packed, output_dims={"result": (packed.shape[0], width)})[0]
+            back = partial(unpack, sizes=kernels.results, simulation=simulation)
+            return jax.vmap(back)(rows, physics=physics, substeps=taken)
+
+        return batched(run_batch)
+
+    several, none = runner(simulation.substeps), runner(0)
+    return Engine("warp", model, simulation.substeps, several, none)
+
+
+class Kernels:
+    """All launches of a step, for every batch size, device and number of substeps."""
+
+    def __init__(self, simulation: Simulation, model: mujoco.MjModel):
+        self.simulation, self.model = simulation, model
+        self.orbits = simulation.orbits_of(model)
+        self.inputs, results = widths(model, simulation)
+        self.results = results | {"overflow": 1}
+        self.batches: dict[tuple[str, int], Worlds] = {}
+        self.said = False  # which kernels run
+
+    def prepare(self, worlds: int) -> Worlds:
+        m = mujoco_warp.put_model(self.model)
+        m.opt.warn_overflow = 0  # returned instead
+        room: dict[str, int] = {}
+        if self.simulation.room:
+            contacts, room["njmax"] = self.simulation.room
+            room["naconmax"] = contacts * worlds + FEW_WORLDS
+        data = mujoco_warp.make_data(self.model, nworld=worlds, **room)
+        adopted = adopt(self.model, m, data, self.simulation.pillars)
+        if not adopted and not self.said:
+            self.said = True
+            reasons = ", ".join(uncovered(self.model, m, data))
+            print(f"engine warp: MuJoCo Warp's own kernels run this model ({reasons})", file=sys.stderr)
+        sensors_off = m.opt.disableflags | mujoco.mjtDisableBit.mjDSBL_SENSOR.value
+        return Worlds(
+            model=m,
+            blind=dataclasses.replace(m, opt=dataclasses.replace(m.opt, disableflags=sensors_off)),
+            data=data,
+            orbits=wp.array(self.orbits, dtype=float),
+            into=wp.zeros((worlds, sum(self.inputs.values())), dtype=float),
+            out=wp.zeros((worlds, sum(self.results.values())), dtype=float),
+            graphs={},
+        )
+
+    def launch(self, packed: wp.array, result: wp.array, substeps: int) -> None:
+        device = wp.get_device()
+        place = (str(device), packed.shape[0])
+        if place not in self.batches:
+            self.batches[place] = self.prepare(packed.shape[0])
+        w = self.batches[place]
+        wp.copy(w.into, packed)
+        if not device.is_cuda:
+            self.advance(w, substeps)
+        else:
+            if substeps not in w.graphs:
+                with wp.ScopedCapture() as capture:
+                    self.advance(w, substeps)
+                w.graphs[substeps] = capture.graph
+            wp.capture_launch(w.graphs[substeps])
+        wp.copy(result, w.out)
+
+    def advance(self, w: Worlds, substeps: int) -> None:
+        """From the rows in `w.into` to those in `w.out`."""
+        data = w.data
+        given = {name: w.into[:, where] for name, where in columns(self.inputs).items()}
+        wanted = {name: w.out[:, where] for name, where in columns(self.results).items()}
+        for name, column in given.items():
+            if column.size and name not in ("done", "substeps"):
+                wp.copy(floats(getattr(data, name)), column)
+        data.overflow.zero_()
+        base = wp.clone(data.mocap_pos) if self.orbits.any() else None
+        for k in range(substeps):
+            if base is not None:
+                clock = [given["done"], given["substeps"], self.model.opt.timestep, k]
+                wp.launch(
+                    go_round,
+                    dim=base.shape,
+                    inputs=[base, w.orbits, *clock],
+                    outputs=[data.mocap_pos],
+                )
+            before = {}
+            if self.simulation.varied:
+                before = {name: wp.clone(getattr(data, name)) for name in STATE}
+            step(w.blind, data)
+            for name, old in before.items():
+                new = getattr(data, name)
+                wp.launch(hold, new.shape, inputs=[given["substeps"], k, old], outputs=[new])
+        forward(w.model, data)
+        full = wanted.pop("overflow")
+        wp.launch(
+            flag,
+            data.nworld,
+            inputs=[
+                data.overflow,
+                NO_ROOM,
+                data.nacon,
+                data.ncollision,
+                data.naconmax,
+                data.nefc,
+                data.njmax,
+            ],
+            outputs=[full],
+        )
+        for name, column in wanted.items():
+            if column.size:
+                wp.copy(column, floats(getattr(data, name)))

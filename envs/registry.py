@@ -1,0 +1,165 @@
+"""Environments by name: Safety Gym's, and those that `register` adds.
+
+`make("car_push1")` and `make("Safexp-CarPush1-v0")` are the same environment.
+"""
+
+import dataclasses
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+from jaxsafe.config import ConfigError, convert, from_dict, named_object, nearest
+from jaxsafe.envs.check import check_env
+from jaxsafe.envs.safety_gym import layout, suite
+from jaxsafe.envs.safety_gym.config import SafetyGymConfig, defaults, read
+from jaxsafe.envs.safety_gym.task import SafetyGym
+from jaxsafe.envs.wrap import WrapConfig, wrapped
+from jaxsafe.types import Env
+
+# name -> options that differ from Safety Gym's defaults, or a function that makes another environment
+ENVS: dict[str, Any] = {**suite.suite()}
+PLAIN = (type(None), bool, int, float, str, list, tuple, dict)
+ANY_ENV = "wrap"  # the option that every environment has
+OF_MAKE = ("engine", ANY_ENV)  # options of a Safety Gym environment that are no `SafetyGymConfig`'s
+ALIASES: dict[str, str] = {suite.alias(name): name for name in ENVS}
+
+
+def register(name: str, env: Any) -> None:
+    """Add an environment of your own, for `make` and the command line.
+
+    Args:
+        name: what to call it. A name that is there already is replaced.
+        env: one of
+            a dict of Safety Gym's options, such as `TASKS["goal1"] | ROBOTS["car"]` of suite.py;
+            a `SafetyGymConfig`, or an environment that `make` made of one;
+            any other `Env`;
+            a function or a class that makes one. Its arguments with defaults become options.
+    Raises:
+        ConfigError: an unknown option, or something that is none of these.
+    """
+    if isinstance(env, SafetyGym):
+        env = env.config
+    if isinstance(env, SafetyGymConfig):
+        env = dataclasses.asdict(env)
+    if isinstance(env, dict):
+        read({k: v for k, v in defaults(**env).items() if k not in OF_MAKE})
+        wrap_config(env.get(ANY_ENV, {}))
+        ENVS[name] = dict(env)
+    elif callable(env):
+        ENVS[name] = env
+    else:
+        checked = check_env(env, name)
+        ENVS[name] = lambda: checked
+
+
+def load(address: str) -> None:
+    """Import 'module:name', from the working directory too, and register it under that address.
+
+    This executes the module, so an address comes from the user, never from a file.
+
+    Raises:
+        ConfigError: no such module, or nothing of that name in it.
+    """
+    register(address, named_object("env", address))
+
+
+def canonical(name: str) -> str:
+    """The registered name of an environment given by name or by Safety Gym's id.
+
+    Raises:
+        ConfigError: no such environment; the message has the nearest name.
+    """
+    if name in ENVS:
+        return name
+    if name in ALIASES:
+        return ALIASES[name]
+    if ":" in name:
+        raise ConfigError(
+            f"{name} is code, which is not imported because a file names it; if you trust it, add "
+            f"env={name}"
+        )
+    if ours := suite.safety_gymnasium(name):
+        raise ConfigError(f"{name} is env={ours} env.rules=safety_gymnasium")
+    raise ConfigError(f"unknown environment {name!r}{nearest(name, [*ENVS, *ALIASES])}")
+
+
+def env_defaults(name: str) -> dict[str, Any]:
+    """Every option of an environment as a plain value. `wrap` is a dict: the fields of `WrapConfig`."""
+    entry = ENVS[canonical(name)]
+    wrap = dataclasses.asdict(WrapConfig())
+    if isinstance(entry, dict):
+        return {"engine": "auto"} | defaults(**entry) | {ANY_ENV: wrap | entry.get(ANY_ENV, {})}
+    return {p.name: p.default for p in arguments(entry, name)} | {ANY_ENV: wrap}
+
+
+def wrap_config(values: dict[str, Any]) -> WrapConfig:
+    if not isinstance(values, dict):
+        raise ConfigError(f"env.wrap={values!r}: set its parts, such as env.wrap.action_repeat=2")
+    return from_dict(WrapConfig, values, "env.wrap.")
+
+
+def arguments(factory: Callable[..., Env], name: str) -> list[inspect.Parameter]:
+    """The arguments that are options: those with a plain value as default.
+
+    Raises:
+        ConfigError: an argument has no default, or the name of an option that every environment has.
+    """
+    given = inspect.signature(factory, eval_str=True).parameters.values()
+    named = [p for p in given if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
+    for p in named:
+        if p.default is p.empty:
+            raise ConfigError(f"{name}: argument {p.name!r} has no default, so nobody would give it")
+        if p.name == ANY_ENV:
+            raise ConfigError(f"{name}: argument {p.name!r} is what every environment has: rename it")
+    return [p for p in named if isinstance(p.default, PLAIN)]
+
+
+def make(env: str | SafetyGymConfig, **overrides: Any) -> SafetyGym:
+    """Build an environment.
+
+    Args:
+        env: a name ('car_push1', 'Safexp-CarPush1-v0', what `register` was given) or a config.
+        overrides: options by name. Safety Gym's are those of `SafetyGymConfig`, and `engine`: 'auto',
+            'c', 'warp' or 'jax'. Every environment has `wrap`, a dict of `WrapConfig`'s fields.
+    Returns:
+        A `SafetyGym`, or the `Env` that was registered; in its wrappers, if `wrap` asks for any.
+    Raises:
+        ConfigError: an unknown name or option (with the nearest valid one), a value of the wrong
+            type, or a task that cannot be built or has no valid layout.
+    """
+    name = "custom" if isinstance(env, SafetyGymConfig) else canonical(env)
+    options = dataclasses.asdict(env) if isinstance(env, SafetyGymConfig) else ENVS[name]
+    given = {k: v for k, v in overrides.items() if k != ANY_ENV}
+    wrap = wrap_config(overrides.get(ANY_ENV, {}))
+    if isinstance(options, dict):
+        wrap = wrap_config({**options.get(ANY_ENV, {}), **overrides.get(ANY_ENV, {})})
+        made: Env = safety_gym(name, {k: v for k, v in options.items() if k != ANY_ENV}, given)
+    else:
+        made = registered(name, options, given)
+    return wrapped(made, wrap)  # type: ignore[return-value]
+
+
+def safety_gym(name: str, options: dict[str, Any], overrides: dict[str, Any]) -> SafetyGym:
+    options = {"engine": "auto"} | defaults(**options) | overrides
+    engine = convert(options.pop("engine"), str, "env.engine")
+    made = SafetyGym(read(options), engine, name)
+    if name in ALIASES.values() and overrides.keys() <= {"engine"}:  # known to have layouts
+        return made
+    if not layout.feasible(made.place):
+        raise ConfigError(
+            f"env: no valid layout in {layout.LAYOUTS:,} tries: fewer or smaller objects, smaller "
+            "keepouts or larger placements_extents"
+        )
+    return made
+
+
+def registered(name: str, factory: Callable[..., Env], overrides: dict[str, Any]) -> Env:
+    kinds = {p.name: p.annotation for p in arguments(factory, name)}
+    for option in overrides:
+        if option not in kinds:
+            raise ConfigError(f"unknown option env.{option}{nearest(option, kinds)}")
+    typed = {
+        k: v if kinds[k] is inspect.Parameter.empty else convert(v, kinds[k], f"env.{k}")
+        for k, v in overrides.items()
+    }
+    return check_env(factory(**typed), name)

@@ -1,0 +1,176 @@
+"""What a robot observes, component by component. Source: Safety Gym's Engine, `obs`."""
+
+from collections.abc import Iterable
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from jaxsafe.envs import engines
+from jaxsafe.envs.engines import Readings
+from jaxsafe.envs.safety_gym import layout as layouts
+from jaxsafe.envs.safety_gym import scene as scenes
+from jaxsafe.envs.safety_gym import sensing
+from jaxsafe.envs.safety_gym.arena import Arena, World, norm, rotation_of
+
+JOINT_SENSORS = (  # in the order in which Safety-Gymnasium observes them
+    mujoco.mjtSensor.mjSENS_JOINTVEL,
+    mujoco.mjtSensor.mjSENS_BALLANGVEL,
+    mujoco.mjtSensor.mjSENS_JOINTPOS,
+    mujoco.mjtSensor.mjSENS_BALLQUAT,
+)
+
+
+def observe(
+    arena: Arena, world: World, readings: Readings, ctrl: jax.Array, slack: float = 0.0
+) -> jax.Array:
+    """The flat observation [obs_size], or the components by name.
+
+    slack: thickens what natural lidar sees, in m; see `sensing.natural_lidar`.
+    """
+    parts = components(arena, world, readings, ctrl, slack)
+    if not arena.config.observation_flatten:
+        return parts  # type: ignore[return-value]
+    if not parts:
+        return jnp.zeros(0)
+    return jnp.concatenate([parts[name].reshape(-1) for name in parts])
+
+
+def components(
+    arena: Arena, world: World, readings: Readings, ctrl: jax.Array, slack: float = 0.0
+) -> dict[str, jax.Array]:
+    """Every observed component by name, in order."""
+    cfg = arena.config
+    position, rotation = arena.robot_pose(world)
+    goal = arena.goal_position(world)
+    parts: dict[str, jax.Array] = {}
+    if cfg.observe_sensors:
+        parts |= sensor_parts(arena, readings)
+    if cfg.observe_goal_dist:
+        parts["goal_dist"] = jnp.exp(-norm((position - goal)[:2]))[None]
+    if cfg.observe_goal_comp:
+        parts["goal_compass"] = sensing.compass(goal, position, rotation, cfg.compass_shape)
+    if cfg.observe_box_comp and cfg.task == "push":
+        parts["box_compass"] = sensing.compass(
+            arena.box_position(world), position, rotation, cfg.compass_shape
+        )
+    parts |= lidars(arena, world, readings, goal, slack)
+    if cfg.observe_remaining:
+        parts["remaining"] = (world.steps / cfg.num_steps)[None]
+    if cfg.observe_qpos:
+        parts["qpos"] = from_start(arena, world, world.physics.qpos, 3)
+    if cfg.observe_qvel:
+        parts["qvel"] = from_start(arena, world, world.physics.qvel, 2)
+    if cfg.observe_ctrl:
+        parts["ctrl"] = ctrl
+    if cfg.observe_freejoint:
+        parts["freejoint"] = world.physics.qpos[:7]
+    if cfg.observe_com:
+        parts["com"] = arena.sensor(readings, "subtreecom")
+    return {name: parts[name] for name in in_order(arena, parts)}
+
+
+def in_order(arena: Arena, names: Iterable[str]) -> list[str]:
+    """By name; in Safety-Gymnasium sensors, velocities and angles of joints, then kind by kind."""
+    if arena.config.rules == "safety_gym":
+        return sorted(names)
+    order = list(arena.config.sensors_obs)
+    for kind in JOINT_SENSORS:
+        order += [name for name, (_, found) in arena.sensors.items() if found == kind]
+    for kind in layouts.ORDER[arena.config.rules]:
+        order += [f"{kind}_lidar", f"{kind}_compass"]
+    return sorted(names, key=order.index)
+
+
+def sensor_parts(arena: Arena, readings: Readings) -> dict[str, jax.Array]:
+    model, angles = arena.scene.model, arena.config.sensors_angle_components
+    parts = {name: arena.sensor(readings, name) for name in arena.config.sensors_obs}
+    for name, (_, kind) in arena.sensors.items():
+        value = arena.sensor(readings, name)
+        if kind == mujoco.mjtSensor.mjSENS_JOINTPOS:
+            parts[name] = jnp.concatenate([jnp.sin(value), jnp.cos(value)]) if angles else value
+        elif kind == mujoco.mjtSensor.mjSENS_BALLQUAT:
+            parts[name] = rotation_of(value) if angles else value
+        elif kind in (mujoco.mjtSensor.mjSENS_JOINTVEL, mujoco.mjtSensor.mjSENS_BALLANGVEL):
+            parts[name] = value
+    assert model.nsensordata == readings.sensors.shape[-1]
+    return parts
+
+
+def lidars(
+    arena: Arena, world: World, readings: Readings, goal: jax.Array, slack: float
+) -> dict[str, jax.Array]:
+    cfg = arena.config
+    seen = {  # name: targets [n, 2]
+        "goal": goal[None, :2] if cfg.observe_goal_lidar else None,
+        "box": arena.positions(world, "box") if cfg.task == "push" and cfg.observe_box_lidar else None,
+        "circle": jnp.zeros((1, 2)) if cfg.task == "circle" and cfg.observe_circle else None,
+        "hazards": arena.positions(world, "hazards") if cfg.observe_hazards else None,
+        "vases": arena.positions(world, "vases") if cfg.observe_vases else None,
+    }
+    for kind in ("walls", "pillars", "buttons", "gremlins"):
+        watched = getattr(cfg, f"{kind}_num") and getattr(cfg, f"observe_{kind}")
+        seen[kind] = arena.positions(world, kind) if watched else None
+    position, rotation = arena.robot_pose(world)
+    parts = {}
+    for name, targets in seen.items():
+        if targets is None:
+            continue
+        if cfg.lidar_type == "natural":
+            group = scenes.GROUP[name if name in scenes.GROUP else name[:-1]]
+            shapes = shapes_of(arena, world, readings)
+            lidar = sensing.natural_lidar(shapes, position, rotation, cfg.lidar_num_bins, group, slack)
+        else:
+            law = (cfg.lidar_max_dist, cfg.lidar_exp_gain, cfg.lidar_alias)
+            lidar = sensing.pseudo_lidar(targets, position, rotation, cfg.lidar_num_bins, *law)
+        if name == "buttons":
+            lidar = jnp.where(world.buttons_timer == 0, lidar, 0.0)
+        parts[f"{name}_lidar"] = lidar
+    return parts
+
+
+def shapes_of(arena: Arena, world: World, readings: Readings) -> sensing.Shapes:
+    """All geoms that a ray can meet: the model's, and those that are no part of the physics."""
+    cfg, model = arena.config, arena.scene.model
+    others = np.flatnonzero(model.geom_bodyid != model.body("robot").id)
+    kinds, sizes, groups = (
+        model.geom_type[others],
+        model.geom_size[others],
+        model.geom_group[others],
+    )
+    position, rotation = (readings.fields[name][others] for name in ("geom_xpos", "geom_xmat"))
+    cylinder, box = int(mujoco.mjtGeom.mjGEOM_CYLINDER), int(mujoco.mjtGeom.mjGEOM_BOX)
+    extra: list[tuple] = []  # type, size, group, position, rotation
+    if arena.goal_kind == "goal":
+        size = (cfg.goal_size, cfg.goal_size / 2, 0)
+        extra.append((cylinder, size, scenes.GROUP["goal"], arena.goal_position(world), jnp.eye(3)))
+    for xy in arena.positions(world, "hazards"):
+        size = (cfg.hazards_size, 0.01, 0)
+        extra.append((cylinder, size, scenes.GROUP["hazard"], jnp.append(xy, 0.02), jnp.eye(3)))
+    if cfg.gremlins_num:
+        physics, timestep = world.physics, model.opt.timestep
+        last = (physics.substeps - 1) * timestep
+        guides = engines.mocap_at(physics.mocap_pos, arena.scene.orbit, last, jnp)
+        resting = physics.mocap_pos - jnp.array([0.0, 0.0, cfg.gremlins_size])
+        guides = jnp.where(physics.substeps > 0, guides, resting)
+        for i in range(cfg.gremlins_num):
+            turn = rotation_of(physics.mocap_quat[i])
+            extra.append((box, (cfg.gremlins_size,) * 3, scenes.GROUP["gremlin"], guides[i], turn))
+    if extra:
+        kind, size, group, place, turn = zip(*extra, strict=True)
+        kinds, groups = np.append(kinds, kind), np.append(groups, group)
+        sizes = np.concatenate([sizes, np.array(size)])
+        position = jnp.concatenate([position, jnp.stack(place)])
+        rotation = jnp.concatenate([rotation, jnp.stack(turn)])
+    return sensing.Shapes(kinds, sizes, groups, position, rotation)
+
+
+def from_start(arena: Arena, world: World, vector: jax.Array, pose_size: int) -> jax.Array:
+    """Point's coordinates are relative to its start in the original: qpos (3) and qvel (2)."""
+    if not arena.scene.planar:
+        return vector
+    c, s = jnp.cos(world.start[2]), jnp.sin(world.start[2])
+    offset = world.start if pose_size == 3 else jnp.zeros(3)
+    x, y = vector[0] - offset[0], vector[1] - offset[1]
+    return vector.at[:3].set(jnp.stack([c * x + s * y, c * y - s * x, vector[2] - offset[2]]))

@@ -1,0 +1,222 @@
+"""Train what a study lacks: python scripts/study.py NAME [--minutes 8]
+
+docs/results/NAME/study.yaml lists runs in order of worth. Each that is not done is trained by
+scripts/train.py in RUNS/NAME/, and when it is done its figures and curves go into the study and onto
+its page. A run that is stopped, by Ctrl-C or after --minutes, continues the next time, as long as its
+folder in RUNS is there. Failed and diverged runs are kept and marked. Failed ones are tried again, as
+the last.
+
+Several runs share a GPU with --at-once; start NVIDIA's multi-process service first
+(docs/performance.md). Exit status: 0 if nothing is left to do, 130 if stopped, 1 if a run failed, 2 for
+bad input.
+"""
+
+import argparse
+import contextlib
+import os
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import jaxsafe
+from jaxsafe.commands.guard import guarded
+from jaxsafe.config import ConfigError, nearest
+from jaxsafe.report import condensed, studies
+from jaxsafe.report.read import read_one
+from jaxsafe.report.studies import Study
+from jaxsafe.run import run_folder
+from jaxsafe.run.arguments import fail
+from jaxsafe.run.settings import load
+
+ROOT = Path(jaxsafe.__file__).parent.parent
+STOPPED = (130, -signal.SIGINT)
+
+
+class Place(NamedTuple):
+    """Where and how long to train."""
+
+    folder: Path  # the run folder; the log stands beside it
+    gpu: str | None  # the index of the GPU, or None for JAX's choice
+    late: Callable[[], bool]  # whether to stop now
+
+
+def train(options: list[str], place: Place) -> int:
+    """Run scripts/train.py with its output in a log beside the run folder. Returns its exit status."""
+    place.folder.parent.mkdir(parents=True, exist_ok=True)
+    words = [sys.executable, str(ROOT / "scripts" / "train.py"), *options]
+    words += [f"run_dir={place.folder}", "resume=true"]
+    own = {} if place.gpu is None else {"CUDA_VISIBLE_DEVICES": place.gpu}
+    own |= {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}  # several share a GPU
+    with log_of(place.folder).open("a") as log:
+        process = subprocess.Popen(
+            words,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            env=os.environ | own,
+            start_new_session=True,  # Ctrl-C is passed on once, below
+        )
+        while process.poll() is None:
+            if place.late():
+                process.send_signal(signal.SIGINT)
+                return process.wait()
+            time.sleep(0.1)
+    return process.returncode
+
+
+def log_of(folder: Path) -> Path:
+    return folder.with_name(f"{folder.name}.log")
+
+
+def states(study: Study) -> dict[str, str]:
+    """done, diverged, failed or '' of each run: the worst of its seeds."""
+    order = ("done", "diverged", "failed")
+    found = dict.fromkeys(study.runs, "")
+    for row in condensed.read(study.folder).rows:
+        if row["run"] in found and row["state"] in order:
+            found[row["run"]] = max(found[row["run"]] or "done", row["state"], key=order.index)
+    return found
+
+
+def left(study: Study, only: list[str], runs: Path) -> list[str]:
+    """What is still to train: those begun, then by worth, and last those that failed."""
+    known = states(study)
+    found = [run for run in study.runs if known[run] in ("", "failed")]
+    found = [run for run in found if not only or condensed.name_of(run) in only]
+
+    def turn(run: str) -> tuple[bool, bool]:
+        return known[run] == "failed", not (runs / condensed.name_of(run)).exists()
+
+    return sorted(found, key=turn)
+
+
+def listing(study: Study, runs: Path) -> str:
+    lines = []
+    for run, state in states(study).items():
+        folder = runs / condensed.name_of(run)
+        if not state and (progress := run_folder.progress(folder)):
+            state = f"begun, at {progress.steps or progress.updates:,} steps"
+        lines.append(f"{condensed.name_of(run)}: {state or 'to do'}")
+    return "\n".join(lines)
+
+
+def find(name: str) -> Path:
+    """A folder with a study.yaml, or the name of one in docs/results."""
+    home = ROOT / "docs" / "results"
+    for folder in (Path(name).expanduser(), home / name):
+        if (folder / "study.yaml").is_file():
+            return folder
+    known = sorted(path.parent.name for path in home.glob("*/study.yaml"))
+    raise ConfigError(f"no study {name}{nearest(name, known)}; a new one begins with its study.yaml")
+
+
+@contextlib.contextmanager
+def stopping(event: threading.Event) -> Iterator[None]:
+    """Set `event` at Ctrl-C and its like, instead of raising."""
+    endings = (signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
+    before = {ending: signal.signal(ending, lambda *_: event.set()) for ending in endings}
+    try:
+        yield
+    finally:
+        for ending, handler in before.items():
+            signal.signal(ending, handler)
+
+
+def work(study: Study, args: argparse.Namespace, train: Callable[[list[str], Place], int]) -> int:
+    """Train what is left, several at once. Returns the exit status."""
+    runs, stop, one_at_a_time = args.runs / study.folder.name, threading.Event(), threading.Lock()
+    todo: queue.SimpleQueue[str] = queue.SimpleQueue()
+    asked = left(study, args.only, runs)
+    for run in asked:
+        todo.put(run)
+    for word in " ".join([*study.options, *study.runs]).split():
+        kind, _, name = word.partition("=")
+        if kind in ("env", "algo"):  # the user's own are imported here, too, to read what came out
+            load(kind, name)
+    end = time.monotonic() + 60 * args.minutes
+    failed: list[str] = []
+    unfinished: list[str] = []
+
+    def late() -> bool:
+        return stop.is_set() or time.monotonic() >= end
+
+    def one(run: str, gpu: str | None) -> None:
+        name, begun = condensed.name_of(run), time.monotonic()
+        if late():
+            unfinished.append(name)
+            return
+        folder = runs / name
+        status = train(study.command(run), Place(folder, gpu, late))
+        minutes = f"{(time.monotonic() - begun) / 60:.1f} minutes"
+        if status in STOPPED:
+            unfinished.append(name)
+            print(f"{name}: stopped, {minutes}", flush=True)
+            return
+        with one_at_a_time:
+            began = (folder / "metrics.csv").exists()
+            for trained in read_one(folder) if began else []:
+                studies.add(study, run, trained, studies.origin_of(folder), failed=status != 0)
+        failed.extend([name] * (status != 0))
+        result = f"failed, see {log_of(folder)}" if status else "done"
+        print(f"{name}: {result}, {minutes}", flush=True)
+
+    def worker(gpu: str | None) -> None:
+        with contextlib.suppress(queue.Empty):
+            while True:
+                run = todo.get_nowait()
+                try:
+                    one(run, gpu)
+                except Exception as error:  # the other runs go on
+                    failed.append(condensed.name_of(run))
+                    print(f"{condensed.name_of(run)}: {error!r}", flush=True)
+
+    print(f"{len(asked)} of {len(study.runs)} runs to do", flush=True)
+    gpus = args.gpus.split(",") if args.gpus else [None]
+    threads = [threading.Thread(target=worker, args=(gpu,)) for gpu in gpus * args.at_once]
+    with stopping(stop):
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    if len(unfinished) + len(failed) < len(asked) and condensed.there(study.folder):
+        studies.write_page(study)
+    print(f"left to do: {', '.join(unfinished + failed) or 'nothing'}")
+    return 1 if failed else 130 if unfinished else 0
+
+
+def main(train: Callable[[list[str], Place], int] = train) -> int:
+    """scripts/study.py. `train` is what trains one run."""
+
+    def study_command() -> int:
+        parser = argparse.ArgumentParser(
+            description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        )
+        parser.error = fail  # type: ignore[method-assign]
+        parser.add_argument("study", metavar="NAME", help="in docs/results, or a folder")
+        parser.add_argument("--list", action="store_true", help="say what is done, and train nothing")
+        parser.add_argument("--page", action="store_true", help="draw the page, and train nothing")
+        parser.add_argument("--minutes", type=float, default=float("inf"), help="then stop")
+        parser.add_argument("--only", nargs="+", default=[], metavar="RUN", help="as --list names it")
+        parser.add_argument("--gpus", help="their indices, with commas between")
+        parser.add_argument("--at-once", type=int, default=1, help="runs on each GPU")
+        parser.add_argument("--runs", type=Path, default=Path("runs") / "studies", metavar="DIR")
+        args = parser.parse_args()
+        study = studies.read(find(args.study))
+        names = [condensed.name_of(run) for run in study.runs]
+        for name in args.only:
+            if name not in names:
+                raise ConfigError(f"--only {name}{nearest(name, names)}")
+        if args.list:
+            print(listing(study, args.runs / study.folder.name))
+            return 0
+        if args.page:
+            studies.write_page(study)
+            return 0
+        return work(study, args, train)
+
+    return guarded(study_command)

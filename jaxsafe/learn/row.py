@@ -1,0 +1,33 @@
+"""A row of the registry of algorithms: all that the rest of the house needs to know of one."""
+
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any, Literal, NamedTuple
+
+from jaxsafe.types import Algorithm
+
+NOTHING: Mapping[str, Any] = MappingProxyType({})
+
+
+class Row(NamedTuple):
+    """An algorithm. Command line, contract tests, tables, pages and migration are made from its row.
+
+    config: a class under `jaxsafe.config.config`. Its docstring is the algorithm's page: equations,
+        source, departures.
+    make: make(env, axis_name=None) -> Algorithm.
+    summary: what it does, in a few words.
+    published: setting -> options of the config that reproduce it; `preset=published` is the first.
+    omnisafe: OmniSafe's name for it, from which scripts/migrate.py translates; '' if it has none.
+    holds: what keeps to the cost limit: the cost of the average episode, the cost of every episode,
+        or nothing, where the limit is only drawn in plots.
+    lever: options with which it learns Lever, the small exact problem of tests/toys.py, if its
+        defaults do not.
+    """
+
+    config: type[Any]
+    make: Callable[..., Algorithm]
+    summary: str = ""
+    published: Mapping[str, Mapping[str, Any]] = NOTHING
+    omnisafe: str = ""
+    holds: Literal["average", "episode", "nothing"] = "average"
+    lever: Mapping[str, Any] = NOTHING

@@ -1,0 +1,133 @@
+"""The two files of a study that hold its runs.
+
+    final.csv    a row a run and seed: the columns of `ROW`, then figures, then those of `Origin`
+    curves.npz   curves    float32 [rows, 3, 100]: return, cost and cost rate over training, as means
+                           over equal stretches of it; NaN before the first episode has ended
+                 run, seed text [rows], to find the curves of a row
+                 settings  JSON: every setting of the runs, {common: {...}, runs: {run: {...}}}
+
+Both are replaced whole, curves.npz first, so that a reader finds the curves of every row of final.csv
+whenever the writer was stopped. Nothing in them is executed.
+"""
+
+import csv
+import io
+import json
+import re
+import zipfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxsafe.config import ConfigError
+from jaxsafe.run import run_folder
+
+ROW = ("run", "env", "algo", "settings", "seed", "state", "steps")
+CURVES = ("train/return", "train/cost", "train/cost_rate")  # as metrics.csv calls them
+POINTS = 100
+
+
+class Origin(NamedTuple):
+    """What a run was made with; '' is not known."""
+
+    commit: str = ""
+    dirty: str = ""  # 'yes': the tree had changes that were in no commit; or 'no'
+    device: str = ""
+    engine: str = ""
+    python: str = ""
+    jax: str = ""
+    mujoco: str = ""
+    warp: str = ""
+    trained: str = ""  # the day
+    source: str = ""  # where every iteration is: a run folder, or COMMIT:PATH in the history
+
+
+class Condensed(NamedTuple):
+    """The runs of a study."""
+
+    rows: list[dict[str, str]]
+    curves: dict[tuple[str, str], np.ndarray]  # by run and seed, float32 [3, 100]
+    settings: dict[str, dict[str, Any]]  # by run, as `flat` names them
+
+    def figures(self) -> list[str]:
+        """The columns that hold numbers."""
+        names = dict.fromkeys(name for row in self.rows for name in row)
+        return [name for name in names if name not in ROW and name not in Origin._fields]
+
+
+def there(folder: Path) -> bool:
+    return (folder / "final.csv").is_file()
+
+
+def name_of(run: str) -> str:
+    """What the folder of a run is called: 'point_goal1-cpo' for 'env=point_goal1 algo=cpo'."""
+    words = [re.sub("^(env|algo)=", "", word) for word in run.split()]
+    return re.sub(r"[^\w.=+-]+", "_", "-".join(words))
+
+
+def read(folder: Path) -> Condensed:
+    """The runs of a study; none where none is finished.
+
+    Raises:
+        ConfigError: the files cannot be read, or do not belong together.
+    """
+    if not there(folder):
+        return Condensed([], {}, {})
+    try:
+        with (folder / "final.csv").open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        with np.load(folder / "curves.npz", allow_pickle=False) as file:
+            keys = zip(file["run"].tolist(), file["seed"].tolist(), strict=True)
+            curves = dict(zip(keys, file["curves"], strict=True))
+            saved = json.loads(str(file["settings"]))
+        settings = {run: saved["common"] | own for run, own in saved["runs"].items()}
+        if any((row["run"], row["seed"]) not in curves or row["run"] not in settings for row in rows):
+            raise ConfigError("curves.npz lacks rows of final.csv")
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+        raise ConfigError(f"{folder} cannot be read: {' '.join(str(error).split())}") from error
+    return Condensed(rows, curves, settings)
+
+
+def write(folder: Path, runs: Condensed) -> None:
+    """Write both files. Curves and settings without a row are left out."""
+    keys = [(row["run"], row["seed"]) for row in runs.rows]
+    settings = {run: runs.settings[run] for run, _ in keys}
+    packed, text = io.BytesIO(), io.StringIO()
+    np.savez_compressed(
+        packed,
+        run=np.array([run for run, _ in keys]),
+        seed=np.array([seed for _, seed in keys]),
+        curves=np.stack([runs.curves[key] for key in keys]),
+        settings=np.array(json.dumps(apart(settings))),
+    )
+    header = [*ROW, *runs.figures(), *Origin._fields]
+    writer = csv.DictWriter(text, header, restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(runs.rows)
+    part = folder / "curves.npz.part"
+    part.write_bytes(packed.getvalue())
+    part.replace(folder / "curves.npz")
+    run_folder.replace_text(folder / "final.csv", text.getvalue())
+
+
+def apart(settings: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """What all runs have in common, and what else each has."""
+    first, *others = settings.values()
+    common = {k: v for k, v in first.items() if all(k in s and s[k] == v for s in others)}
+    own = {run: {k: v for k, v in s.items() if k not in common} for run, s in settings.items()}
+    return {"common": common, "runs": own}
+
+
+def table(rows: Sequence[Mapping[str, str]], curves: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
+    """The curves of one run's seeds as columns of a metrics.csv with a row a point and seed."""
+    ends = [np.linspace(0, int(row["steps"]), POINTS + 1)[1:] for row in rows]
+    seeds = np.repeat([float(row["seed"]) for row in rows], POINTS)
+    columns = {
+        "iteration": np.tile(np.arange(1.0, POINTS + 1), len(rows)),
+        "steps": np.concatenate(ends),
+        "seed": seeds,
+    }
+    found = {name: np.concatenate([c[i] for c in curves]) for i, name in enumerate(CURVES)}
+    return columns | {name: x.astype(float) for name, x in found.items() if np.isfinite(x).any()}

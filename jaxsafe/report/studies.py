@@ -1,0 +1,405 @@
+"""A study: the runs that answer one question, condensed into four small files.
+
+    STUDY/study.yaml    what is asked, and which runs answer it, in order of worth
+    STUDY/final.csv     a row a run and seed: what it reached, and what it was made with
+    STUDY/curves.npz    return, cost and cost rate of each row over training, 100 points each
+    STUDY/README.md     a page made from the other three
+
+A run of a study is one training command with all its seeds. `add` condenses its run folder, and
+`write_page` draws the page. `jaxsafe.report.read` reads a study wherever it reads a run folder.
+
+study.yaml has these keys; the first four are needed:
+
+    title      the heading of the page
+    about      what is asked, in Markdown
+    options    options of scripts/train.py that all runs have, as 'num_seeds=5 total_steps=1e7'
+    runs       a list of further options, a run each: 'env=point_goal1 algo=cpo'
+    windows    stretches of training, [[begin, end], ...] in steps, over which final.csv has means too
+    published  a CSV of published figures to set beside the runs, relative to the study
+    printed    of runs whose evaluation was kept for all seeds together: the text that the run printed
+"""
+
+import functools
+import io
+import json
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import yaml
+from matplotlib.figure import Figure
+from PIL import Image
+
+from jaxsafe.config import ConfigError
+from jaxsafe.report import condensed, plots, scores, stats, tables
+from jaxsafe.report.condensed import CURVES, POINTS, Origin
+from jaxsafe.report.group import Group, group, tasks_of, telling
+from jaxsafe.report.published import Published, beside, read_published
+from jaxsafe.report.read import Run, defaults
+from jaxsafe.report.read import read as read_runs
+from jaxsafe.run import run_folder
+
+SPAN = 20  # iterations over which costs are averaged before their swing is taken
+CHUNK = 8  # settings in one figure of curves
+MOST = 24  # settings whose points can be told apart in one figure
+PAGE = """# {title}
+
+{about}
+
+<!-- measured: figures -->
+<!-- end -->
+
+## Settings and tasks
+
+<!-- measured: matrix -->
+<!-- end -->
+
+## Runs
+
+<!-- measured: runs -->
+<!-- end -->
+"""
+
+
+class Study(NamedTuple):
+    """What study.yaml says."""
+
+    folder: Path
+    title: str
+    about: str
+    options: list[str]  # of every run
+    runs: list[str]  # 'env=point_goal1 algo=cpo', in order of worth
+    windows: list[tuple[float, float]]  # in steps
+    published: Path | None
+    printed: dict[str, str]  # by run
+
+    def command(self, run: str) -> list[str]:
+        """The options of scripts/train.py that train `run`."""
+        return [*self.options, *run.split()]
+
+
+def read(folder: Path) -> Study:
+    """study.yaml.
+
+    Raises:
+        ConfigError: there is none, or it says something else.
+    """
+    path = folder / "study.yaml"
+    try:
+        found = yaml.safe_load(path.read_text())
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ConfigError(f"{path} cannot be read: {' '.join(str(error).split())}") from error
+    needed, more = {"title", "about", "options", "runs"}, {"windows", "published", "printed"}
+    if not isinstance(found, dict) or not needed <= found.keys() <= needed | more:
+        raise ConfigError(
+            f"{path}: expected {', '.join(sorted(needed))} and perhaps {', '.join(sorted(more))}"
+        )
+    runs, printed = found["runs"], found.get("printed") or {}
+    if not isinstance(runs, list) or not all(isinstance(run, str) for run in runs):
+        raise ConfigError(f"{path}: expected runs as a list of options, as 'env=point_goal1 algo=cpo'")
+    names = [condensed.name_of(run) for run in runs]
+    for name in names:
+        if names.count(name) > 1:
+            raise ConfigError(f"{path}: {name} occurs twice")
+    published = found.get("published")
+    return Study(
+        folder,
+        str(found["title"]),
+        str(found["about"]).strip(),
+        str(found["options"]).split(),
+        runs,
+        [(float(begin), float(end)) for begin, end in found.get("windows") or []],
+        folder / published if published else None,
+        printed,
+    )
+
+
+# ---- condensing ------------------------------------------------------------------------------
+
+
+def add(study: Study, run: str, trained: Run, origin: Origin, failed: bool = False) -> None:
+    """Put a run into final.csv and curves.npz, in place of what they had of it."""
+    rows, curves, settings = condensed.read(study.folder)
+    made = rows_of(study, run, trained, origin, failed)
+    worth = {text: i for i, text in enumerate(study.runs)}
+    rows = [*(row for row in rows if row["run"] != run), *made]
+    rows.sort(key=lambda row: worth.get(row["run"], len(worth)))
+    curves |= {(run, row["seed"]): x for row, x in zip(made, points(trained), strict=True)}
+    settings[run] = {k: v for k, v in trained.config.items() if k not in ("run_dir", "resume")}
+    condensed.write(study.folder, condensed.Condensed(rows, curves, settings))
+
+
+def rows_of(study: Study, run: str, trained: Run, origin: Origin, failed: bool) -> list[dict[str, str]]:
+    """The rows of final.csv of a run, one a seed."""
+    table, values = trained.table, trained.values | more_figures(trained.table, study.windows)
+    named = {name: x for name, x in values.items() if not name.startswith("normalised")}
+    known = dict.fromkeys(trained.seeds.astype(int).astype(str), "done")
+    if "train/nonfinite" in table:
+        bad = run_folder.last_tenth(table, "train/nonfinite") > 0
+        known = {seed: "diverged" if b else "done" for seed, b in zip(known, bad, strict=True)}
+    state = "failed" if failed else "unfinished" if not trained.ended else ""
+    seconds = [table["seconds"][table["seed"] == s].max() for s in trained.seeds]
+    clock = run_folder.clock_of(table)
+    named = {"minutes": np.array(seconds) / 60} | named
+    return [
+        {
+            "run": run,
+            "env": trained.env,
+            "algo": trained.config["algo.name"],
+            "settings": " ".join(f"{k}={v}" for k, v in unusual(trained.config).items()),
+            "seed": seed,
+            "state": state or own,
+            "steps": str(int(table[clock][table["seed"] == int(seed)].max())),
+        }
+        | {name: "" if np.isnan(x[i]) else f"{x[i]:.9g}" for name, x in named.items()}
+        | origin._asdict()
+        for i, (seed, own) in enumerate(known.items())
+    ]
+
+
+def points(trained: Run) -> list[np.ndarray]:
+    """Return, cost and cost rate of each seed over a hundred equal stretches, float32 [3, 100].
+
+    Twelve bits of the mantissa are kept, four digits: the rest is noise that does not compress.
+    """
+    edges = np.linspace(0, trained.steps, POINTS + 1)
+    table = dict(trained.table)
+    table |= {f"mean {name}": table[name] for name in CURVES if name in table}
+    nothing = np.full((len(trained.seeds), POINTS), np.nan)
+    found = [
+        plots.stretches(table, f"mean {name}", edges) if name in table else nothing for name in CURVES
+    ]
+    values = np.stack(found, axis=1).astype(np.float32)
+    bits = values.view(np.uint32)
+    rounded = ((bits + (1 << 10)) & np.uint32(0xFFFFF800)).view(np.float32)
+    return [*np.where(np.isfinite(values), rounded, np.float32(np.nan))]
+
+
+def more_figures(
+    table: Mapping[str, np.ndarray], windows: Iterable[tuple[float, float]]
+) -> dict[str, np.ndarray]:
+    """What final.csv has of each seed beside `measured`, [S] by name.
+
+    - Return and cost as the learner estimates them, which needs no whole episode, over the last 10%.
+    - Of each window (begin, end]: means of return and cost, and how far the cost swings.
+    - Of algorithms that linearise the cost: what a step promises to take off it, a step, and which
+      share of that comes true: the slope of the change of the violation on the sum of the promises,
+      from one span of `SPAN` iterations to the next.
+    """
+    estimates = [k for k in ("return_estimate", "cost_estimate") if f"train/{k}" in table]
+    late = {k.replace("_", " "): run_folder.last_tenth(dict(table), f"train/{k}") for k in estimates}
+    found: dict[str, list[float]] = {}
+    for seed in np.unique(table["seed"]):
+        own = {name: x[table["seed"] == seed] for name, x in table.items()}
+        for begin, end in windows:
+            inside = (own["steps"] > begin) & (own["steps"] <= end)
+            ret, cost = (own[f"train/{name}"][inside] for name in ("return", "cost"))
+            name = window_name(begin, end)
+            found.setdefault(f"return {name}", []).append(ret.mean() if len(ret) else np.nan)
+            found.setdefault(f"cost {name}", []).append(cost.mean() if len(cost) else np.nan)
+            swing = spans(cost).mean(1).std() if len(cost) >= SPAN else np.nan
+            found.setdefault(f"swing {name}", []).append(swing)
+        if {"train/objective_c", "train/violation"} <= own.keys() and len(own["steps"]) > 2 * SPAN:
+            promise, violation = (spans(own[f"train/{k}"]) for k in ("objective_c", "violation"))
+            slope = np.polyfit(promise.sum(1)[:-1], np.diff(violation.mean(1)), 1)[0]
+            found.setdefault("promised", []).append(-own["train/objective_c"].mean())
+            found.setdefault("kept", []).append(slope)
+    return late | {name: np.array(values) for name, values in found.items()}
+
+
+def spans(values: np.ndarray) -> np.ndarray:
+    """[T] as [T // SPAN, SPAN], without the rest."""
+    return values[: len(values) // SPAN * SPAN].reshape(-1, SPAN)
+
+
+def window_name(begin: float, end: float) -> str:
+    return f"{begin:g}-{end:g}"
+
+
+def unusual(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The options of a flat config that differ from today's defaults of its preset and conventions."""
+    preset, compat = config["preset"], config.get("compat", "none")
+    chosen = {k: v for k, v in (("preset", preset), ("compat", compat)) if v not in ("fast", "none")}
+    usual = defaults(config["env.name"], config["algo.name"], preset, compat)
+    chosen |= {"devices": config["devices"]} if config.get("devices", 1) != 1 else {}
+    return chosen | {
+        name: value
+        for name, value in config.items()
+        if name.startswith(("env.", "algo.")) and name in usual and value != usual[name]
+    }
+
+
+def origin_of(folder: Path) -> Origin:
+    """What a run folder's last start says of itself."""
+    try:
+        last = json.loads((folder / "versions.json").read_text())[-1]
+        commit = str(last["commit"] or "")
+        return Origin(
+            commit=commit.removesuffix("-dirty")[:7],
+            dirty=("yes" if commit.endswith("-dirty") else "no") if commit else "",
+            device=last["device"],
+            engine=last["engine"] or "",
+            python=last["python"],
+            jax=last["jax"],
+            mujoco=last["mujoco"],
+            warp=last["warp-lang"] or "",
+            trained=last["time"][:10],
+            source=str(folder),
+        )
+    except (OSError, ValueError, LookupError, TypeError):
+        return Origin(source=str(folder))
+
+
+# ---- the page --------------------------------------------------------------------------------
+
+
+class Picture(NamedTuple):
+    """A figure of the page, not yet drawn."""
+
+    path: Path
+    caption: str
+    draw: Callable[[], Figure]
+
+
+def write_page(study: Study) -> None:
+    """Write README.md, and draw its figures into images/ beside the study."""
+    text, pictures = page(study)
+    images = study.folder.parent / "images"
+    images.mkdir(exist_ok=True)
+    for old in images.glob(f"{study.folder.name}-*.png"):
+        old.unlink()
+    for picture in pictures:
+        save_small(picture.draw(), picture.path)
+    run_folder.replace_text(study.folder / "README.md", text)
+
+
+def page(study: Study) -> tuple[str, list[Picture]]:
+    """The text of README.md, and the figures that it shows.
+
+    Tables stand between marks. A README.md that is there keeps its own words around them; without one,
+    `about` is all that the page says.
+    """
+    path = study.folder / "README.md"
+    text = path.read_text() if path.exists() else PAGE.format(title=study.title, about=study.about)
+    runs = read_runs([study.folder])
+    groups = in_order(runs)
+    known = read_published(study.published) if study.published else {}
+    pictures = pictures_of(study, groups, known) if "<!-- measured: figures -->" in text else []
+    shown = [
+        f"![{x.caption}]({Path('..') / x.path.relative_to(study.folder.parent)})" for x in pictures
+    ]
+    makers: dict[str, Callable[[], str]] = {
+        "figures": lambda: "\n\n".join(shown),
+        "matrix": lambda: matrix(groups, known),
+        "runs": lambda: run_table(study, runs, known),
+    }
+    made = {name: make() for name, make in makers.items() if f"<!-- measured: {name} -->" in text}
+    return tables.between_marks(text, made, "measured"), pictures
+
+
+def in_order(runs: Sequence[Run]) -> list[Group]:
+    """The groups of each setting and task, in the order of the runs, the order of their worth."""
+    by = [name for name in telling(runs) if name != "total_steps"]
+    for name in ("compat", "devices"):
+        if name not in by and len({run.config[name] for run in runs}) > 1:
+            by.append(name)
+    return group(runs, by)
+
+
+def pictures_of(
+    study: Study, groups: Sequence[Group], known: Mapping[tuple[str, str], Published]
+) -> list[Picture]:
+    """Return against cost, and curves of at most `CHUNK` settings a figure."""
+    images, name = study.folder.parent / "images", study.folder.name
+    settings = list(dict.fromkeys(g.name for g in groups))
+    found = []
+    if 1 < len(settings) <= MOST:
+        theirs = {(g.env, g.name): beside(g, known) for g in groups}
+        hollow = "; hollow diamonds are published means" if any(theirs.values()) else ""
+        title = "last 10 % of training"
+        draw = functools.partial(plots.trade_off, groups, title, theirs)
+        caption = f"Return against cost, a point a setting{hollow}"
+        found.append(Picture(images / f"{name}-trade_off.png", caption, draw))
+    for i, first in enumerate(range(0, len(settings), CHUNK), 1):
+        chunk = settings[first : first + CHUNK]
+        draw = functools.partial(plots.learning, [g for g in groups if g.name in chunk])
+        caption = f"Return, cost and cost rate over training: {', '.join(chunk)}"
+        found.append(Picture(images / f"{name}-curves{i}.png", caption, draw))
+    return found
+
+
+def save_small(figure: Figure, path: Path) -> None:
+    """Write a PNG of 256 colours, which is a third as large."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=80)
+    picture = Image.open(buffer).convert("RGB")
+    picture.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(
+        path, optimize=True
+    )
+
+
+def matrix(groups: Sequence[Group], known: Mapping[tuple[str, str], Published]) -> str:
+    """Return and cost of each setting on each task, and below them what is published."""
+    tasks = tasks_of(groups)
+    found = {(g.env, g.name): g for g in groups}
+    lines = [f"| | {' | '.join(f'`{env}`' for env in tasks)} |", "|---|" + "---:|" * len(tasks)]
+    for name in sorted({g.name for g in groups}):
+        cells = []
+        for env in tasks:
+            cell = []
+            if g := found.get((env, name)):
+                cell.append(f"{g.ret.mean:.1f}, {g.cost.mean:.1f}")
+                if theirs := beside(g, known):
+                    cell.append(f"*{theirs.ret[0]:.1f}, {theirs.cost[0]:.1f}*")
+            cells.append("<br>".join(cell))
+        lines.append(f"| `{name}` | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def run_table(study: Study, runs: Sequence[Run], known: Mapping[tuple[str, str], Published]) -> str:
+    """A row a run: what it reached in training and after it, and what it was made with."""
+    origins = {row["run"]: row for row in condensed.read(study.folder).rows}
+    states: dict[str, set[str]] = {}
+    for row in condensed.read(study.folder).rows:
+        states.setdefault(row["run"], set()).add(row["state"])
+    named = {Path(run.config["run_dir"]).name: run for run in runs}
+    header = ["run", "seeds", "return, last 10%", "cost, last 10%", "final policy"]
+    header += [*(["published"] if known else []), "minutes", "commit"]
+    numbers = ("seeds", "return, last 10%", "cost, last 10%", "minutes")
+    ends = ["---:" if name in numbers else "---" for name in header]
+    lines = [f"| {' | '.join(header)} |", f"|{'|'.join(ends)}|"]
+    for text, row in sorted(origins.items(), key=lambda item: condensed.name_of(item[0])):
+        run = named[condensed.name_of(text)]
+        ret, cost = (tables.cell(stats.estimate(run.values[k]), ".2f") for k in ("return", "cost"))
+        words = " ".join(f"`{re.sub('^(env|algo)=', '', word)}`" for word in text.split())
+        odd = ", ".join(sorted(states[text] - {"done"}))
+        cells = [f"{words}{f' ({odd})' if odd else ''}", str(len(run.seeds)), ret, cost]
+        cells.append(final_policy(run, study.printed.get(text, "-")))
+        cells += [published_cell(run.config, known)] if known else []
+        known_minutes = run.values.get("minutes")
+        cells.append("-" if known_minutes is None else f"{known_minutes.max():.1f}")
+        cells.append(f"{row['commit'] or '-'}{' (dirty)' if row['dirty'] == 'yes' else ''}")
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def final_policy(run: Run, otherwise: str) -> str:
+    """What the mean action made in fresh episodes, mean over seeds and its interval."""
+    if not {"final return", "final cost"} <= run.values.keys():
+        return otherwise
+    ret, cost = (stats.estimate(run.values[f"final {k}"]) for k in ("return", "cost"))
+    return "{:.2f} [{:.2f}, {:.2f}], cost {:.2f} [{:.2f}, {:.2f}]".format(*ret, *cost)
+
+
+def published_cell(config: Mapping[str, Any], known: Mapping[tuple[str, str], Published]) -> str:
+    """What others report of a setting, or where that is nothing constrained, unconstrained PPO."""
+    env, algo = config["env.name"], config["algo.name"]
+    theirs = known.get((env, algo))
+    if theirs and theirs.holds_for(config.get("env.rules", "safety_gym")):
+        (ret, ret_std), (cost, cost_std) = theirs.ret, theirs.cost
+        return f"{theirs.source} {ret:.2f} ± {ret_std:.2f}, cost {cost:.2f} ± {cost_std:.2f}"
+    if ppo := scores.CHARACTERISTIC.get(env):
+        return f"none (unconstrained PPO: {ppo.ret:.4g}, cost {ppo.cost:.4g})"
+    return "none"

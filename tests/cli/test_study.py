@@ -1,0 +1,274 @@
+"""Studies: what their files hold, and the command that makes and continues them."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from jaxsafe.commands import study as command
+from jaxsafe.config import ConfigError
+from jaxsafe.report import condensed, plots, studies
+from jaxsafe.report.read import read, read_one
+from jaxsafe.run import run_folder
+
+ROOT = Path(__file__).parent.parent.parent
+TOY = """
+title: Toy
+about: Which of two earns more?
+options: total_steps=4000 num_seeds=2
+runs:
+- env=point_goal1 algo=cpo
+- env=point_goal1 algo=ppo_lag algo.dual_lr=0.2
+windows: [[1000, 2000]]
+"""
+
+
+@pytest.fixture
+def toy(tmp_path) -> studies.Study:
+    folder = tmp_path / "results" / "toy"
+    folder.mkdir(parents=True)
+    (folder / "study.yaml").write_text(TOY)
+    return studies.read(folder)
+
+
+def trained(folder: Path, options: list[str], steps: int = 4000, nonfinite: Any = (0, 0)) -> None:
+    """Write what training with these options leaves: iterations of 10 steps, returns by the seed."""
+    given = dict(word.split("=") for word in options)
+    algo = {"name": given["algo"]} | ({"dual_lr": 0.2} if "algo.dual_lr" in given else {})
+    folder.mkdir(parents=True)
+    config = {"env": {"name": given["env"]}, "algo": algo, "total_steps": 4000, "num_seeds": 2}
+    run_folder.write_config(folder, config)
+    run_folder.append_versions(folder, "abacus", "c")
+    names = ["train/return", "train/cost", "train/cost_rate", "train/nonfinite"]
+    log = run_folder.Metrics(folder, names, 0)
+    for i in range(1, steps // 10 + 1):
+        values = [np.array([i, 2 * i]), np.array([i % 40, 30.0]), np.full(2, 0.1), np.array(nonfinite)]
+        values[0] = np.where(i < 5, np.nan, values[0])
+        log.append(i, 10 * i, [0, 1], 60.0 * i, dict(zip(names, values, strict=True)))
+    log.close()
+    (folder / "evaluation.json").write_text(
+        json.dumps({"seeds": {"return": [5.0, 7.0], "cost": [1.0, 2.0]}})
+    )
+
+
+def call(monkeypatch, *arguments: Any, train: Any = command.train) -> int:
+    monkeypatch.setattr(sys, "argv", ["study.py", *map(str, arguments)])
+    return command.main(train)
+
+
+# ---- the files -------------------------------------------------------------------------------
+
+
+def test_figures_and_curves_of_a_study_are_those_of_its_runs(toy, tmp_path):
+    trained(tmp_path / "run", toy.command(toy.runs[1]))
+    (run,) = read_one(tmp_path / "run")
+    studies.add(toy, toy.runs[1], run, studies.origin_of(tmp_path / "run"))
+    (same,) = read([toy.folder])
+    assert same.setting == run.setting and same.limits == run.limits and same.steps == run.steps
+    for name, values in run.values.items():
+        np.testing.assert_allclose(same.values[name], values, rtol=1e-8, err_msg=name)
+    assert {*same.values} - {*run.values} == {f"{k} 1000-2000" for k in ("return", "cost", "swing")} | {
+        "minutes"
+    }
+    edges = np.linspace(0, run.steps, 51)
+    for name in condensed.CURVES:
+        here, there = (plots.stretches(r.table, name, edges) for r in (same, run))
+        np.testing.assert_allclose(here, there, rtol=2e-3, err_msg=name)
+
+
+def test_a_window_has_means_and_the_swing_of_the_cost_by_hand(toy, tmp_path):
+    trained(tmp_path / "run", toy.command(toy.runs[0]))
+    (run,) = read_one(tmp_path / "run")
+    found = studies.more_figures(run.table, toy.windows)  # iterations 101 .. 200, five spans of 20
+    np.testing.assert_allclose(found["return 1000-2000"], [150.5, 301])
+    # costs are 21 .. 39, 0, then 1 .. 20, and so on: means of spans are 28.5 and 10.5 in turn
+    np.testing.assert_allclose(found["cost 1000-2000"], [21.3, 30])
+    np.testing.assert_allclose(found["swing 1000-2000"], [18 * (0.6 * 0.4) ** 0.5, 0])
+
+
+def test_what_a_step_promises_and_keeps_is_a_slope_by_hand():
+    count = 5 * studies.SPAN
+    promise = np.repeat([-0.1, -0.2, -0.3, -0.1, -0.2], studies.SPAN)
+    drops = np.cumsum([0, *(0.5 * studies.SPAN * np.array([-0.1, -0.2, -0.3, -0.1]))])
+    table = {
+        "seed": np.zeros(count),
+        "steps": np.arange(count) + 1.0,
+        "train/objective_c": promise,
+        "train/violation": np.repeat(drops, studies.SPAN),
+    }
+    found = studies.more_figures(table, [])
+    np.testing.assert_allclose(found["promised"], [0.18])
+    np.testing.assert_allclose(found["kept"], [0.5])  # half of each promise comes true
+
+
+def test_rows_say_what_a_run_was_made_with_and_how_it_ended(toy, tmp_path):
+    for i, (steps, nonfinite) in enumerate([(4000, (0, 1)), (2000, (0, 0))]):
+        trained(tmp_path / str(i), toy.command(toy.runs[i]), steps, nonfinite)
+        (run,) = read_one(tmp_path / str(i))
+        studies.add(toy, toy.runs[i], run, studies.origin_of(tmp_path / str(i)))
+    rows = condensed.read(toy.folder).rows
+    assert [row["state"] for row in rows] == ["done", "diverged", "unfinished", "unfinished"]
+    assert [row["settings"] for row in rows] == ["", "", "algo.dual_lr=0.2", "algo.dual_lr=0.2"]
+    first = rows[0]
+    assert (first["device"], first["engine"], first["seed"], first["steps"]) == (
+        "abacus",
+        "c",
+        "0",
+        "4000",
+    )
+    last = json.loads((tmp_path / "0" / "versions.json").read_text())[-1]["commit"]
+    assert last is None or (last.startswith(first["commit"]) and len(first["commit"]) == 7)
+    assert first["dirty"] == ("" if last is None else "yes" if last.endswith("-dirty") else "no")
+
+
+def test_a_study_whose_files_do_not_belong_together_is_refused(toy, tmp_path):
+    trained(tmp_path / "run", toy.command(toy.runs[0]))
+    (run,) = read_one(tmp_path / "run")
+    studies.add(toy, toy.runs[0], run, condensed.Origin())
+    table = toy.folder / "final.csv"
+    table.write_text(table.read_text().replace("algo=cpo", "algo=pcpo"))
+    with pytest.raises(ConfigError, match="lacks rows of final"):
+        condensed.read(toy.folder)
+    (toy.folder / "curves.npz").write_bytes(b"PK no more")
+    with pytest.raises(ConfigError, match="cannot be read"):
+        condensed.read(toy.folder)
+
+
+# ---- the command -----------------------------------------------------------------------------
+
+
+def test_an_interrupted_study_continues_with_what_is_left(toy, tmp_path, monkeypatch, capsys):
+    asked: list[str] = []
+
+    def train(options: list[str], place: command.Place) -> int:
+        asked.append(place.folder.name)
+        if len(asked) == 2:
+            place.folder.mkdir()
+            return 130  # as after Ctrl-C
+        trained(place.folder, options) if not place.folder.exists() else None
+        return 0
+
+    runs = tmp_path / "runs"
+    arguments = (toy.folder, "--runs", runs)
+    assert call(monkeypatch, *arguments, train=train) == 130
+    assert "left to do: point_goal1-ppo_lag-algo.dual_lr=0.2\n" in capsys.readouterr().out
+    assert call(monkeypatch, *arguments, "--list") == 0
+    assert (
+        capsys.readouterr().out
+        == "point_goal1-cpo: done\npoint_goal1-ppo_lag-algo.dual_lr=0.2: to do\n"
+    )
+    shutil.rmtree(runs / "toy" / asked[1])
+    assert call(monkeypatch, *arguments, train=train) == 0
+    assert asked == ["point_goal1-cpo", *["point_goal1-ppo_lag-algo.dual_lr=0.2"] * 2]
+    assert call(monkeypatch, *arguments, train=train) == 0 and len(asked) == 3
+    assert {p.name for p in toy.folder.iterdir()} == {
+        "study.yaml",
+        "final.csv",
+        "curves.npz",
+        "README.md",
+    }
+    text = (toy.folder / "README.md").read_text()
+    assert (
+        "| `point_goal1` `cpo` | 2 |" in text
+        and "| `point_goal1` `ppo_lag` `algo.dual_lr=0.2` |" in text
+    )
+    for name in ("toy-trade_off.png", "toy-curves1.png"):
+        assert f"(../images/{name})" in text and (toy.folder.parent / "images" / name).exists()
+
+
+def test_a_page_keeps_the_words_around_its_tables(toy, tmp_path):
+    trained(tmp_path / "run", toy.command(toy.runs[0]))
+    (run,) = read_one(tmp_path / "run")
+    studies.add(toy, toy.runs[0], run, condensed.Origin())
+    page = toy.folder / "README.md"
+    page.write_text("# Mine\n\nbefore\n\n<!-- measured: matrix -->\nold\n<!-- end -->\n\nafter\n")
+    studies.write_page(toy)
+    text = page.read_text()
+    assert text.startswith("# Mine\n\nbefore\n") and text.endswith("\n\nafter\n") and "old" not in text
+    assert "| `cpo` | " in text
+
+
+def test_failed_runs_are_kept_and_tried_again_last(toy, tmp_path, monkeypatch, capsys):
+    asked: list[str] = []
+
+    def train(options: list[str], place: command.Place) -> int:
+        asked.append(place.folder.name)
+        shutil.rmtree(place.folder, ignore_errors=True)
+        trained(place.folder, options, 2000)
+        return 1 if "algo=cpo" in options else 130
+
+    arguments = (toy.folder, "--runs", tmp_path / "runs")
+    assert call(monkeypatch, *arguments, train=train) == 1
+    assert "point_goal1-cpo: failed, see" in capsys.readouterr().out
+    assert {row["state"] for row in condensed.read(toy.folder).rows} == {"failed"}
+    assert call(monkeypatch, *arguments, train=train) == 1
+    assert asked == [*asked[:2], *asked[1::-1]] and asked[0] == "point_goal1-cpo"
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (["nothing"], "no study nothing"),
+        (["gaol"], "no study gaol; did you mean 'goal'?"),
+        (
+            ["goal", "--only", "point_goal1-cop"],
+            "--only point_goal1-cop; did you mean 'point_goal1-cpo'?",
+        ),
+    ],
+)
+def test_what_is_not_there_is_one_line_and_status_2(arguments, message, monkeypatch, capsys):
+    assert call(monkeypatch, *arguments, "--list") == 2
+    assert capsys.readouterr().err.startswith(f"error: {message}")
+
+
+@pytest.mark.parametrize(
+    "old, new, message",
+    [
+        ("title: Toy", "titel: Toy", "expected about, options, runs, title and perhaps"),
+        ("algo=ppo_lag algo.dual_lr=0.2", "algo=cpo", "point_goal1-cpo occurs twice"),
+        ("- env", "env", "cannot be read"),
+    ],
+)
+def test_a_study_yaml_that_says_something_else_is_refused(old, new, message, toy):
+    (toy.folder / "study.yaml").write_text(TOY.replace(old, new))
+    with pytest.raises(ConfigError, match=message):
+        studies.read(toy.folder)
+
+
+@pytest.mark.slow  # two real runs of scripts/train.py, one of them stopped half-way
+def test_real_training_is_stopped_and_continued(tmp_path):
+    folder = tmp_path / "results" / "toy"
+    folder.mkdir(parents=True)
+    (folder / "study.yaml").write_text(
+        "title: Toy\nabout: Which earns more?\n"
+        "options: >-\n  env=toys:Corridor num_envs=4 algo.horizon=16 algo.minibatches=2\n"
+        "  algo.critic_epochs=2 algo.hidden=[8,8] total_steps=64000 eval_episodes=2 video=false\n"
+        "runs:\n- algo=ppo\n- algo=cpo\n"
+    )
+    runs = tmp_path / "runs"
+    words = [sys.executable, ROOT / "scripts" / "study.py", folder, "--runs", runs]
+    environ = {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}"}
+    process = subprocess.Popen(words, env=environ)
+    log = runs / "toy" / "ppo" / "metrics.csv"
+    while not (log.exists() and log.read_text().count("\n") > 20):
+        assert process.poll() is None
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    assert process.wait() == 130 and not condensed.there(folder)
+    done = subprocess.run(words, env=environ, text=True, capture_output=True)
+    assert done.returncode == 0 and "left to do: nothing" in done.stdout, done.stdout + done.stderr
+    assert "resuming at" in (runs / "toy" / "ppo.log").read_text()
+    rows = condensed.read(folder).rows
+    assert [(row["algo"], row["state"], row["steps"]) for row in rows] == [
+        ("ppo", "done", "64000"),
+        ("cpo", "done", "64000"),
+    ]
+    assert "| `ppo` | 1 |" in (folder / "README.md").read_text()

@@ -1,0 +1,85 @@
+"""What the constraint, the metrics and the learner see of rewards and costs, by hand."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+from learners import begin, learner
+from toys import Clock
+
+from jaxsafe.learn.on_policy import learned
+from jaxsafe.learn.returns import Window
+
+FIVE_STEPS = {"stagger": False, "horizon": 5}
+
+
+def test_what_the_learner_sees_is_normalised_by_all_batches_up_to_this_one():
+    reward = jnp.array([[[1.0, 3.0]], [[5.0, 11.0]]])  # two batches of [T, N] = [1, 2]
+    cost = jnp.array([[[0.0, 1.0]], [[1.0, 0.0]]])
+    ts = begin("pdo", reward_normalize=True, cost_normalize=True)
+    a, _, signals = learned(ts, reward[0], cost[0], None)
+    np.testing.assert_allclose(a, [[-1, 1]], rtol=1e-6)  # mean 2, standard deviation 1
+    a, b, signals = learned(dataclasses.replace(ts, signals=signals), reward[1], cost[1], None)
+    # 1, 3, 5, 11: mean 5, variance (16 + 4 + 0 + 36) / 4 = 14; 0, 1, 1, 0: mean and deviation 1/2
+    np.testing.assert_allclose(a, [[0, 6 / 14**0.5]], rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(b, [[1, -1]], rtol=1e-6)
+    np.testing.assert_allclose(signals.mean, [5, 0.5])
+    np.testing.assert_allclose(signals.var, [14, 0.25], rtol=1e-6)
+    for reward_too, cost_too in ((True, False), (False, True)):
+        cfg = dataclasses.replace(ts.config, reward_normalize=reward_too, cost_normalize=cost_too)
+        a, b, _ = learned(dataclasses.replace(ts, config=cfg), reward[0], cost[0], None)
+        assert (a == reward[0]).all() == (not reward_too) and (b == cost[0]).all() == (not cost_too)
+
+
+def test_the_constraint_and_the_metrics_see_rewards_and_costs_as_they_are():
+    env = Clock(episode_length=5)
+    runs = [
+        learner("pdo", env).update(begin("pdo", env, **FIVE_STEPS | normalised, cost_limit=9.0))
+        for normalised in ({}, {"reward_normalize": True, "cost_normalize": True})
+    ]
+    for ts, m in runs:
+        assert (m["train/return"], m["train/cost"], m["train/cost_estimate"]) == (5, 10, 10)
+        assert m["train/cost_rate"] == 2 and m["train/return_estimate"] == 5
+        np.testing.assert_allclose(ts.dual.lam, 0.001 + 0.1, rtol=1e-4)  # a violation of 1, Adam's step
+    plain, scaled = (m["train/value_loss_c"] for _, m in runs)
+    assert scaled < plain / 2  # the critic's targets are near 0, not near 2 / (1 - discount)
+
+
+def test_the_constraint_sees_the_mean_cost_of_the_window():
+    env = Clock(episode_length=5)
+    ts, update = begin("crpo", env, cost_window=3, cost_limit=6.0), learner("crpo", env).update
+    seen = []
+    for _ in range(4):  # an episode costs 10: above the limit of 6, and its tolerance of 2
+        ts, metrics = update(ts)
+        assert metrics["train/cost_estimate"] == 10
+        seen.append(ts.past_costs.values.tolist())
+        assert metrics["train/over_limit"] == 1
+    assert seen == [[0, 0, 10], [0, 10, 10], [10, 10, 10], [10, 10, 10]]
+    # the next J_c is 10 again: with 1 and 4 before it the mean is 5, with 7 and 10 it is 9
+    for past, over in (((9.0, 1.0, 4.0), 0), ((0.0, 7.0, 10.0), 1)):
+        before = dataclasses.replace(ts, past_costs=Window(jnp.array(past), jnp.int32(3)))
+        _, metrics = update(before)
+        assert metrics["train/over_limit"] == over
+    # of three with but one before it the mean is (4 + 10) / 2
+    before = dataclasses.replace(ts, past_costs=Window(jnp.array([0.0, 0.0, 4.0]), jnp.int32(1)))
+    after, metrics = update(before)
+    assert metrics["train/over_limit"] == 0 and after.past_costs.count == 2
+
+
+def test_metrics_are_of_the_episodes_that_ended_and_of_none_there_is_no_mean():
+    env = Clock(episode_length=9, lives=(3, 3))
+    ts, m = learner("ppo", env).update(begin("ppo", env, stagger=False, horizon=6))
+    expected = {"episodes": 16, "return": 3, "cost": 6, "cost_a": 1.5, "cost_b": 4.5, "ticks": 3}
+    expected |= {"episode_length": 3, "cost_rate": 2}
+    for name, x in expected.items():
+        np.testing.assert_allclose(m[f"train/{name}"], x, rtol=1e-6)
+    # the mean length starts at the limit, 9, and takes 16 episodes of 3 steps among a memory of 8
+    np.testing.assert_allclose(m["train/cost_estimate"], 2 * (9 - 6 * 16 / 24), rtol=1e-6)
+
+    ts = begin("ppo", env, stagger=False, horizon=6)
+    state = ts.rollout.state
+    state = dataclasses.replace(state, obs=state.obs.at[:, 2].set(99.0))  # none ends in 6 steps
+    endless = dataclasses.replace(ts, rollout=dataclasses.replace(ts.rollout, state=state))
+    _, m = learner("ppo", env).update(endless)
+    assert m["train/episodes"] == 0 and jnp.isnan(m["train/return"]) and jnp.isnan(m["train/ticks"])
+    assert m["train/cost_estimate"] == 2 * 9

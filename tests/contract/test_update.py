@@ -1,0 +1,118 @@
+"""What an update does to numbers: one program of three members for each method and option."""
+
+import dataclasses
+from functools import cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from learners import begin, covering, every_option, learner, members, numbers, others_slowly, row
+
+from jaxsafe.types import Metrics, PyTree
+
+COMPILED = others_slowly(covering())
+LIMITS = {"cost_limit": jnp.array([25.0, 1.0, 5.0]), "entropy_coef": jnp.zeros(3)}
+
+
+class Update(NamedTuple):
+    before: PyTree  # three members, whose limits are LIMITS
+    after: PyTree
+    metrics: Metrics
+
+
+@cache
+def first_update(name: str) -> Update:
+    before = members(name, [0, 1, 2], **LIMITS)
+    return Update(before, *learner(name).together(before))
+
+
+def same(a: Any, b: Any) -> None:
+    for x, y in zip(numbers(a), numbers(b), strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
+def broken(ts: PyTree, *where: int) -> PyTree:
+    """`ts` with a state that is not finite in one environment: of a lone member, or of member i."""
+    state = ts.rollout.state
+    at = (*where, 0)
+    state = dataclasses.replace(
+        state, physics=state.physics.at[at].set(jnp.nan), obs=state.obs.at[at].set(jnp.nan)
+    )
+    return dataclasses.replace(ts, rollout=dataclasses.replace(ts.rollout, state=state))
+
+
+@pytest.mark.parametrize("name", COMPILED)
+def test_an_update_moves_every_parameter_and_stays_finite(name):
+    before, after, metrics = first_update(name)
+    assert jax.tree.structure(before) == jax.tree.structure(after)
+    assert [x.aval for x in jax.tree.leaves(before)] == [x.aval for x in jax.tree.leaves(after)]
+    assert all(jnp.isfinite(x).all() for x in jax.tree.leaves((after.params, metrics)))
+    assert (metrics["train/nonfinite"] == 0).all()
+    for a, b in zip(*map(jax.tree.leaves, (before.params, after.params)), strict=True):
+        assert (a != b).reshape(3, -1).any(1).all()
+
+
+@pytest.mark.parametrize("name", COMPILED)
+def test_the_same_key_gives_the_same_run(name):
+    same(first_update(name)[1:], learner(name).together(members(name, [0, 1, 2], **LIMITS)))
+
+
+@pytest.mark.parametrize("name", COMPILED)
+def test_a_batch_that_is_not_finite_changes_nothing_that_is_learned_and_is_counted(name):
+    ts = first_update(name).after
+    whole, _ = learner(name).together(ts)
+    after, metrics = learner(name).together(broken(ts, 1))
+    assert metrics["train/nonfinite"][1] > 0
+    for field in ("params", "dual", "normaliser", "episode_length"):
+        same(row(getattr(ts, field), 1), row(getattr(after, field), 1))
+    for other in (0, 2):  # the members beside it learn on
+        assert metrics["train/nonfinite"][other] == 0
+        same(row(whole, other), row(after, other))
+
+
+@pytest.mark.parametrize("name", COMPILED)
+def test_acting_normalises_and_is_the_mean_without_a_key(name):
+    algo, ts = learner(name).algo, row(first_update(name).after, 0)
+    size = ts.rollout.state.obs.shape[-1]  # with what an augmentation appends
+    obs = jax.random.normal(jax.random.key(1), (500, size))
+
+    def act(ts, obs, key=None):
+        return algo.policy.act(algo.params(ts), (), obs, key)[0]
+
+    mean = act(ts, obs[0])
+    assert mean.shape == (2,)
+    draws = jax.vmap(lambda key: act(ts, obs[0], key))(jax.random.split(jax.random.key(0), 4000))
+    np.testing.assert_allclose(draws.mean(0), mean, atol=0.05)
+    np.testing.assert_allclose(draws.std(0), jnp.exp(ts.params["actor"]["log_std"]), rtol=0.05)
+    normaliser = dataclasses.replace(ts.normaliser, mean=ts.normaliser.mean + 1)
+    shifted = dataclasses.replace(ts, normaliser=normaliser)
+    np.testing.assert_allclose(act(shifted, obs.at[:, :4].add(1.0)), act(ts, obs), rtol=2e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", COMPILED)
+def test_an_entropy_bonus_raises_the_entropy_and_a_malus_lowers_it(name):
+    coefs = jnp.array([-100.0, 0.0, 100.0])
+    ts = members(name, [0, 0, 0], cost_limit=jnp.full(3, 25.0), entropy_coef=coefs)
+    low, none, high = map(float, learner(name).together(ts)[1]["train/entropy"])
+    assert low < none - 1e-3 < none + 1e-3 < high  # by steps of 3e-4, or within 0.02 nats
+
+
+ESTIMATORS = {"cpo": "plain", "focops": "vtrace", "ppo_saute": "gae_rtg"}
+
+
+@pytest.mark.parametrize("name", others_slowly([*ESTIMATORS]))
+def test_two_updates_with_every_option_at_once_are_finite(name):
+    ts = begin(name, **every_option(name, ESTIMATORS.get(name, "vtrace")))
+    ts, _ = learner(name).update(ts)
+    ts, metrics = learner(name).update(ts)
+    assert all(jnp.isfinite(x).all() for x in jax.tree.leaves((ts.params, ts.signals, metrics)))
+    assert metrics["train/nonfinite"] == 0 and ts.signals.count == 2 * 8 * 25
+    after, metrics = learner(name).update(broken(ts))  # leaves the statistics of rewards alone, too
+    assert metrics["train/nonfinite"] > 0
+    same(ts.signals, after.signals)
+
+
+def test_without_normalisation_nothing_is_kept():
+    assert begin("ppo", obs_normalize=False).normaliser == ()
