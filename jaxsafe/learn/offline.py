@@ -138,16 +138,16 @@ def offline(env: Env, learner: Learner) -> Algorithm:
 
 def taken(data: DataSet, rows: jax.Array, cfg: Any, normaliser: PyTree) -> Transitions:
     """The transitions of some rows [B], with observations as the networks see them."""
-    part = DataSet(*(jnp.asarray(x)[rows] for x in data))
+    obs, action, reward, cost, next_obs, terminated = (jnp.asarray(x)[rows] for x in data)
     return Transitions(
-        obs=seen(normaliser, part.obs, cfg),
-        action=part.action,
-        reward=part.reward,
-        cost=part.cost,
-        costs=part.cost[:, None],
-        next_obs=seen(normaliser, part.next_obs, cfg),
+        obs=seen(normaliser, obs, cfg),
+        action=action,
+        reward=reward,
+        cost=cost,
+        costs=cost[:, None],
+        next_obs=seen(normaliser, next_obs, cfg),
         steps=jnp.ones(len(rows), jnp.int32),
-        terminated=part.terminated,
+        terminated=terminated,
         weight=jnp.full(len(rows), 1 / len(rows)),
     )
 

@@ -22,6 +22,10 @@ MARKERS = {"-": "o", "--": "s", ":": "^", "-.": "v"}  # by the kind of line that
 PANELS = (("train/return", "return of an episode"), ("train/cost", "cost of an episode"))
 
 
+# what evaluation during training adds to a panel: end of the column's name -> label and marker
+EVALUATED = {"": ("evaluated, mean action", "o"), "_sampled": ("evaluated, sampled", "s")}
+
+
 def by_seed(metrics: dict[str, np.ndarray], name: str) -> tuple[np.ndarray, np.ndarray]:
     """Steps [T] and values [S, T] of one metric; NaN where a seed has no value yet."""
     clock = metrics[run_folder.clock_of(metrics)]
@@ -42,6 +46,8 @@ def curves(
 ) -> None:
     """Write the PNG: a thin line a seed, and for several seeds their mean and 95 % interval.
 
+    Evaluations during training are points on dashed lines, each the mean over seeds.
+
     Settings trained side by side have a colour each, and their own limits where those differ. Named
     costs with limits of their own have panels instead of a limit on the sum.
     """
@@ -61,6 +67,10 @@ def curves(
         for i, (setting, table) in enumerate(settings.items()):
             if name in table and len(table["steps"]):
                 draw(axes, *by_seed(table, name), f"C{i % 10}", setting)
+            for end, (label, marker) in EVALUATED.items():
+                if (column := name.replace("train/", "eval/") + end) in table:
+                    look = {"marker": marker, "mfc": "none" if end else None, "color": f"C{i % 10}"}
+                    axes.plot(*evaluated(table, column), ls="--", lw=1, label=label, **look)
         if name in limits:
             common, column = limits[name]
             own = {t[column][0]: i for i, t in enumerate(settings.values()) if column in t}
@@ -71,6 +81,14 @@ def curves(
             axes.legend(frameon=False, fontsize="small")
     figure.suptitle(title)
     figure.savefig(path, dpi=120)
+
+
+def evaluated(metrics: Mapping[str, np.ndarray], name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Where a metric has values, as steps [T], and their means over seeds [T]."""
+    known = np.isfinite(metrics[name])
+    clock, values = metrics[run_folder.clock_of(metrics)][known], metrics[name][known]
+    steps = np.unique(clock)
+    return steps, np.array([values[clock == step].mean() for step in steps])
 
 
 def axis_of(metrics: Mapping[str, np.ndarray]) -> str:

@@ -51,7 +51,8 @@ class Run(NamedTuple):
         """Whether training is at the end that its config gives."""
         updates = self.config.get("total_updates")  # a study of an older version has none
         if updates is not None:
-            return int(self.table["updates"].max()) >= updates
+            column = "updates" if "updates" in self.table else "steps"  # a study has one clock
+            return int(self.table[column].max()) >= updates
         return self.steps >= self.config["total_steps"]
 
 

@@ -22,6 +22,10 @@ class Unit(NamedTuple):
     def at(self, iteration: int) -> int:
         return iteration * self.each
 
+    def crosses(self, every: int, iteration: int) -> bool:
+        """Whether `iteration` reaches or passes a multiple of `every`; never one of 0."""
+        return every > 0 and self.at(iteration) // every > self.at(iteration - 1) // every
+
 
 def unit(clocks: Clocks) -> Unit:
     return Unit("steps", clocks.steps) if clocks.steps else Unit("updates", clocks.updates)

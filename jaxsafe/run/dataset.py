@@ -16,6 +16,7 @@ Source: Liu et al. (2023), "Datasets and Benchmarks for Offline Safe Reinforceme
 import zipfile
 import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -73,7 +74,8 @@ def read_dataset(path: str) -> DataSet:
 def write_dataset(path: str | Path, data: DataSet) -> None:
     """Write a data set that `read_dataset` reads."""
     fields = {name: np.asarray(x) for name, x in data._asdict().items()}
-    np.savez_compressed(path, **{name: fields[field] for name, (field, _) in ARRAYS.items()})
+    named: Any = {name: fields[field] for name, (field, _) in ARRAYS.items()}
+    np.savez_compressed(path, **named)
 
 
 def sha256(path: str) -> str:

@@ -15,6 +15,14 @@ from jaxsafe.types import Clocks
 OVERFLOW = "train/overflow"  # steps of an episode in which engine warp ran out of room
 
 
+SHOWN = {  # what the progress report shows: the first of these that is known
+    "ret": ("train/return_estimate", "eval/return"),
+    "cost": ("train/cost_estimate", "eval/cost"),
+    "lam": ("train/lam",),
+}
+UNKNOWN = np.full(1, np.nan)
+
+
 class Log:
     """Metrics to metrics.csv, TensorBoard and the progress report, the files by a thread.
 
@@ -92,12 +100,8 @@ class Log:
             shown,
             len(self.seeds),
             **{
-                short: mean(values[name]) if name in values else float("nan")
-                for short, name in (
-                    ("ret", "train/return_estimate"),
-                    ("cost", "train/cost_estimate"),
-                    ("lam", "train/lam"),
-                )
+                short: mean(next((values[name] for name in names if name in values), UNKNOWN))
+                for short, names in SHOWN.items()
             },
         )
 

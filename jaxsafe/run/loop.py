@@ -14,12 +14,25 @@ import numpy as np
 
 from jaxsafe.learn.constraints import own_limits
 from jaxsafe.run import checkpoint, clock, distributed, spread
+from jaxsafe.run.evaluate import COLUMNS
 from jaxsafe.run.interrupts import Interrupts
 from jaxsafe.run.log import Log
 from jaxsafe.run.progress import Report
 from jaxsafe.run.settings import TrainConfig
 from jaxsafe.run.spread import Program
 from jaxsafe.types import PyTree
+
+
+class Hooks(NamedTuple):
+    """What a session adds to the loop.
+
+    adapt(ts) -> ts changes a fresh train state, to start from another policy; not used on resumption.
+    evaluate(params) -> {name: [M]} measures the policies of all members, for the columns
+        `evaluate.COLUMNS`; process 0 calls it. None: they are not measured.
+    """
+
+    adapt: Callable[[PyTree], PyTree] = lambda ts: ts
+    evaluate: Callable[[PyTree], dict[str, np.ndarray]] | None = None
 
 
 class Outcome(NamedTuple):
@@ -34,7 +47,7 @@ def train(
     folder: Path,
     report: Report,
     resume_command: str,
-    adapt: Callable[[PyTree], PyTree] | None = None,
+    hooks: Hooks = Hooks(),  # noqa: B008
 ) -> Outcome:
     """Train to the end that `settings` gives, from the newest checkpoint in `folder` if there is one.
 
@@ -44,7 +57,7 @@ def train(
         folder: the run folder; gets metrics.csv, tensorboard/ and checkpoints/.
         report: where progress goes.
         resume_command: printed when the run is stopped early.
-        adapt: changes a fresh train state (start from another policy); not used on resumption.
+        hooks: what is done beside.
     Returns:
         The train state, with its leading axis, and how far it is.
     Raises:
@@ -70,11 +83,12 @@ def train(
         else:
             start = distributed.place(program.start, program.sharding)
             ts = jax.jit(program.init)(start, program.shared())
-            ts = distributed.place(adapt(ts), program.sharding) if adapt else ts
+            ts = distributed.place(hooks.adapt(ts), program.sharding)
         if iteration >= iterations:
             report.line("nothing left to train")
             return Outcome(ts, iteration, False)
         names = sorted(jax.eval_shape(program.update, ts, program.shared())[1])
+        names += COLUMNS if hooks.evaluate else ()
         update = spread.compiled(program, ts)
         report.line(f"compiled in {time.perf_counter() - begun:.1f} s")
         stop.nothing_to_save = ""
@@ -91,6 +105,11 @@ def train(
             while iteration < iterations:
                 ts, metrics = update(ts, program.shared(iteration, since))
                 metrics, iteration = distributed.whole(metrics), iteration + 1
+                due = unit.crosses(settings.eval_every, iteration) or iteration == iterations
+                if hooks.evaluate and due:
+                    acting = distributed.whole(program.params(ts))
+                    if log:
+                        metrics |= hooks.evaluate(of_members(program, acting))
                 if log:
                     log.append(iteration, metrics)
                 by_count = (
@@ -105,9 +124,7 @@ def train(
                     if log:
                         log.sync()
                         checkpoint.save(store, state, at, since, keeps_replay)
-                        acting = jax.tree.map(
-                            lambda x: x[: len(program.members)], program.params(state)
-                        )
+                        acting = of_members(program, program.params(state))
                         checkpoint.save(folder / "policy", acting, at)
                     saved_at = time.perf_counter()
                     if keeps_replay and checkpoint.replay_bytes(like):  # at most 5% of the time
@@ -120,6 +137,12 @@ def train(
             done = f"{unit.at(iteration):,} {unit.name}"
             report.line(f"stopped at {done}; continue with: {resume_command}")
     return Outcome(ts, iteration, interrupted)
+
+
+def of_members(program: Program, params: PyTree) -> PyTree:
+    """What acts of each member, [M, ...], on one device: a split one has a copy on each of its own."""
+    own = jax.tree.map(lambda x: x[: len(program.members)], params)
+    return jax.device_put(own, jax.local_devices()[0])
 
 
 def restored(store: Path, like: PyTree, report: Report) -> tuple[PyTree, int, int]:

@@ -35,6 +35,7 @@ import jaxsafe
 from jaxsafe.config import ConfigError
 from jaxsafe.run import checkpoint
 from jaxsafe.run.checkpoint import Progress
+from jaxsafe.run.evaluate import COLUMNS
 
 PACKAGES = (
     "jax", "jaxlib", "mujoco", "mujoco-mjx", "warp-lang", "flax", "optax", "orbax-checkpoint", "numpy",
@@ -139,24 +140,27 @@ class Metrics:
     def __init__(self, folder: Path, names: list[str], iteration: int):
         """Open for appending after `iteration`; later rows and a torn last line are dropped.
 
+        Columns of evaluation may be new, or stay without new values.
+
         Raises:
             ConfigError: the file exists with other columns.
         """
-        self.path, self.names, self.seconds = folder / "metrics.csv", names, 0.0
-        header = [*INDEX, *names]
+        self.path, self.names, self.seconds = folder / "metrics.csv", list(names), 0.0
+        header = [*INDEX, *self.names]
         kept = []
         if self.path.exists() and iteration:
             with self.path.open(newline="") as file:
                 rows = csv.reader(file)
-                if (found := next(rows, header)) != header:
-                    odd = sorted(set(found) ^ set(header))
-                    raise ConfigError(
-                        f"{self.path} has other columns ({', '.join(odd) or 'in another order'})"
-                    )
+                found = next(rows, header)
+                odd = sorted(set(found) ^ set(header))
+                if not all(name in COLUMNS for name in odd):
+                    raise ConfigError(f"{self.path} has other columns ({', '.join(odd)})")
+                self.names += [name for name in found if name not in header]
+                header = [*INDEX, *self.names]
                 kept = [
-                    r
-                    for r in rows
-                    if len(r) == len(header) and r[0].isdigit() and int(r[0]) <= iteration
+                    [dict(zip(found, row, strict=True)).get(name, "") for name in header]
+                    for row in rows
+                    if len(row) == len(found) and row[0].isdigit() and int(row[0]) <= iteration
                 ]
             self.seconds = float(kept[-1][INDEX.index("seconds")]) if kept else 0.0
         part = self.path.with_suffix(".part")
@@ -167,8 +171,9 @@ class Metrics:
         self.writer = csv.writer(self.file, lineterminator="\n")
 
     def append(self, at: Progress, seeds: list[int], seconds: float, values: Mapping) -> None:
-        """Add one row a seed; `values` holds float [S] by metric name."""
-        columns = [np.asarray(values[name], np.float32) for name in self.names]
+        """Add one row a seed; `values` holds float [S] by metric name, those of evaluation if known."""
+        nothing = dict.fromkeys(COLUMNS, np.full(len(seeds), np.nan))
+        columns = [np.asarray((nothing | dict(values))[name], np.float32) for name in self.names]
         for s, seed in enumerate(seeds):
             cells = ("" if math.isnan(c[s]) else str(c[s]) for c in columns)
             self.writer.writerow([*at, seed, f"{seconds:.3f}", *cells])

@@ -15,6 +15,7 @@ from jaxsafe.config import ConfigError, flat
 from jaxsafe.envs.wrap import innermost
 from jaxsafe.run import checkpoint, clock, dataset, distributed, loop, run_folder
 from jaxsafe.run.devices import check_devices, device_name, use_compilation_cache
+from jaxsafe.run.evaluate import watcher
 from jaxsafe.run.interrupts import Interrupts
 from jaxsafe.run.memory import check_memory, check_state_memory
 from jaxsafe.run.policies import warm_start
@@ -153,10 +154,13 @@ def run(session: Session, report: Report, finish: Finish) -> int:
     """Train, then `finish`. Returns the exit status: 0, or 130 if the user stopped it."""
     settings, folder, env, program, again = session
     train, cfg = settings.train, settings.algo
-    adapt = None
+    hooks = loop.Hooks()
+    if train.eval_every:
+        algo = settings.row.make(env, None)
+        hooks = hooks._replace(evaluate=watcher(algo, train.eval_episodes, train.seed))
     begun = distributed.first(np.array(run_folder.progress(folder) is not None))
     if train.init_from is not None and not begun:
-        adapt = warm_start(settings, program, report.line)
+        hooks = hooks._replace(adapt=warm_start(settings, program, report.line))
     engine = getattr(innermost(env), "engine", None)  # Safety Gym's environments have one
     try:
         if distributed.leads():
@@ -180,7 +184,7 @@ def run(session: Session, report: Report, finish: Finish) -> int:
     )
     if line := about_replay(program, train):
         report.line(line)
-    outcome = loop.train(program, train, folder, report, again, adapt)
+    outcome = loop.train(program, train, folder, report, again, hooks)
     distributed.leave()
     if outcome.interrupted:
         return 130

@@ -30,6 +30,7 @@ ON_RESUME = (
     "checkpoint_every",
     "checkpoint_iterations",
     "checkpoint_replay",
+    "eval_every",
     "eval_episodes",
     "video",
 )  # may change
@@ -81,16 +82,25 @@ class TrainConfig:
     checkpoint_every: float = 60.0  # s between checkpoints
     checkpoint_iterations: int = 0  # also after this many iterations; 0: by time alone
     checkpoint_replay: bool | None = None  # keep the replay, to resume bit for bit; null: up to 2 GB
-    eval_episodes: int = 20  # at the end, for each seed; 0: none
+    eval_every: int = 0  # evaluate after so many environment steps, or updates without any; 0: never
+    eval_episodes: int = 20  # of an evaluation, for each seed; 0: none, at the end either
     video: bool = True  # of the first seed's policy, at the end
 
     def __post_init__(self) -> None:
         for name in ("total_steps", "total_updates", "num_envs", "num_seeds", "devices"):
             if (value := getattr(self, name)) is not None and value < 1:
                 raise ConfigError(f"{name}={value}: expected at least 1")
-        for name in ("seed", "checkpoint_every", "checkpoint_iterations", "eval_episodes"):
+        for name in (
+            "seed",
+            "checkpoint_every",
+            "checkpoint_iterations",
+            "eval_every",
+            "eval_episodes",
+        ):
             if not (value := getattr(self, name)) >= 0:
                 raise ConfigError(f"{name}={value}: expected at least 0")
+        if self.eval_every and not self.eval_episodes:
+            raise ConfigError(f"eval_every={self.eval_every}: expected eval_episodes of at least 1")
         if self.seed + self.num_seeds > 2**31:
             raise ConfigError(f"seed={self.seed}: expected less than {2**31 - self.num_seeds + 1}")
 

@@ -102,6 +102,17 @@ def test_a_comparison_holds_runs_without_training_episodes(whole):
     assert typed("plot", str(whole), "--out", str(whole.parent / "comparison")) == 0
 
 
+def test_evaluation_during_training_stands_in_for_its_episodes(data, tmp_path):
+    run = tmp_path / "run"
+    args = (*BC, f"dataset={data}", "total_updates=100", "eval_every=30", f"run_dir={run}")
+    assert typed("train", *args) == 0
+    table = run_folder.read_metrics(run)
+    assert table["updates"][np.isfinite(table["eval/cost"])].tolist() == [30, 60, 90, 100]
+    np.testing.assert_array_equal(table["eval/return"], table["eval/return_sampled"])  # deterministic
+    (found,) = read.read([run])
+    assert found.values["return"][0] == pytest.approx(table["eval/return"][-1], rel=1e-6)
+
+
 def test_python_trains_on_a_path(data, tmp_path, capsys):
     run = jaxsafe.train("toys:Corridor", "bc", dataset=data, total_updates=10, updates=10, hidden=(8,),
                         eval_episodes=0, video=False, run_dir=tmp_path / "run")  # fmt: skip

@@ -37,6 +37,13 @@ def test_a_clock_that_stands_still_ends_no_run():
         clock.iterations(TrainConfig(total_updates=64), Clocks(64, 0))
 
 
+def test_a_multiple_is_crossed_once_by_whole_iterations():
+    crossed = [i for i in range(1, 8) if clock.unit(BOTH).crosses(100, i)]
+    assert crossed == [2, 4, 5, 7]  # 128, 256, 320 and 448 are the first from 100, 200, 300, 400 on
+    assert [i for i in range(1, 4) if clock.unit(OFFLINE).crosses(10, i)] == [1, 2, 3]
+    assert not any(clock.unit(BOTH).crosses(0, i) for i in range(1, 8))
+
+
 def test_environment_steps_are_shown_where_there_are_any():
     assert clock.unit(BOTH) == ("steps", 64) and clock.unit(BOTH).at(3) == 192
     assert clock.unit(OFFLINE) == ("updates", 10)
