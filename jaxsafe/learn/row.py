@@ -27,7 +27,7 @@ class Row(NamedTuple):
     config: type[Any]
     make: Callable[..., Algorithm]
     summary: str = ""
-    published: Mapping[str, Mapping[str, Any]] = NOTHING
+    published: Mapping[str, dict[str, Any]] = NOTHING
     omnisafe: str = ""
     holds: Literal["average", "episode", "nothing"] = "average"
     lever: Mapping[str, Any] = NOTHING

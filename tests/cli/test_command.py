@@ -36,7 +36,6 @@ from jaxsafe.learn.conventions import conventions
 from jaxsafe.run import (
     arguments,
     checkpoint,
-    compat,
     loop,
     policies,
     run_folder,
@@ -144,7 +143,6 @@ def test_the_conventions_of_omnisafe_are_defaults_of_either_preset():
 
 def test_each_convention_differs_from_the_defaults_of_every_algorithm_that_has_it():
     for row in algos.ALGOS.values():
-        assert compat.overrides("omnisafe", row.config)
         for convention in conventions(row.config):
             assert all(getattr(row.config(), k) != v for k, v in convention.options.items())
 
