@@ -14,7 +14,7 @@ from jaxsafe.learn import augment
 from jaxsafe.learn.augment import Budget, control_budget, full_budget, init_schedule
 from jaxsafe.learn.normalise import Normaliser, normalise
 from jaxsafe.learn.on_policy import see
-from jaxsafe.learn.rollout import collect, init_rollout
+from jaxsafe.learn.rollout import collect, init_rollout, memoryless
 from jaxsafe.run import checkpoint, compat, evaluate
 from jaxsafe.types import Policy
 
@@ -41,7 +41,7 @@ def start(name, env, **settings):
 
 def run(env, num_envs, horizon, policy, **options):
     rollout = init_rollout(env, jax.random.key(0), num_envs, stagger=False)
-    step = jax.jit(partial(collect, env, policy, horizon=horizon, **options))
+    step = jax.jit(partial(collect, env, memoryless(policy), horizon=horizon, **options))
     return step(rollout, key=jax.random.key(1))[1]
 
 
