@@ -47,21 +47,27 @@ def blank(env: Env) -> DataSet:
 
 @config
 class OfflineConfig:
-    """What the offline algorithms share. [O] OmniSafe's default."""
+    """What the offline algorithms share."""
 
-    updates: int = 1000  # gradient steps of an iteration, which is a row of the metrics
-    batch_size: int = 256  # transitions of a gradient step, drawn with replacement [O]
-    total_iterations: float = float("inf")  # where what decays reaches 0; inf: total_updates' end
-    hidden: tuple[int, ...] = (256, 256)  # units of each network; [O] has a third layer
-    activation: Literal["relu", "tanh"] = "relu"  # [O]
-    init: Literal["torch", "orthogonal"] = "torch"  # weights; [O] torch, its kaiming_uniform
-    obs_normalize: bool = True  # by the mean and variance of the data; [O] False
-    discount: float = 0.99  # [O]
-    cost_discount: float = 0.99  # [O]
-    cost_limit: float = 25.0  # undiscounted cost of an episode [O]; imitation only draws it
-    lr: float = 1e-3  # of the policy, by Adam [O]
-    lr_decay: bool = False  # linearly to 0 at total_iterations
-    max_grad_norm: float = 40.0  # of each network's gradient
+    updates: int = 1000  # Gradient steps of an iteration, which is a row of the metrics.
+    # Transitions of a gradient step, drawn with replacement. As in OmniSafe's VAE-BC.
+    batch_size: int = 256
+    # The iteration at which whatever decays reaches 0. inf: the last one of `total_updates`.
+    total_iterations: float = float("inf")
+    hidden: tuple[int, ...] = (256, 256)  # Units of the hidden layers of each network.
+    activation: Literal["relu", "tanh"] = "relu"  # Of the hidden layers, as in OmniSafe.
+    # The first weights. torch: uniform as in PyTorch, OmniSafe's choice. orthogonal: with gains.
+    init: Literal["torch", "orthogonal"] = "torch"
+    # Whether observations are normalised by the mean and variance of the data. OmniSafe does not.
+    obs_normalize: bool = True
+    # The discount of rewards. Imitation only uses it for evaluation's discounted return.
+    discount: float = 0.99
+    cost_discount: float = 0.99  # The discount of costs, likewise.
+    # The undiscounted cost that an episode may have. Imitation only draws it in plots.
+    cost_limit: float = 25.0
+    lr: float = 1e-3  # The policy's learning rate, by Adam, as in OmniSafe's VAE-BC.
+    lr_decay: bool = False  # Whether it falls linearly to 0 at `total_iterations`.
+    max_grad_norm: float = 40.0  # The largest norm of each network's gradient.
 
 
 @flax.struct.dataclass
