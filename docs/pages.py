@@ -22,6 +22,7 @@ from typing import Any
 
 from jaxsafe.algos import ALGOS, Row
 from jaxsafe.envs import ENVS
+from jaxsafe.learn.offline import OfflineConfig
 from jaxsafe.report import stats, studies
 from jaxsafe.report import tables as report
 from jaxsafe.report.published import read_published
@@ -137,6 +138,8 @@ def measured(name: str) -> str:
         unusual = {k: v for k, v in studies.unusual(run.config).items() if k.startswith("algo.")}
         how += "".join(f", `{k}={v}`" for k, v in unusual.items())
         rows.append(f"| {how} | {ret} | {cost} | {studies.published_cell(run.config, known)} |")
+    if not rows and issubclass(ALGOS[name].config, OfflineConfig):
+        return "Not run at length yet."
     if not rows:
         return "Not run at length yet; it learns the small exact problem of tests/toys.py, Lever."
     head = "| 1e7 steps a seed, limit 25 | return, last 10% | cost | published |\n|---|---|---|---|\n"
@@ -147,9 +150,10 @@ def page(name: str) -> str:
     row = ALGOS[name]
     title, text = prose(row.config.__doc__ or "")
     module = row.config.__module__.rsplit(".", 1)[1]
+    data = " dataset=data.npz" if issubclass(row.config, OfflineConfig) else ""
     return f"""# {title.removesuffix(".")}
 
-    python scripts/train.py env=point_goal1 algo={name}
+    python scripts/train.py env=point_goal1 algo={name}{data}
 
 {text}
 
@@ -164,7 +168,7 @@ The code: [algos/{module}.py](../../algos/{module}.py).
 ## Results
 
 {measured(name)}
-"""
+""".replace("\n\n\n", "\n\n")
 
 
 def fidelity(name: str) -> list[str]:

@@ -125,21 +125,22 @@ class Run:
     def steps(self) -> int:
         """Environment steps of each seed up to the newest checkpoint; 0 without one."""
         done = run_folder.progress(self.folder)
-        return done[1] if done else 0
+        return done.steps if done else 0
 
     @property
     def metrics(self) -> dict[str, np.ndarray]:
-        """metrics.csv: 'steps', 'iteration' and 'seconds' are float [T], over iterations, the rest are
-        float [T, P], over policies, with NaN where an iteration had no value (no episode ended).
+        """metrics.csv: 'iteration', 'steps', 'updates' and 'seconds' are float [T], over iterations.
 
-        Steps are of one seed; 'train/return' and 'train/cost' are undiscounted sums of an episode.
+        The rest are float [T, P], over policies, with NaN where an iteration had no value (no episode
+        ended). Environment steps and updates (gradient steps) are of one seed; 'train/return' and
+        'train/cost' are undiscounted sums of an episode.
         Empty before the first iteration.
         """
         table = run_folder.read_metrics(self.folder)
         num = len(self.settings.configs) * self.settings.train.num_seeds
         rows = len(table["steps"]) // num if table else 0
         whole = {name: x[: rows * num].reshape(rows, num) for name, x in table.items()}
-        common = ("steps", "iteration", "seconds")
+        common = {*run_folder.INDEX} - {"seed"}
         return {name: x[:, 0] if name in common else x for name, x in whole.items()}
 
     def policy(self, obs: jax.Array, key: jax.Array | None = None, index: int = 0) -> jax.Array:

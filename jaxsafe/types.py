@@ -106,7 +106,9 @@ class Algorithm(NamedTuple):
     params(ts) -> pytree, what acts and what another run can start from: networks, normaliser, config.
         No optimiser and no replay.
     task(params) -> the Env whose observations the policy takes.
-    clocks(cfg) -> Clocks.
+    clocks(cfg) -> Clocks. Raises ConfigError for sizes that do not fit each other. Where an update
+        takes no environment steps, the algorithm learns from the data set in `Shared`; elsewhere its
+        config has `num_envs`.
     """
 
     init: Callable[[jax.Array, Any, Shared], PyTree]

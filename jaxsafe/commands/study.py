@@ -100,7 +100,7 @@ def listing(study: Study, runs: Path) -> str:
     for run, state in states(study).items():
         folder = runs / condensed.name_of(run)
         if not state and (progress := run_folder.progress(folder)):
-            state = f"begun, at {progress[1]:,} steps"
+            state = f"begun, at {progress.steps or progress.updates:,} steps"
         lines.append(f"{condensed.name_of(run)}: {state or 'to do'}")
     return "\n".join(lines)
 

@@ -413,6 +413,7 @@ def learned_of(ts: TrainState) -> Learned:
 
 
 def clocks(cfg: Any) -> Clocks:
+    check(cfg)
     return Clocks(cfg.num_envs * cfg.horizon, cfg.critic_epochs * cfg.minibatches)
 
 
@@ -484,10 +485,11 @@ def check(cfg: Any) -> None:
     rows = "num_envs" if cfg.trunk == "gru" else "num_envs * horizon"
     size = cfg.num_envs * (1 if cfg.trunk == "gru" else cfg.horizon)
     if size % cfg.minibatches:
-        divisors = [m for m in range(1, size + 1) if size % m == 0]
+        near = ((cfg.minibatches - i, cfg.minibatches + i) for i in range(1, cfg.minibatches))
+        divisor = next(m for pair in near for m in pair if size % m == 0)
         raise ConfigError(
             f"minibatches={cfg.minibatches}: expected a divisor of {rows} = {size}; "
-            f"the nearest is {min(divisors, key=lambda m: abs(m - cfg.minibatches))}"
+            f"the nearest is {divisor}"
         )
 
 

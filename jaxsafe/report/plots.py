@@ -22,13 +22,16 @@ MARKERS = {"-": "o", "--": "s", ":": "^", "-.": "v"}  # by the kind of line that
 PANELS = (("train/return", "return of an episode"), ("train/cost", "cost of an episode"))
 
 
+# what evaluation during training adds to a panel: end of the column's name -> label and marker
+EVALUATED = {"": ("evaluated, mean action", "o"), "_sampled": ("evaluated, sampled", "s")}
+
+
 def by_seed(metrics: dict[str, np.ndarray], name: str) -> tuple[np.ndarray, np.ndarray]:
     """Steps [T] and values [S, T] of one metric; NaN where a seed has no value yet."""
-    steps, seeds = np.unique(metrics["steps"]), np.unique(metrics["seed"])
+    clock = metrics[run_folder.clock_of(metrics)]
+    steps, seeds = np.unique(clock), np.unique(metrics["seed"])
     values = np.full((len(seeds), len(steps)), np.nan)
-    values[np.searchsorted(seeds, metrics["seed"]), np.searchsorted(steps, metrics["steps"])] = metrics[
-        name
-    ]
+    values[np.searchsorted(seeds, metrics["seed"]), np.searchsorted(steps, clock)] = metrics[name]
     for row in values:
         carry(row)  # over iterations in which no episode ended
     return steps, values
@@ -42,6 +45,8 @@ def curves(
     own_limits: Mapping[str, float] = MappingProxyType({}),
 ) -> None:
     """Write the PNG: a thin line a seed, and for several seeds their mean and 95 % interval.
+
+    Evaluations during training are points on dashed lines, each the mean over seeds.
 
     Settings trained side by side have a colour each, and their own limits where those differ. Named
     costs with limits of their own have panels instead of a limit on the sum.
@@ -62,16 +67,34 @@ def curves(
         for i, (setting, table) in enumerate(settings.items()):
             if name in table and len(table["steps"]):
                 draw(axes, *by_seed(table, name), f"C{i % 10}", setting)
+            for end, (label, marker) in EVALUATED.items():
+                if (column := name.replace("train/", "eval/") + end) in table:
+                    look = {"marker": marker, "mfc": "none" if end else None, "color": f"C{i % 10}"}
+                    axes.plot(*evaluated(table, column), ls="--", lw=1, label=label, **look)
         if name in limits:
             common, column = limits[name]
             own = {t[column][0]: i for i, t in enumerate(settings.values()) if column in t}
             for limit, i in (own or {common: 3}).items():
                 axes.axhline(limit, color=f"C{i % 10}", ls="--", lw=1, label=f"limit {limit:g}")
-        axes.set(xlabel="environment steps", ylabel=label)
+        axes.set(xlabel=axis_of(metrics), ylabel=label)
         if axes.get_legend_handles_labels()[0]:
             axes.legend(frameon=False, fontsize="small")
     figure.suptitle(title)
     figure.savefig(path, dpi=120)
+
+
+def evaluated(metrics: Mapping[str, np.ndarray], name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Where a metric has values, as steps [T], and their means over seeds [T]."""
+    known = np.isfinite(metrics[name])
+    clock, values = metrics[run_folder.clock_of(metrics)][known], metrics[name][known]
+    steps = np.unique(clock)
+    return steps, np.array([values[clock == step].mean() for step in steps])
+
+
+def axis_of(metrics: Mapping[str, np.ndarray]) -> str:
+    """What the axis of training is called."""
+    known = metrics and run_folder.clock_of(metrics) == "updates"
+    return "gradient steps" if known else "environment steps"
 
 
 def draw(axes: Axes, steps: np.ndarray, values: np.ndarray, color: str, setting: str) -> None:
@@ -148,8 +171,8 @@ def front(points: Sequence[tuple[float, float]]) -> tuple[list[float], list[floa
 
 
 def learning(groups: Sequence[Any]) -> Figure:
-    """Return, cost and, where it is known, cost rate so far over environment steps: a row a task, a
-    line a setting.
+    """Return, cost and, where it is known, cost rate so far over training: a row a task, a line a
+    setting.
 
     A point is the mean over one of at most 50 equal stretches of training; the band is the 95 %
     interval over seeds. A line ends where the first of its seeds does.
@@ -165,7 +188,7 @@ def learning(groups: Sequence[Any]) -> Figure:
         cost = panels[1]
         shown = [g for g in groups if g.env == env]
         runs = [run for g in shown for run in g.runs]
-        count = min(50, *(len(np.unique(run.table["steps"])) for run in runs))
+        count = min(50, *(len(np.unique(run.table["iteration"])) for run in runs))
         edges = np.linspace(0, max(run.steps for run in runs), count + 1)
         for g in shown:
             for axes, name in zip(panels, names, strict=True):
@@ -181,8 +204,9 @@ def learning(groups: Sequence[Any]) -> Figure:
         for axes, label in zip(panels, ("return", "cost", "cost rate so far"), strict=False):
             axes.set(title=f"{env}, {label}")
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-    for axes in rows[-1]:
-        axes.set_xlabel("environment steps")
+        clocks = dict.fromkeys(axis_of(run.table) for run in runs)
+        for axes in panels:
+            axes.set_xlabel(" or ".join(clocks))
     legend(figure, rows.ravel(), looks)
     return figure
 
@@ -197,7 +221,7 @@ def stretches(table: Mapping[str, np.ndarray], name: str, edges: np.ndarray) -> 
     found = np.full((len(seeds), len(edges) - 1), np.nan)
     for row, seed in zip(found, seeds, strict=True):
         own = table["seed"] == seed
-        values, steps = table[name][own], table["steps"][own]
+        values, steps = table[name][own], table[run_folder.clock_of(table)][own]
         if name == "train/cost_rate":
             values = np.cumsum(values) / np.arange(1, len(values) + 1)
         known = np.isfinite(values)

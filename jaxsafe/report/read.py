@@ -19,9 +19,11 @@ from jaxsafe.run.settings import NOT_COMPARED, REGISTERED, Entries, ask, settle
 from jaxsafe.run.spread import members
 
 # Fields that do not make another setting.
-NOT_A_SETTING = {"seed", "num_seeds", "num_envs", "devices", *NOT_COMPARED} - {"total_steps"}
+NOT_A_SETTING = {"seed", "num_seeds", "num_envs", "devices", *NOT_COMPARED}
+NOT_A_SETTING -= {"total_steps", "total_updates"}
 
 NEEDED = ("iteration", "steps", "seed", "train/return", "train/cost")  # columns
+STAND_IN = {"train/return": "eval/return", "train/cost": "eval/cost"}  # where training has no episodes
 
 
 class Run(NamedTuple):
@@ -41,7 +43,17 @@ class Run(NamedTuple):
 
     @property
     def steps(self) -> int:
-        return int(self.table["steps"].max())
+        """Environment steps, or gradient steps where training takes none."""
+        return int(self.table[run_folder.clock_of(self.table)].max())
+
+    @property
+    def ended(self) -> bool:
+        """Whether training is at the end that its config gives."""
+        updates = self.config.get("total_updates")  # a study of an older version has none
+        if updates is not None:
+            column = "updates" if "updates" in self.table else "steps"  # a study has one clock
+            return int(self.table[column].max()) >= updates
+        return self.steps >= self.config["total_steps"]
 
 
 def read(paths: Iterable[Path]) -> list[Run]:
@@ -97,6 +109,9 @@ def read_one(folder: Path, entries: Entries = REGISTERED) -> list[Run]:
     metrics = run_folder.read_metrics(folder)
     if not len(metrics.get("iteration", ())):
         return []
+    if run_folder.clock_of(metrics) == "updates":
+        nothing = np.full(len(metrics["seed"]), np.nan)
+        metrics = {name: metrics.get(other, nothing) for name, other in STAND_IN.items()} | metrics
     for name in NEEDED:
         if name not in metrics:
             raise ConfigError(f"{run_folder.metrics_file(folder)} has no column {name}")

@@ -180,8 +180,8 @@ def notes(groups: Sequence[Group]) -> list[str]:
     for name, values in differing(groups).items():
         lines.append(f"averaged over {name} ({', '.join(map(str, values))})")
     for run in (run for g in groups for run in g.runs):
-        if run.steps < run.config["total_steps"]:
-            total = run.config["total_steps"]
+        if not run.ended:
+            total = run.config.get("total_updates") or run.config["total_steps"]
             lines.append(f"unfinished: {run.config['run_dir']}, at {run.steps:,} of {total:,} steps")
     envs = tasks_of(groups)
     if left := [env for env in envs if env not in suite(groups).tasks]:

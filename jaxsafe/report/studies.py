@@ -139,8 +139,9 @@ def rows_of(study: Study, run: str, trained: Run, origin: Origin, failed: bool) 
     if "train/nonfinite" in table:
         bad = run_folder.last_tenth(table, "train/nonfinite") > 0
         known = {seed: "diverged" if b else "done" for seed, b in zip(known, bad, strict=True)}
-    state = "failed" if failed else "unfinished" if trained.steps < total(trained) else ""
+    state = "failed" if failed else "unfinished" if not trained.ended else ""
     seconds = [table["seconds"][table["seed"] == s].max() for s in trained.seeds]
+    clock = run_folder.clock_of(table)
     named = {"minutes": np.array(seconds) / 60} | named
     return [
         {
@@ -150,16 +151,12 @@ def rows_of(study: Study, run: str, trained: Run, origin: Origin, failed: bool) 
             "settings": " ".join(f"{k}={v}" for k, v in unusual(trained.config).items()),
             "seed": seed,
             "state": state or own,
-            "steps": str(int(table["steps"][table["seed"] == int(seed)].max())),
+            "steps": str(int(table[clock][table["seed"] == int(seed)].max())),
         }
         | {name: "" if np.isnan(x[i]) else f"{x[i]:.9g}" for name, x in named.items()}
         | origin._asdict()
         for i, (seed, own) in enumerate(known.items())
     ]
-
-
-def total(trained: Run) -> int:
-    return int(trained.config["total_steps"])
 
 
 def points(trained: Run) -> list[np.ndarray]:

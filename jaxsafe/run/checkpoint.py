@@ -1,6 +1,6 @@
 """Checkpoints of a whole train state: written atomically, verified when read, no pickle.
 
-    checkpoints/00000042/manifest.json   iteration, steps, shapes, SHA-256 of every other file
+    checkpoints/00000042/manifest.json   iteration, steps, updates, shapes, SHA-256 of every other file
     checkpoints/00000042/state/          an Orbax checkpoint of {leaf name: array}
 
 A checkpoint is written under a temporary name and renamed when it is complete, so a folder
@@ -33,11 +33,18 @@ class CheckpointError(RuntimeError):
     """A checkpoint that cannot be written or read. The message is one line for the user."""
 
 
-class Manifest(NamedTuple):
-    """What a checkpoint says about itself."""
+class Progress(NamedTuple):
+    """How far a run is."""
 
     iteration: int
     steps: int  # environment steps of one seed
+    updates: int  # gradient steps of one seed, at most
+
+
+class Manifest(NamedTuple):
+    """What a checkpoint says about itself."""
+
+    at: Progress
     files: dict[str, str]  # path under the checkpoint -> SHA-256
     leaves: dict[str, tuple[str, tuple[int, ...]]]  # name -> dtype, shape
     since: int = 0  # the iteration from which on its replay holds everything, see types.Shared
@@ -98,21 +105,19 @@ def keeps_replay(like: PyTree, wanted: bool | None) -> bool:
     return replay_bytes(like) <= SMALL_REPLAY if wanted is None else wanted
 
 
-def save(
-    folder: Path, ts: PyTree, iteration: int, steps: int, since: int = 0, replay: bool = True
-) -> Path:
+def save(folder: Path, ts: PyTree, at: Progress, since: int = 0, replay: bool = True) -> Path:
     """Write `ts` as the newest checkpoint under `folder` and drop all but the last `KEEP`.
 
     Args:
         folder: holds the numbered checkpoints.
         ts: the train state.
-        iteration, steps: how far it is; steps are of one seed.
+        at: how far it is.
         since: the iteration from which on its replay holds everything.
         replay: whether to keep the replay.
     Raises:
         CheckpointError: it could not be written (a full disk); earlier checkpoints stay.
     """
-    target, part = folder / f"{iteration:08d}", folder / f"{iteration:08d}.part"
+    target, part = folder / f"{at.iteration:08d}", folder / f"{at.iteration:08d}.part"
     try:
         for leftover in folder.glob("*.part"):  # of a process that was killed
             shutil.rmtree(leftover)
@@ -125,8 +130,7 @@ def save(
                 args=ocp.args.StandardSave({k: v for k, v in arrays.items() if v.size}),  # type: ignore[call-arg]
             )
         manifest = {
-            "iteration": iteration,
-            "steps": steps,
+            **at._asdict(),
             "since": since,
             "files": {name: digest(part / name) for name in files(part)},
             "leaves": {k: [str(v.dtype), list(v.shape)] for k, v in arrays.items()},
@@ -168,7 +172,7 @@ def restore(
         empty = {name: np.zeros(x.shape, x.dtype) for name, x in expected.items() if in_replay(name)}
         arrays |= empty
         known = {name: (str(x.dtype), x.shape) for name, x in empty.items()}
-        manifest = manifest._replace(leaves=manifest.leaves | known, since=manifest.iteration)
+        manifest = manifest._replace(leaves=manifest.leaves | known, since=manifest.at.iteration)
     for name in sorted({*expected, *manifest.leaves}):
         want = (str(expected[name].dtype), tuple(expected[name].shape)) if name in expected else None
         if (have := manifest.leaves.get(name)) != want:
@@ -202,8 +206,9 @@ def read_manifest(path: Path) -> Manifest:
         str(k): (str(dtype), tuple(int(n) for n in shape))
         for k, (dtype, shape) in raw["leaves"].items()
     }
-    since = int(raw.get("since", 0))  # of 0.1, which had no replay, absent
-    return Manifest(int(raw["iteration"]), int(raw["steps"]), dict(raw["files"]), leaves, since)
+    at = Progress(*(int(raw.get(name, 0)) for name in Progress._fields))  # of 0.1, updates are absent
+    since = int(raw.get("since", 0))  # likewise: there was no replay
+    return Manifest(at, dict(raw["files"]), leaves, since)
 
 
 def verify(path: Path, manifest: Manifest) -> None:

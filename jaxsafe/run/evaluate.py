@@ -1,6 +1,6 @@
 """Fresh episodes of a trained policy, and what is measured of each."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import jax
@@ -9,6 +9,9 @@ import numpy as np
 
 from jaxsafe.learn.acting import Player
 from jaxsafe.types import Algorithm, PyTree
+
+# columns of metrics.csv where training is evaluated, of mean and of sampled actions
+COLUMNS = ("eval/return", "eval/cost", "eval/return_sampled", "eval/cost_sampled")
 
 
 class Episodes(NamedTuple):
@@ -27,17 +30,20 @@ def episode(
     key: jax.Array,
     discount: jax.Array | float = 1.0,
     cost_discount: jax.Array | float = 1.0,
+    sampled: bool = False,
 ) -> Episodes:
-    """One whole episode of mean actions, pure: rewards and costs count until termination or the limit.
+    """One whole episode, pure: rewards and costs count until termination or the limit.
 
-    The discounted sums, sum_t discount^t r_t and likewise of costs, begin with the first step.
+    Actions are the mean ones, or `sampled`; both begin with the same reset. The discounted sums,
+    sum_t discount^t r_t and likewise of costs, begin with the first step.
     """
-    reset_key, _ = jax.random.split(key)
+    reset_key, act_key = jax.random.split(key)
     env = player.task
 
     def step(now, t):
         state, carry, alive = now
-        action, carry = player.act(carry, state)
+        own_key = jax.random.fold_in(act_key, t) if sampled else None
+        action, carry = player.act(carry, state, own_key)
         state = env.step(state, action)
         reward, cost = alive * state.reward, alive * state.cost
         later = discount**t * reward, cost_discount**t * cost
@@ -49,20 +55,48 @@ def episode(
     return jax.tree.map(lambda x: x.sum(0), sums)
 
 
-def run_episodes(algo: Algorithm, params: PyTree, num_episodes: int, seed: int) -> Episodes:
-    """`num_episodes` fresh episodes for each of the S policies in `params` (leading axis), compiled.
+def player_of(
+    algo: Algorithm, num_episodes: int, seed: int, sampled: bool = False
+) -> Callable[[PyTree], Episodes]:
+    """What plays `num_episodes` fresh episodes with each of S policies: params [S, ...] -> Episodes.
 
-    Actions are the mean ones. Every policy meets the same episodes, so that seeds differ by their
-    policy alone.
+    Every policy meets the same episodes, so that seeds differ by their policy alone. It compiles once.
     """
     keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), 0x6576616C), num_episodes)
 
     def one_seed(params: PyTree) -> Episodes:
         player = Player(algo.policy, params, algo.task(params))
         discounts = params.config.discount, params.config.cost_discount
-        return jax.vmap(lambda key: episode(player, key, *discounts))(keys)
+        return jax.vmap(lambda key: episode(player, key, *discounts, sampled))(keys)
 
-    return jax.tree.map(np.asarray, jax.jit(jax.vmap(one_seed))(params))
+    play = jax.jit(jax.vmap(one_seed))
+    return lambda params: jax.tree.map(np.asarray, play(params))
+
+
+def run_episodes(
+    algo: Algorithm, params: PyTree, num_episodes: int, seed: int, sampled: bool = False
+) -> Episodes:
+    """`num_episodes` fresh episodes for each of the S policies in `params` (leading axis).
+
+    Actions are the mean ones, or `sampled`. See `player_of`.
+    """
+    return player_of(algo, num_episodes, seed, sampled)(params)
+
+
+def watcher(algo: Algorithm, num_episodes: int, seed: int) -> Callable[[PyTree], dict[str, np.ndarray]]:
+    """What evaluates S policies during training: params [S, ...] -> {name of a column: means [S]}.
+
+    The programs with mean and with sampled actions run one after the other, as two that call the host
+    at once can wait for each other.
+    """
+    players = [player_of(algo, num_episodes, seed, sampled) for sampled in (False, True)]
+
+    def evaluate(params: PyTree) -> dict[str, np.ndarray]:
+        played = [play(params) for play in players]
+        means = [x.mean(1) for episodes in played for x in (episodes.ret, episodes.cost)]
+        return dict(zip(COLUMNS, means, strict=True))
+
+    return evaluate
 
 
 def measures(

@@ -7,11 +7,20 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from jaxsafe.run import run_folder
+from jaxsafe.run import clock, run_folder
 from jaxsafe.run.progress import Report
 from jaxsafe.run.spread import Member
+from jaxsafe.types import Clocks
 
 OVERFLOW = "train/overflow"  # steps of an episode in which engine warp ran out of room
+
+
+SHOWN = {  # what the progress report shows: the first of these that is known
+    "ret": ("train/return_estimate", "eval/return"),
+    "cost": ("train/cost_estimate", "eval/cost"),
+    "lam": ("train/lam",),
+}
+UNKNOWN = np.full(1, np.nan)
 
 
 class Log:
@@ -26,18 +35,18 @@ class Log:
         names: list[str],
         members: list[Member],
         iteration: int,
-        per_update: int,
+        clocks: Clocks,
         report: Report,
     ):
-        self.seeds, self.per_update, self.warned = [m.seed for m in members], per_update, False
-        self.report = report
+        self.seeds, self.clocks, self.warned = [m.seed for m in members], clocks, False
+        self.report, self.unit = report, clock.unit(clocks)
         self.swept = {name: np.array([m.swept[name] for m in members]) for name in members[0].swept}
         self.csv = run_folder.Metrics(folder, [*self.swept, *names], iteration)
         self.begun = time.perf_counter() - self.csv.seconds
         self.boards = [
             run_folder.Board(
                 folder / "tensorboard" / m.setting.replace(", ", "-") / f"seed{m.seed}",
-                iteration * per_update,
+                self.unit.at(iteration),
             )
             for m in members
         ]
@@ -69,17 +78,18 @@ class Log:
         self, iteration: int, metrics: dict[str, jax.Array]
     ) -> tuple[int, dict[str, np.ndarray]]:
         values = {k: np.asarray(v, np.float32) for k, v in jax.device_get(metrics).items()}
-        steps, seconds = iteration * self.per_update, time.perf_counter() - self.begun
-        self.csv.append(iteration, steps, self.seeds, seconds, values | self.swept)
+        shown, seconds = self.unit.at(iteration), time.perf_counter() - self.begun
+        at = clock.after(iteration, self.clocks)
+        self.csv.append(at, self.seeds, seconds, values | self.swept)
         for s, board in enumerate(self.boards):
-            board.append(steps, {name: float(value[s]) for name, value in values.items()})
-        return steps, values
+            board.append(shown, {name: float(value[s]) for name, value in values.items()})
+        return shown, values
 
     def _finish(self) -> None:
         if not self.writing:
             return
         writing, self.writing = self.writing, None
-        steps, values = writing.result()
+        shown, values = writing.result()
         if not self.warned and (values.get(OVERFLOW, np.zeros(())) > 0).any():  # NaN: nothing ended
             self.warned = True
             self.report.line(
@@ -87,15 +97,11 @@ class Log:
                 "raise env.contact_room"
             )
         self.report.update(
-            steps,
+            shown,
             len(self.seeds),
             **{
-                short: mean(values[name]) if name in values else float("nan")
-                for short, name in (
-                    ("ret", "train/return_estimate"),
-                    ("cost", "train/cost_estimate"),
-                    ("lam", "train/lam"),
-                )
+                short: mean(next((values[name] for name in names if name in values), UNKNOWN))
+                for short, names in SHOWN.items()
             },
         )
 

@@ -13,19 +13,31 @@ import jax
 import numpy as np
 
 from jaxsafe.learn.constraints import own_limits
-from jaxsafe.run import checkpoint, distributed, spread
+from jaxsafe.run import checkpoint, clock, distributed, spread
+from jaxsafe.run.evaluate import COLUMNS
 from jaxsafe.run.interrupts import Interrupts
 from jaxsafe.run.log import Log
 from jaxsafe.run.progress import Report
 from jaxsafe.run.settings import TrainConfig
 from jaxsafe.run.spread import Program
-from jaxsafe.types import PyTree, Shared
+from jaxsafe.types import PyTree
+
+
+class Hooks(NamedTuple):
+    """What a session adds to the loop.
+
+    adapt(ts) -> ts changes a fresh train state, to start from another policy; not used on resumption.
+    evaluate(params) -> {name: [M]} measures the policies of all members, for the columns
+        `evaluate.COLUMNS`; process 0 calls it. None: they are not measured.
+    """
+
+    adapt: Callable[[PyTree], PyTree] = lambda ts: ts
+    evaluate: Callable[[PyTree], dict[str, np.ndarray]] | None = None
 
 
 class Outcome(NamedTuple):
     ts: PyTree
     iteration: int
-    steps: int
     interrupted: bool
 
 
@@ -35,9 +47,9 @@ def train(
     folder: Path,
     report: Report,
     resume_command: str,
-    adapt: Callable[[PyTree], PyTree] | None = None,
+    hooks: Hooks = Hooks(),  # noqa: B008
 ) -> Outcome:
-    """Train to `settings.total_steps`, from the newest checkpoint in `folder` if there is one.
+    """Train to the end that `settings` gives, from the newest checkpoint in `folder` if there is one.
 
     Args:
         program: from `build`.
@@ -45,14 +57,13 @@ def train(
         folder: the run folder; gets metrics.csv, tensorboard/ and checkpoints/.
         report: where progress goes.
         resume_command: printed when the run is stopped early.
-        adapt: changes a fresh train state (start from another policy); not used on resumption.
+        hooks: what is done beside.
     Returns:
         The train state, with its leading axis, and how far it is.
     Raises:
         checkpoint.CheckpointError, OSError: the disk failed; the last good checkpoint stays.
     """
-    per_update = program.clocks.steps
-    iterations = -(-settings.total_steps // per_update)
+    iterations, unit = clock.iterations(settings, program.clocks), clock.unit(program.clocks)
     store = folder / "checkpoints"
     resuming = bool(distributed.first(np.array(bool(checkpoint.checkpoints(store)))))
     with report, Interrupts(report.line, report.hosted) as stop:
@@ -61,37 +72,44 @@ def train(
         )
         begun = time.perf_counter()
         iteration = since = 0
-        like = jax.eval_shape(program.init, program.start, Shared(np.int32(0)))
+        program = program._replace(data=distributed.place(program.data, program.everywhere))
+        like = jax.eval_shape(program.init, program.start, program.shared())
         keeps_replay = checkpoint.keeps_replay(like, settings.checkpoint_replay)
         if resuming:
             ts, iteration, since = restored(store, like, report)
             ts = distributed.place(ts, program.sharding)
             empty = ", with an empty replay" if iteration and since == iteration else ""
-            report.line(f"resuming at {iteration * per_update:,} steps{empty}")
+            report.line(f"resuming at {unit.at(iteration):,} {unit.name}{empty}")
         else:
             start = distributed.place(program.start, program.sharding)
-            ts = jax.jit(program.init)(start, Shared(np.int32(0)))
-            ts = distributed.place(adapt(ts), program.sharding) if adapt else ts
+            ts = jax.jit(program.init)(start, program.shared())
+            ts = distributed.place(hooks.adapt(ts), program.sharding)
         if iteration >= iterations:
             report.line("nothing left to train")
-            return Outcome(ts, iteration, iteration * per_update, False)
-        names = sorted(jax.eval_shape(program.update, ts, Shared(np.int32(0)))[1])
+            return Outcome(ts, iteration, False)
+        names = sorted(jax.eval_shape(program.update, ts, program.shared())[1])
+        names += COLUMNS if hooks.evaluate else ()
         update = spread.compiled(program, ts)
         report.line(f"compiled in {time.perf_counter() - begun:.1f} s")
         stop.nothing_to_save = ""
 
         vote = distributed.Vote(program.sharding)
         with (
-            Log(folder, names, program.members, iteration, per_update, report)
+            Log(folder, names, program.members, iteration, program.clocks, report)
             if distributed.leads()
             else contextlib.nullcontext()
         ) as log:
             limits = [m.algo.cost_limit for m in program.members if not own_limits(m.algo)]
-            report.start(iterations * per_update, iteration * per_update, limits)
+            report.start(unit.at(iterations), unit.at(iteration), limits, unit.name)
             saved_at, pause = time.perf_counter(), settings.checkpoint_every
             while iteration < iterations:
-                ts, metrics = update(ts, Shared(np.int32(iteration), np.int32(since)))
+                ts, metrics = update(ts, program.shared(iteration, since))
                 metrics, iteration = distributed.whole(metrics), iteration + 1
+                due = unit.crosses(settings.eval_every, iteration) or iteration == iterations
+                if hooks.evaluate and due:
+                    acting = distributed.whole(program.params(ts))
+                    if log:
+                        metrics |= hooks.evaluate(of_members(program, acting))
                 if log:
                     log.append(iteration, metrics)
                 by_count = (
@@ -102,14 +120,12 @@ def train(
                 if stopping or by_count or by_time or iteration == iterations:
                     saving = time.perf_counter()
                     state = distributed.whole(ts)
-                    steps = iteration * per_update
+                    at = clock.after(iteration, program.clocks)
                     if log:
                         log.sync()
-                        checkpoint.save(store, state, iteration, steps, since, keeps_replay)
-                        acting = jax.tree.map(
-                            lambda x: x[: len(program.members)], program.params(state)
-                        )
-                        checkpoint.save(folder / "policy", acting, iteration, steps)
+                        checkpoint.save(store, state, at, since, keeps_replay)
+                        acting = of_members(program, program.params(state))
+                        checkpoint.save(folder / "policy", acting, at)
                     saved_at = time.perf_counter()
                     if keeps_replay and checkpoint.replay_bytes(like):  # at most 5% of the time
                         pause = max(settings.checkpoint_every, 19 * (saved_at - saving))
@@ -118,8 +134,15 @@ def train(
         report.stop()
         interrupted = iteration < iterations
         if interrupted:
-            report.line(f"stopped at {iteration * per_update:,} steps; continue with: {resume_command}")
-    return Outcome(ts, iteration, iteration * per_update, interrupted)
+            done = f"{unit.at(iteration):,} {unit.name}"
+            report.line(f"stopped at {done}; continue with: {resume_command}")
+    return Outcome(ts, iteration, interrupted)
+
+
+def of_members(program: Program, params: PyTree) -> PyTree:
+    """What acts of each member, [M, ...], on one device: a split one has a copy on each of its own."""
+    own = jax.tree.map(lambda x: x[: len(program.members)], params)
+    return jax.device_put(own, jax.local_devices()[0])
 
 
 def restored(store: Path, like: PyTree, report: Report) -> tuple[PyTree, int, int]:
@@ -127,11 +150,12 @@ def restored(store: Path, like: PyTree, report: Report) -> tuple[PyTree, int, in
     from which on its replay holds everything."""
     if jax.process_count() == 1:
         ts, manifest = checkpoint.restore(store, like, report.line)
-        return ts, manifest.iteration, manifest.since
+        return ts, manifest.at.iteration, manifest.since
     arrays = {name: np.zeros(x.shape, x.dtype) for name, x in checkpoint.as_data(like).items()}
-    clock = np.zeros(2, int)
+    numbers = np.zeros(2, int)
     if distributed.leads():
         ts, manifest = checkpoint.restore(store, like, report.line)
-        arrays, clock = checkpoint.to_arrays(ts), np.array([manifest.iteration, manifest.since])
-    arrays, (iteration, since) = distributed.first((arrays, clock))
+        arrays = checkpoint.to_arrays(ts)
+        numbers = np.array([manifest.at.iteration, manifest.since])
+    arrays, (iteration, since) = distributed.first((arrays, numbers))
     return checkpoint.from_arrays(like, arrays), int(iteration), int(since)

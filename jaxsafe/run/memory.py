@@ -5,13 +5,13 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 
 from jaxsafe.config import ConfigError
+from jaxsafe.envs.wrap import raw_steps
 from jaxsafe.run import checkpoint, spread
 from jaxsafe.run.settings import TrainConfig
 from jaxsafe.run.spread import Program
-from jaxsafe.types import Env, Shared
+from jaxsafe.types import Env
 
 ROOM = 0.8  # of the memory that a program may take by `capacity`
 
@@ -20,32 +20,34 @@ class TooLarge(ConfigError):
     """What was asked cannot fit the memory."""
 
 
-def check_memory(env: Env, algo_config: Any, num_members: int, devices: int) -> None:
+def check_memory(env: Env, program: Program, settings: TrainConfig) -> None:
     """Refuse, before anything compiles, a trajectory that cannot fit the device.
 
     A lower bound: observations before and after each step, actions and a few scalars.
     """
     limit, what = device_memory()
     step = 4 * (2 * env.obs_size + env.action_size + 8 + len(env.cost_names))  # bytes
-    need = step * algo_config.num_envs * algo_config.horizon * num_members // devices
+    steps, members = program.clocks.steps // raw_steps(env), len(program.members)  # rows kept of each
+    need = step * steps * members // settings.devices
     if need > limit:
         raise TooLarge(
-            f"num_envs={algo_config.num_envs} x horizon={algo_config.horizon} x "
-            f"{num_members} seeds needs at least {need / 2**30:,.1f} GiB a device, "
-            f"{what} has {limit / 2**30:,.1f}; use fewer num_envs"
+            f"{steps:,} environment steps an update x {members} seeds needs at least "
+            f"{need / 2**30:,.1f} GiB a device, {what} has {limit / 2**30:,.1f}; use fewer num_envs"
         )
 
 
 def check_state_memory(program: Program, settings: TrainConfig) -> None:
     """Like `check_memory`, for the train state itself, known once it is traced: old and new, but a
-    replay only once, as it is written in place."""
+    replay only once, as it is written in place. Every device has the whole data set."""
     limit, what = device_memory()
-    like = jax.eval_shape(program.init, program.start, Shared(np.int32(0)))
+    like = jax.eval_shape(program.init, program.start, program.shared())
     whole = sum(x.size * x.dtype.itemsize for x in checkpoint.as_data(like).values())
     replay = checkpoint.replay_bytes(like)
-    need = (2 * (whole - replay) + replay) / settings.devices
+    data = sum(x.nbytes for x in jax.tree.leaves(program.data))
+    need = (2 * (whole - replay) + replay) / settings.devices + data
     if need > limit:
         part = f" ({replay / settings.devices / 2**30:,.1f} GiB of it replay)" if replay else ""
+        part += f" ({data / 2**30:,.1f} GiB of it the data set)" if data else ""
         less = "a smaller algo.replay_size or " if replay > whole / 2 else "fewer num_envs or "
         raise TooLarge(
             f"the train state needs {need / 2**30:,.1f} GiB a device{part}, {what} has "
@@ -57,7 +59,7 @@ def capacity(program: Program) -> int:
     """How many of its members fit the memory at once, by the compiled update's own account."""
     like = jax.tree.map(
         lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=program.sharding),
-        jax.eval_shape(program.init, program.start, Shared(np.int32(0))),
+        jax.eval_shape(program.init, program.start, program.shared()),
     )
     used: Any = spread.compiled(program, like).memory_analysis()
     need = used.temp_size_in_bytes + used.argument_size_in_bytes + used.output_size_in_bytes

@@ -14,6 +14,7 @@ import numpy as np
 
 from jaxsafe.config import ConfigError, flat
 from jaxsafe.learn.acting import Player
+from jaxsafe.learn.offline import blank
 from jaxsafe.run import checkpoint, run_folder
 from jaxsafe.run.settings import DEFAULT, REGISTERED, Entries, Settings, load, make_env, settle
 from jaxsafe.run.spread import Program, members
@@ -87,9 +88,11 @@ class Actor(NamedTuple):
 def policy_of(settings: Settings, env: Env, folder: Path) -> tuple[Algorithm, PyTree]:
     """The algorithm, and what acts of the newest policy of each member, [S, ...]."""
     algo = settings.row.make(env, None)
+    offline = not algo.clocks(settings.algo).steps  # shapes alone count, so that no data set is read
+    shared = Shared(np.int32(0), data=blank(env) if offline else ())
 
     def first(cfg: Any) -> PyTree:
-        return algo.params(algo.init(jax.random.key(0), cfg, Shared(np.int32(0))))
+        return algo.params(algo.init(jax.random.key(0), cfg, shared))
 
     run = members(settings.configs, settings.train)
     floats = jax.tree.map(lambda *x: np.array(x, np.float32), *[m.algo for m in run])
@@ -179,7 +182,7 @@ def warm_start(
     there, here = flat(saved.plain()), flat(settings.plain())
     options = [k for k in here if k.startswith("env.") and saved.env_name == settings.env_name]
     differ = [
-        f"{name} is {there.get(name)} there, {here[name]} here"
+        f"{name} is {there.get(name)} there, {here.get(name)} here"
         for name in (
             "env.name",
             "algo.hidden",
@@ -188,9 +191,9 @@ def warm_start(
             "algo.obs_normalize",
             *options,
         )
-        if there.get(name) != here[name]
+        if there.get(name) != here.get(name)
     ]
-    like = jax.eval_shape(program.init, program.start, Shared(np.int32(0)))
+    like = jax.eval_shape(program.init, program.start, program.shared())
     check_policy(like, policy, source, why="; ".join(["", *differ[:3]]))
     units = [plain.get("algo.activation") for plain in (there, here)]  # no shape tells them apart
     if units[0] != units[1]:

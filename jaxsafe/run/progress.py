@@ -72,13 +72,14 @@ class Report:
         self._end_changing()
         self.console.print(text, markup=False)
 
-    def start(self, total_steps: int, steps: int, cost_limits: Sequence[float]) -> None:
-        self.total = total_steps
+    def start(self, total: int, done: int, cost_limits: Sequence[float], unit: str = "steps") -> None:
+        """Begin to show progress from `done` to `total`, which count in `unit`."""
+        self.total, self.unit = total, unit
         self.last = {"ret": math.nan, "cost": math.nan, "lam": math.nan}  # finite values seen last
         self.printed = -math.inf
         ends = sorted({min(cost_limits), max(cost_limits)}) if cost_limits else []
         self.limits = "/" * bool(ends) + "-".join(map(short, ends))
-        self.begun, self.begun_at = time.perf_counter(), steps
+        self.begun, self.begun_at = time.perf_counter(), done
         if self.console.is_terminal:
             columns: list[ProgressColumn] = [
                 BarColumn(bar_width=20),
@@ -88,36 +89,35 @@ class Report:
             self.live = Progress(
                 *columns, console=self.console, auto_refresh=True, refresh_per_second=4
             )
-            self.task = self.live.add_task(
-                "", total=total_steps, completed=steps, text=Text("first update")
-            )
+            self.task = self.live.add_task("", total=total, completed=done, text=Text("first update"))
             self.live.start()
 
-    def update(self, steps: int, num_members: int, ret: float, cost: float, lam: float) -> None:
-        """Show the state after `steps` environment steps of each member; NaN keeps the last value."""
+    def update(self, done: int, num_members: int, ret: float, cost: float, lam: float) -> None:
+        """Show the state where each member has `done` so many; NaN keeps the last value."""
         now = time.perf_counter()
         self.last.update(
             {k: v for k, v in (("ret", ret), ("cost", cost), ("lam", lam)) if math.isfinite(v)}
         )
-        rate = (steps - self.begun_at) / max(now - self.begun, 1e-9)  # of one seed
+        rate = (done - self.begun_at) / max(now - self.begun, 1e-9)  # of one seed
         lam = self.last["lam"]  # of algorithms that have one multiplier
         text = (
-            f"{count(steps)}/{count(self.total)} steps  {count(rate * num_members)} steps/s  "
+            f"{count(done)}/{count(self.total)} {self.unit}  "
+            f"{count(rate * num_members)} {self.unit}/s  "
             f"return {short(self.last['ret'])}  "
             f"cost {short(self.last['cost'])}{self.limits}  "
             f"{f'lam {short(lam)}  ' if math.isfinite(lam) else ''}"
-            f"left {clock((self.total - steps) / max(rate, 1e-9))}"
+            f"left {clock((self.total - done) / max(rate, 1e-9))}"
         )
         if self.live:
-            self.live.update(self.task, completed=steps, text=text)
+            self.live.update(self.task, completed=done, text=text)
         elif self.notebook:
-            if now - self.printed >= NOTEBOOK_EVERY or steps >= self.total:
-                self.printed, text = now, f"{100 * steps / self.total:3.0f}%  {text}"
+            if now - self.printed >= NOTEBOOK_EVERY or done >= self.total:
+                self.printed, text = now, f"{100 * done / self.total:3.0f}%  {text}"
                 print("\r" + text.ljust(self.width), end="", flush=True)
                 self.width = len(text)
-        elif now - self.printed >= PLAIN_EVERY or steps >= self.total:
+        elif now - self.printed >= PLAIN_EVERY or done >= self.total:
             self.printed = now
-            self.line(f"{100 * steps / self.total:3.0f}%  {text}")
+            self.line(f"{100 * done / self.total:3.0f}%  {text}")
 
     def _end_changing(self) -> None:
         if self.width:

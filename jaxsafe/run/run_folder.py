@@ -34,12 +34,14 @@ from tensorboardX.proto import event_pb2, summary_pb2
 import jaxsafe
 from jaxsafe.config import ConfigError
 from jaxsafe.run import checkpoint
+from jaxsafe.run.checkpoint import Progress
+from jaxsafe.run.evaluate import COLUMNS
 
 PACKAGES = (
     "jax", "jaxlib", "mujoco", "mujoco-mjx", "warp-lang", "flax", "optax", "orbax-checkpoint", "numpy",
     "brax",
 )  # fmt: skip
-INDEX = ("iteration", "steps", "seed", "seconds")
+INDEX = (*Progress._fields, "seed", "seconds")  # the first columns of metrics.csv
 
 
 def write_config(folder: Path, config: dict[str, Any]) -> None:
@@ -65,8 +67,8 @@ def read_config(folder: Path) -> dict[str, Any]:
     return config
 
 
-def append_versions(folder: Path, device: str, engine: str | None) -> None:
-    """Add this start of the run to versions.json."""
+def append_versions(folder: Path, device: str, engine: str | None, dataset: str | None = None) -> None:
+    """Add this start of the run to versions.json, with the SHA-256 of its data set."""
     path = folder / "versions.json"
     try:
         starts = list(json.loads(path.read_text())) if path.exists() else []
@@ -79,6 +81,7 @@ def append_versions(folder: Path, device: str, engine: str | None) -> None:
         "commit": commit(),
         "device": device,
         "engine": engine,
+        "dataset": dataset,
         "python": platform.python_version(),
         "platform": platform.platform(),
         "jaxsafe": jaxsafe.__version__,
@@ -94,6 +97,14 @@ def trained_by(folder: Path) -> str:
         return f"{last['jaxsafe']} ({last['commit']})"
     except (OSError, ValueError, LookupError, TypeError):
         return "of an unknown version"
+
+
+def dataset_of(folder: Path) -> str | None:
+    """The SHA-256 of the data set that a run was last started with; None where that is not known."""
+    try:
+        return str(json.loads((folder / "versions.json").read_text())[-1]["dataset"] or "") or None
+    except (OSError, ValueError, LookupError, TypeError):
+        return None
 
 
 def installed(package: str) -> str | None:
@@ -129,26 +140,29 @@ class Metrics:
     def __init__(self, folder: Path, names: list[str], iteration: int):
         """Open for appending after `iteration`; later rows and a torn last line are dropped.
 
+        Columns of evaluation may be new, or stay without new values.
+
         Raises:
             ConfigError: the file exists with other columns.
         """
-        self.path, self.names, self.seconds = folder / "metrics.csv", names, 0.0
-        header = [*INDEX, *names]
+        self.path, self.names, self.seconds = folder / "metrics.csv", list(names), 0.0
+        header = [*INDEX, *self.names]
         kept = []
         if self.path.exists() and iteration:
             with self.path.open(newline="") as file:
                 rows = csv.reader(file)
-                if (found := next(rows, header)) != header:
-                    odd = sorted(set(found) ^ set(header))
-                    raise ConfigError(
-                        f"{self.path} has other columns ({', '.join(odd) or 'in another order'})"
-                    )
+                found = next(rows, header)
+                odd = sorted(set(found) ^ set(header))
+                if not all(name in COLUMNS for name in odd):
+                    raise ConfigError(f"{self.path} has other columns ({', '.join(odd)})")
+                self.names += [name for name in found if name not in header]
+                header = [*INDEX, *self.names]
                 kept = [
-                    r
-                    for r in rows
-                    if len(r) == len(header) and r[0].isdigit() and int(r[0]) <= iteration
+                    [dict(zip(found, row, strict=True)).get(name, "") for name in header]
+                    for row in rows
+                    if len(row) == len(found) and row[0].isdigit() and int(row[0]) <= iteration
                 ]
-            self.seconds = float(kept[-1][3]) if kept else 0.0
+            self.seconds = float(kept[-1][INDEX.index("seconds")]) if kept else 0.0
         part = self.path.with_suffix(".part")
         with part.open("w", newline="") as file:
             csv.writer(file, lineterminator="\n").writerows([header, *kept])
@@ -156,14 +170,13 @@ class Metrics:
         self.file = self.path.open("a", newline="")
         self.writer = csv.writer(self.file, lineterminator="\n")
 
-    def append(
-        self, iteration: int, steps: int, seeds: list[int], seconds: float, values: Mapping
-    ) -> None:
-        """Add one row a seed; `values` holds float [S] by metric name."""
-        columns = [np.asarray(values[name], np.float32) for name in self.names]
+    def append(self, at: Progress, seeds: list[int], seconds: float, values: Mapping) -> None:
+        """Add one row a seed; `values` holds float [S] by metric name, those of evaluation if known."""
+        nothing = dict.fromkeys(COLUMNS, np.full(len(seeds), np.nan))
+        columns = [np.asarray((nothing | dict(values))[name], np.float32) for name in self.names]
         for s, seed in enumerate(seeds):
             cells = ("" if math.isnan(c[s]) else str(c[s]) for c in columns)
-            self.writer.writerow([iteration, steps, seed, f"{seconds:.3f}", *cells])
+            self.writer.writerow([*at, seed, f"{seconds:.3f}", *cells])
         self.file.flush()
 
     def sync(self) -> None:
@@ -276,6 +289,13 @@ def setting_name(swept: Mapping[str, Any]) -> str:
     return ", ".join(f"{k}={v:.9g}" if isinstance(v, float) else f"{k}={v}" for k, v in swept.items())
 
 
+def clock_of(metrics: Mapping[str, np.ndarray]) -> str:
+    """The column that says how far training is: 'steps' or, where it takes no environment steps,
+    'updates'."""
+    moves = "updates" not in metrics or not len(metrics["steps"]) or metrics["steps"].max() > 0
+    return "steps" if moves else "updates"
+
+
 def last_tenth(metrics: dict[str, np.ndarray], name: str) -> np.ndarray:
     """The mean of a metric over the last 10 % of training so far, [S]; NaN for a seed without value."""
     late = metrics["iteration"] > 0.9 * metrics["iteration"].max()
@@ -284,14 +304,13 @@ def last_tenth(metrics: dict[str, np.ndarray], name: str) -> np.ndarray:
     return np.array([v.mean() if len(v) else np.nan for v in values])
 
 
-def progress(folder: Path) -> tuple[int, int] | None:
-    """Iteration and steps of the newest checkpoint; None without one."""
+def progress(folder: Path) -> Progress | None:
+    """How far the newest checkpoint is; None without one."""
     for path in checkpoint.checkpoints(folder / "checkpoints"):
         try:
-            manifest = checkpoint.read_manifest(path)
+            return checkpoint.read_manifest(path).at
         except (ValueError, KeyError, TypeError, AttributeError, OSError):
             continue
-        return manifest.iteration, manifest.steps
     return None
 
 

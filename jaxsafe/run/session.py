@@ -13,15 +13,16 @@ import numpy as np
 import jaxsafe
 from jaxsafe.config import ConfigError, flat
 from jaxsafe.envs.wrap import innermost
-from jaxsafe.run import checkpoint, distributed, loop, run_folder
+from jaxsafe.run import checkpoint, clock, dataset, distributed, loop, run_folder
 from jaxsafe.run.devices import check_devices, device_name, use_compilation_cache
+from jaxsafe.run.evaluate import watcher
 from jaxsafe.run.interrupts import Interrupts
 from jaxsafe.run.memory import check_memory, check_state_memory
 from jaxsafe.run.policies import warm_start
 from jaxsafe.run.progress import Report
 from jaxsafe.run.settings import NOT_COMPARED, Settings, TrainConfig, differences, make_env, settle
 from jaxsafe.run.spread import Program, build
-from jaxsafe.types import Env, Shared
+from jaxsafe.types import Env
 
 
 class Session(NamedTuple):
@@ -53,7 +54,7 @@ def choose_folder(settings: Settings, job: int | None, say: Callable[[str], None
         if train.resume:
             for folder in sorted((p.parent for p in home.glob("*/config.yaml")), reverse=True):
                 done = run_folder.progress(folder)
-                if (done is None or done[1] < train.total_steps) and same(settings, folder):
+                if (done is None or not clock.ended(train, done)) and same(settings, folder):
                     return folder
             say(f"no unfinished run of this command in {home}: starting one")
         name = f"{datetime.datetime.now():%Y%m%d-%H%M%S}-seed{train.seed}"
@@ -97,6 +98,11 @@ def compare(settings: Settings, folder: Path) -> None:
     free = {*NOT_COMPARED}
     if len(settings.configs) * settings.train.num_seeds > 1:
         free.add("devices")  # each member is whole on one of them
+    path, known = settings.train.dataset, run_folder.dataset_of(folder)
+    if path is not None and known:
+        if dataset.sha256(path) != known:
+            raise ConfigError(f"dataset={path} is not the file that {folder} was trained with")
+        free.add("dataset")  # the same file may have moved
     for name, (here, there) in differences(flat(settings.plain()), saved).items():
         if name not in free:
             raise ConfigError(
@@ -123,15 +129,16 @@ def prepare(settings: Settings) -> tuple[Env, Program]:
     use_compilation_cache()
     check_devices(train)
     env = make_env(settings)
-    check_memory(env, settings.algo, len(settings.configs) * train.num_seeds, train.devices)
-    program = build(env, settings.row.make, settings.configs, train)
+    data = () if train.dataset is None else dataset.read_dataset(train.dataset)
+    program = build(env, settings.row.make, settings.configs, train, data)
+    check_memory(env, program, train)
     check_state_memory(program, train)
     return env, program
 
 
 def about_replay(program: Program, train: TrainConfig) -> str:
     """How large the replay of a seed is, and what a resumed run does without it; '' of none."""
-    like = jax.eval_shape(program.init, program.start, Shared(np.int32(0)))
+    like = jax.eval_shape(program.init, program.start, program.shared())
     size = checkpoint.replay_bytes(like)
     if not size:
         return ""
@@ -147,20 +154,25 @@ def run(session: Session, report: Report, finish: Finish) -> int:
     """Train, then `finish`. Returns the exit status: 0, or 130 if the user stopped it."""
     settings, folder, env, program, again = session
     train, cfg = settings.train, settings.algo
-    adapt = None
+    hooks = loop.Hooks()
+    if train.eval_every:
+        algo = settings.row.make(env, None)
+        hooks = hooks._replace(evaluate=watcher(algo, train.eval_episodes, train.seed))
     begun = distributed.first(np.array(run_folder.progress(folder) is not None))
     if train.init_from is not None and not begun:
-        adapt = warm_start(settings, program, report.line)
+        hooks = hooks._replace(adapt=warm_start(settings, program, report.line))
     engine = getattr(innermost(env), "engine", None)  # Safety Gym's environments have one
     try:
         if distributed.leads():
             folder.mkdir(parents=True, exist_ok=True)
             run_folder.write_config(folder, settings.plain())
-            run_folder.append_versions(folder, device_name(), engine)
+            data = None if train.dataset is None else dataset.sha256(train.dataset)
+            run_folder.append_versions(folder, device_name(), engine, data)
     except OSError as error:
         raise checkpoint.CheckpointError(f"cannot write to {folder}: {error.strerror}") from error
     several = f"{len(settings.configs)} settings x " if len(settings.configs) > 1 else ""
-    seeds = f"{train.num_seeds} seed{'s' if train.num_seeds > 1 else ''} x {cfg.num_envs} envs"
+    seeds = f"{train.num_seeds} seed{'s' if train.num_seeds > 1 else ''}"
+    seeds += f" x {cfg.num_envs} envs" if program.clocks.steps else ""
     where = device_name() + (f" x {train.devices}" if train.devices > 1 else "")
     if jax.process_count() > 1:
         where += f" in {jax.process_count()} processes"
@@ -172,7 +184,7 @@ def run(session: Session, report: Report, finish: Finish) -> int:
     )
     if line := about_replay(program, train):
         report.line(line)
-    outcome = loop.train(program, train, folder, report, again, adapt)
+    outcome = loop.train(program, train, folder, report, again, hooks)
     distributed.leave()
     if outcome.interrupted:
         return 130

@@ -26,13 +26,16 @@ from jaxsafe.types import Env
 DEFAULT = {"env": "point_goal1", "algo": "ppo_lag"}
 ON_RESUME = (
     "total_steps",
+    "total_updates",
     "checkpoint_every",
     "checkpoint_iterations",
     "checkpoint_replay",
+    "eval_every",
     "eval_episodes",
     "video",
 )  # may change
 NOT_COMPARED = ("run_dir", "resume", *ON_RESUME)
+OFFLINE_UPDATES = 100_000  # total_updates with a data set, unless the user says otherwise
 NAMED = "cost_limits"  # an option of algorithms: floats by name, as {hazards: 10}
 # Bounds of the hyperparameters that have one wherever they occur.
 BOUNDS = {
@@ -61,6 +64,8 @@ class TrainConfig:
     """The settings beside `env` and `algo`."""
 
     total_steps: int = 10_000_000  # environment steps of one seed, rounded up to whole updates
+    # gradient steps of one seed, which then end the run; null: total_steps, or 100,000 with a data set
+    total_updates: int | None = None
     num_envs: int | None = None  # of one seed; null: algo.num_envs
     num_seeds: int = 1  # trained at once: seed, seed + 1, ...
     seed: int = 0
@@ -72,20 +77,30 @@ class TrainConfig:
     compat: str = "none"  # whose departures from the papers to follow: none, or omnisafe
     run_dir: str | None = None  # null: runs/<env>-<algo>/<time>-seed<seed>
     resume: bool | str = False  # true: run_dir, or the newest unfinished run like this one; or a folder
+    dataset: str | None = None  # an .npz to learn from, for offline algorithms
     init_from: str | None = None  # a run folder whose policy to start from
     checkpoint_every: float = 60.0  # s between checkpoints
     checkpoint_iterations: int = 0  # also after this many iterations; 0: by time alone
     checkpoint_replay: bool | None = None  # keep the replay, to resume bit for bit; null: up to 2 GB
-    eval_episodes: int = 20  # at the end, for each seed; 0: none
+    eval_every: int = 0  # evaluate after so many environment steps, or updates without any; 0: never
+    eval_episodes: int = 20  # of an evaluation, for each seed; 0: none, at the end either
     video: bool = True  # of the first seed's policy, at the end
 
     def __post_init__(self) -> None:
-        for name in ("total_steps", "num_envs", "num_seeds", "devices"):
+        for name in ("total_steps", "total_updates", "num_envs", "num_seeds", "devices"):
             if (value := getattr(self, name)) is not None and value < 1:
                 raise ConfigError(f"{name}={value}: expected at least 1")
-        for name in ("seed", "checkpoint_every", "checkpoint_iterations", "eval_episodes"):
+        for name in (
+            "seed",
+            "checkpoint_every",
+            "checkpoint_iterations",
+            "eval_every",
+            "eval_episodes",
+        ):
             if not (value := getattr(self, name)) >= 0:
                 raise ConfigError(f"{name}={value}: expected at least 0")
+        if self.eval_every and not self.eval_episodes:
+            raise ConfigError(f"eval_every={self.eval_every}: expected eval_episodes of at least 1")
         if self.seed + self.num_seeds > 2**31:
             raise ConfigError(f"seed={self.seed}: expected less than {2**31 - self.num_seeds + 1}")
 
@@ -165,7 +180,11 @@ def settle(config: dict[str, Any], entries: Entries = REGISTERED) -> Settings:
     algo_name = algo.pop("name")
     row = find_algo(algo_name, entries)
     train = from_dict(TrainConfig, top)
+    if train.dataset is not None and train.total_updates is None:
+        train = dataclasses.replace(train, total_updates=OFFLINE_UPDATES)
     if train.num_envs is not None:
+        if "num_envs" not in {f.name for f in dataclasses.fields(row.config)}:
+            raise ConfigError(f"num_envs={train.num_envs}: {algo_name} trains without environments")
         algo["num_envs"] = train.num_envs
     for name in env:
         if name not in entry.defaults:

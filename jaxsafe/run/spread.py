@@ -16,7 +16,7 @@ from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
 from jaxsafe.config import ConfigError, flat
 from jaxsafe.envs.wrap import raw_steps
-from jaxsafe.run import checkpoint, run_folder
+from jaxsafe.run import checkpoint, clock, run_folder
 from jaxsafe.run.settings import TrainConfig
 from jaxsafe.types import Algorithm, Clocks, Env, PyTree, Shared
 
@@ -57,9 +57,16 @@ class Program(NamedTuple):
     start: PyTree  # (keys, config): [M], or [devices] for one split member
     members: list[Member]
     sharding: jax.sharding.Sharding
+    everywhere: jax.sharding.Sharding  # of what members share
+    data: PyTree = ()  # the data set
+
+    def shared(self, iteration: int = 0, since: int = 0) -> Shared:
+        return Shared(np.int32(iteration), np.int32(since), self.data)
 
 
-def build(env: Env, make: Callable, configs: Sequence[Any], settings: TrainConfig) -> Program:
+def build(
+    env: Env, make: Callable, configs: Sequence[Any], settings: TrainConfig, data: PyTree = ()
+) -> Program:
     """Spread one algorithm over settings, seeds and devices.
 
     Args:
@@ -67,8 +74,10 @@ def build(env: Env, make: Callable, configs: Sequence[Any], settings: TrainConfi
         make: `make(env, axis_name) -> Algorithm` of the algorithm.
         configs: its config in each setting; they differ in floats alone.
         settings: seeds and devices.
+        data: the data set, for an algorithm that takes no environment steps.
     Raises:
-        ConfigError: the members, or the environments of a lone one, do not split over the devices.
+        ConfigError: the members, or the environments of a lone one, do not split over the devices; a
+            data set that is missing, or that the algorithm has no use for.
     """
     devices, run = settings.devices, members(configs, settings)
     share = devices if len(run) == 1 else 1  # devices among which the environments of one are split
@@ -77,18 +86,25 @@ def build(env: Env, make: Callable, configs: Sequence[Any], settings: TrainConfi
             f"{len(run)} seeds do not split over devices={devices}: "
             f"expected a multiple of {devices}, or 1"
         )
-    if configs[0].num_envs % share:
-        raise ConfigError(f"num_envs={configs[0].num_envs} does not split over devices={devices}")
-
     algo: Algorithm = make(env, AXIS if share > 1 else None)
     clocks = algo.clocks(configs[0])
     clocks = clocks._replace(steps=clocks.steps * raw_steps(env))
+    if data and clocks.steps:
+        raise ConfigError(f"dataset={settings.dataset}: this algorithm learns from no data set")
+    if not data and not clocks.steps:
+        raise ConfigError("an offline algorithm learns from a data set: give dataset=PATH")
+    if share > 1 and not clocks.steps:
+        raise ConfigError(
+            f"devices={devices}: a lone seed has no environments to split over them; use num_seeds"
+        )
+    if share > 1 and configs[0].num_envs % share:
+        raise ConfigError(f"num_envs={configs[0].num_envs} does not split over devices={devices}")
+    iterations = float(clock.iterations(settings, clocks))
 
     def settled(cfg: Any) -> Any:
-        ends = cfg.total_iterations
-        if math.isinf(ends):
-            ends = float(-(-settings.total_steps // clocks.steps))
-        return dataclasses.replace(cfg, num_envs=cfg.num_envs // share, total_iterations=ends)
+        ends = iterations if math.isinf(cfg.total_iterations) else cfg.total_iterations
+        part = {"num_envs": cfg.num_envs // share} if share > 1 else {}
+        return dataclasses.replace(cfg, total_iterations=ends, **part)
 
     # A split seed has one key for all its devices: the algorithm folds the device's index in.
     keys = jax.vmap(jax.random.key)(np.array([m.seed for m in run] * share, np.uint32))
@@ -98,7 +114,7 @@ def build(env: Env, make: Callable, configs: Sequence[Any], settings: TrainConfi
     update = over_rows(algo.update, rows)
     if devices == 1:
         one = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
-        return Program(init, update, algo.params, clocks, (keys, floats), run, one)
+        return Program(init, update, algo.params, clocks, (keys, floats), run, one, one, data)
     mesh = jax.make_mesh(
         (devices,), (AXIS,), devices=jax.devices()[:devices], axis_types=(AxisType.Auto,)
     )
@@ -123,8 +139,17 @@ def build(env: Env, make: Callable, configs: Sequence[Any], settings: TrainConfi
     def empty(x: jax.Array) -> jax.Array:
         return jnp.zeros((x.shape[0] // devices, *x.shape[1:]), x.dtype)
 
-    sharding = NamedSharding(mesh, spec)
-    return Program(split(init), split(update), algo.params, clocks, (keys, floats), run, sharding)
+    return Program(
+        init=split(init),
+        update=split(update),
+        params=algo.params,
+        clocks=clocks,
+        start=(keys, floats),
+        members=run,
+        sharding=NamedSharding(mesh, spec),
+        everywhere=NamedSharding(mesh, PartitionSpec()),
+        data=data,
+    )
 
 
 def over_rows(fn: Callable[[PyTree, Shared], PyTree], rows: int) -> Callable[[PyTree, Shared], PyTree]:
@@ -145,4 +170,8 @@ def over_rows(fn: Callable[[PyTree, Shared], PyTree], rows: int) -> Callable[[Py
 
 def compiled(program: Program, ts: PyTree) -> Any:
     """The update for a train state of these shapes; JAX remembers it."""
-    return jax.jit(program.update, donate_argnums=0).lower(ts, Shared(np.int32(0))).compile()
+    data = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=program.everywhere), program.data
+    )
+    shared = program.shared()._replace(data=data)
+    return jax.jit(program.update, donate_argnums=0).lower(ts, shared).compile()

@@ -23,8 +23,7 @@ from typing import Any, NamedTuple
 import yaml
 
 from jaxsafe.config import ConfigError, flat, is_float, one_line
-from jaxsafe.learn import on_policy
-from jaxsafe.run import checkpoint, distributed, memory, run_folder, session
+from jaxsafe.run import checkpoint, clock, distributed, memory, run_folder, session
 from jaxsafe.run.interrupts import Interrupts
 from jaxsafe.run.policies import warm_start
 from jaxsafe.run.progress import Report
@@ -107,8 +106,7 @@ def plan(given: dict[str, Any], several: dict[str, list[Any]], entries: Entries 
     for i, values in enumerate(itertools.product(*apart.values())):
         chosen = dict(zip(apart, values, strict=True))
         settings = ask(merged(given, nested(side_by_side | chosen)), entries)
-        make_env(settings)
-        on_policy.check(settings.algo)
+        settings.row.make(make_env(settings)).clocks(settings.algo)  # refuses sizes that do not fit
         rest = [f"{k}={as_text(v)}" for k, v in chosen.items() if k not in DEFAULT]
         name = "-".join([f"{i:03d}", settings.label, *rest])
         groups[re.sub(r"[^\w.=+-]+", "_", name)[:100]] = settings
@@ -273,4 +271,4 @@ def train(sweep: Sweep, again: str, report: Report, after: After) -> int:
 def finished(settings: Settings, folder: Path) -> bool:
     done, train = run_folder.progress(folder), settings.train
     evaluated = (folder / "evaluation.json").exists() or not train.eval_episodes
-    return done is not None and done[1] >= train.total_steps and evaluated
+    return done is not None and clock.ended(train, done) and evaluated

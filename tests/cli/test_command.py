@@ -167,7 +167,8 @@ def test_a_run_folder_holds_what_a_reader_needs(real):
     for name in ("config.yaml", "versions.json", "metrics.csv", "curves.png", "evaluation.json"):
         assert (run / name).stat().st_size > 0
     assert list(run.glob("tensorboard/seed0/events*"))
-    assert run_folder.progress(run) == (2, 2 * STEPS)
+    done = run_folder.progress(run)
+    assert done is not None and done[:2] == (2, 2 * STEPS)
     assert [p for p in run.rglob("*") if p.suffix in (".pkl", ".pickle", ".npy")] == []
     saved = run_folder.read_config(run)
     assert settings.settle(saved).plain() == saved
@@ -207,9 +208,9 @@ def test_ctrl_c_saves_and_says_how_to_resume_and_that_works(finished, tmp_path, 
     reached = run_folder.progress(run)
     assert reached is not None
     monkeypatch.chdir(tmp_path)
-    assert typed("train", "resume=run", TOY, f"total_steps={reached[1] + STEPS}") == 0
+    assert typed("train", "resume=run", TOY, f"total_steps={reached.steps + STEPS}") == 0
     assert "resuming at" in capsys.readouterr().out
-    assert run_folder.progress(run) == (reached[0] + 1, reached[1] + STEPS)
+    assert run_folder.progress(run) == (reached[0] + 1, reached[1] + STEPS, reached[2] + 4)
     table, reference = rows(run), rows(finished)
     compared = min(len(table), len(reference))
     where = [i for i, name in enumerate(reference[0]) if name != "train/lr"]  # decays over the run
@@ -278,7 +279,7 @@ def test_the_policy_of_a_run_is_read_whatever_its_minibatches_divide(tmp_path, n
         program.params(jax.eval_shape(program.init, program.start, FIRST)),
     )
     run_folder.write_config(tmp_path, run.plain())
-    checkpoint.save(tmp_path / "policy", ones, 1, 40)
+    checkpoint.save(tmp_path / "policy", ones, checkpoint.Progress(1, 40, 4))
     algo, params = policies.policy_of(run, env, tmp_path)
     params = jax.tree.map(lambda x: x[0], params)
     action, _, _ = algo.policy.act(params, (), jnp.zeros(algo.task(params).obs_size), None)
@@ -304,7 +305,7 @@ def test_a_full_disk_ends_training_in_one_line(tmp_path):
     _, err = process.communicate(timeout=200)
     assert process.returncode == 1
     assert len(err.splitlines()) == 1 and err.startswith("error: ") and "large" in err
-    assert checkpoint.load(tmp_path / "run" / "checkpoints")[1].iteration > 0
+    assert checkpoint.load(tmp_path / "run" / "checkpoints")[1].at.iteration > 0
 
 
 @pytest.mark.parametrize("num_seeds", [1, 2])
@@ -359,7 +360,7 @@ def test_each_seed_starts_from_the_same_seed_where_there_is_one(finished, tmp_pa
     source.mkdir()
     run_folder.write_config(source, run_folder.read_config(finished) | {"seed": 4, "num_seeds": 3})
     three = {k: np.concatenate([v, v + 1, v + 2]) for k, v in policy_rows(finished).items()}
-    checkpoint.save(source / "checkpoints", three, 1, 64)
+    checkpoint.save(source / "checkpoints", three, checkpoint.Progress(1, 64, 4))
     _, taken, said = warm(f"init_from={source}", "seed=5", "num_seeds=3")
     for name, value in three.items():
         np.testing.assert_array_equal(taken[name], value[[1, 2, 0]])
@@ -406,4 +407,4 @@ def test_a_resumed_run_does_not_start_from_the_other_policy_again(
     assert typed("train", *args, f"total_steps={4 * STEPS}", "resume=true") == 0
     assert "starting from" not in capsys.readouterr().out
     assert run_folder.read_config(tmp_path / "run")["init_from"] == "source"
-    assert run_folder.progress(tmp_path / "run") == (4, 4 * STEPS)
+    assert run_folder.progress(tmp_path / "run") == (4, 4 * STEPS, 16)

@@ -15,6 +15,7 @@ from jaxsafe.config import ConfigError
 from jaxsafe.report import group, plots, read, results, scores, stats, tables
 from jaxsafe.report.published import beside, read_published
 from jaxsafe.run import run_folder
+from jaxsafe.run.checkpoint import Progress
 
 RESULTS = Path(__file__).parent.parent.parent / "docs" / "results"
 HEADER = "task,algo,source,return,return_std,cost,cost_std,cost_limit\n"
@@ -45,7 +46,7 @@ def write(
             "train/cost": np.where(late, costs, 99.0),
             "train/cost_rate": np.full(len(returns), i / 100),
         }
-        log.append(i, 10 * i, list(seeds), 0.0, values | more)
+        log.append(Progress(i, 10 * i, i), list(seeds), 0.0, values | more)
     log.close()
     return folder
 

@@ -57,7 +57,7 @@ def wait_for_rows(run: Path, processes: list[subprocess.Popen]) -> None:
 def reached(run: Path) -> int:
     done = run_folder.progress(run)
     assert done is not None
-    return done[1]
+    return done.steps
 
 
 def assert_same_run(a: Path, b: Path) -> None:

@@ -18,6 +18,7 @@ from jaxsafe.config import ConfigError
 from jaxsafe.report import condensed, plots, studies
 from jaxsafe.report.read import read, read_one
 from jaxsafe.run import run_folder
+from jaxsafe.run.checkpoint import Progress
 
 ROOT = Path(__file__).parent.parent.parent
 TOY = """
@@ -52,7 +53,8 @@ def trained(folder: Path, options: list[str], steps: int = 4000, nonfinite: Any 
     for i in range(1, steps // 10 + 1):
         values = [np.array([i, 2 * i]), np.array([i % 40, 30.0]), np.full(2, 0.1), np.array(nonfinite)]
         values[0] = np.where(i < 5, np.nan, values[0])
-        log.append(i, 10 * i, [0, 1], 60.0 * i, dict(zip(names, values, strict=True)))
+        at = Progress(i, 10 * i, i)
+        log.append(at, [0, 1], 60.0 * i, dict(zip(names, values, strict=True)))
     log.close()
     (folder / "evaluation.json").write_text(
         json.dumps({"seeds": {"return": [5.0, 7.0], "cost": [1.0, 2.0]}})

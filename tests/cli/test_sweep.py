@@ -16,6 +16,7 @@ from toys import FIRST, Corridor
 
 from jaxsafe import algos
 from jaxsafe.config import ConfigError, float_fields
+from jaxsafe.learn.offline import OfflineConfig, blank
 from jaxsafe.report import plots
 from jaxsafe.report.evaluation import evaluate
 from jaxsafe.report.finish import finish
@@ -195,10 +196,13 @@ def test_parts_are_whole_settings_or_seeds_of_one_and_of_equal_size():
 @pytest.mark.parametrize("name", sorted(algos.ALGOS))
 def test_every_float_of_every_algorithm_may_differ_between_members(name):
     kind = algos.ALGOS[name].config
-    cfg = kind(num_envs=256, horizon=4, hidden=(4,))
+    offline = issubclass(kind, OfflineConfig)
+    cfg = kind(hidden=(4,)) if offline else kind(num_envs=256, horizon=4, hidden=(4,))
     other = replace(cfg, **{field: 0.25 for field in float_fields(kind)})
-    program = build(Corridor(), algos.ALGOS[name].make, (cfg, other), TrainConfig(num_seeds=2))
-    ts = jax.eval_shape(program.init, program.start, FIRST)
+    data = blank(Corridor()) if offline else ()
+    train = TrainConfig(num_seeds=2, total_updates=1)
+    program = build(Corridor(), algos.ALGOS[name].make, (cfg, other), train, data)
+    ts = jax.eval_shape(program.init, program.start, program.shared())
     assert all(x.shape == (4,) for x in jax.tree.leaves(ts.config))
     assert jax.tree.leaves(program.start[1])[0].dtype == np.float32
 
@@ -247,7 +251,7 @@ def test_an_interrupted_sweep_goes_on_and_ends_bit_for_bit_as_if_uninterrupted(t
         patch.setattr(checkpoint, "save", killed)
         train(tmp_path / "sweep", *args)
     first, second = sorted((tmp_path / "sweep").glob("0*"))
-    assert (run_folder.progress(first), run_folder.progress(second)) == ((6, 192), (2, 64))
+    assert [run_folder.progress(f) for f in (first, second)] == [(6, 192, 24), (2, 64, 8)]
     train(tmp_path / "sweep", *GRID, "checkpoint_iterations=2")  # the parts are remembered
     starts = [len(json.loads((f / "versions.json").read_text())) for f in (first, second)]
     assert starts == [1, 2]
@@ -317,7 +321,8 @@ def write(folder: Path, configs: dict[str, Any], table: list[tuple]) -> None:
         late = iteration > 18
         seeds, limits, returns, costs = (np.array(c) for c in zip(*table, strict=True))
         values = {"train/return": late * returns, "train/cost": np.where(late, costs, 99.0)}
-        log.append(iteration, iteration * 10, list(seeds), 0.0, values | dict.fromkeys(swept, limits))
+        at = checkpoint.Progress(iteration, iteration * 10, iteration)
+        log.append(at, list(seeds), 0.0, values | dict.fromkeys(swept, limits))
     log.close()
 
 

@@ -14,7 +14,7 @@ from jaxsafe.learn import augment
 from jaxsafe.learn.augment import Budget, control_budget, full_budget, init_schedule
 from jaxsafe.learn.normalise import Normaliser, normalise
 from jaxsafe.learn.on_policy import see
-from jaxsafe.learn.rollout import collect, init_rollout
+from jaxsafe.learn.rollout import collect, init_rollout, memoryless
 from jaxsafe.run import checkpoint, compat, evaluate
 from jaxsafe.types import Policy
 
@@ -41,11 +41,7 @@ def start(name, env, **settings):
 
 def run(env, num_envs, horizon, policy, **options):
     rollout = init_rollout(env, jax.random.key(0), num_envs, stagger=False)
-
-    def behave(carry, obs, first, key):
-        return *policy(obs, key), carry
-
-    step = jax.jit(partial(collect, env, behave, horizon=horizon, **options))
+    step = jax.jit(partial(collect, env, memoryless(policy), horizon=horizon, **options))
     return step(rollout, key=jax.random.key(1))[1]
 
 
@@ -262,7 +258,7 @@ def test_a_schedule_comes_back_from_a_checkpoint(tmp_path):
     env = Clock(episode_length=6)
     algo, update = build("ppo_simmer_pid", env)
     ts, _ = update(start("ppo_simmer_pid", env, **HAND))
-    checkpoint.save(tmp_path, ts, iteration=1, steps=24)
+    checkpoint.save(tmp_path, ts, checkpoint.Progress(1, 24, 1))
     cfg = ALGOS["ppo_simmer_pid"].config(**TINY | HAND)
     like = jax.eval_shape(lambda: algo.init(jax.random.key(0), cfg, FIRST))
     back, _ = checkpoint.restore(tmp_path, like)

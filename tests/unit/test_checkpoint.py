@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxsafe.run import checkpoint
-from jaxsafe.run.checkpoint import CheckpointError, checkpoints, restore, save
+from jaxsafe.run.checkpoint import CheckpointError, Progress, checkpoints, restore, save
 
 
 def state(scale: float = 1.0):
@@ -15,6 +15,10 @@ def state(scale: float = 1.0):
         "flags": (jnp.array([True, False]), ()),
         "iteration": jnp.int32(7),
     }
+
+
+def at(iteration: int) -> Progress:
+    return Progress(iteration, 10 * iteration, 2 * iteration)
 
 
 def assert_same(a, b):
@@ -34,23 +38,23 @@ def flip_a_byte(path):
 
 
 def test_a_train_state_comes_back_bit_for_bit_with_its_random_keys(tmp_path):
-    save(tmp_path, state(0.1), iteration=7, steps=70)
+    save(tmp_path, state(0.1), at(7))
     restored, manifest = restore(tmp_path, jax.eval_shape(state))
     assert_same(restored, state(0.1))
-    assert (manifest.iteration, manifest.steps) == (7, 70)
+    assert manifest.at == at(7)
     assert jax.random.normal(restored["key"][0]) == jax.random.normal(state()["key"][0])
 
 
 def test_the_last_two_checkpoints_stay(tmp_path):
     for i in range(4):
-        save(tmp_path, state(), i, i)
+        save(tmp_path, state(), at(i))
     assert [p.name for p in checkpoints(tmp_path)] == ["00000003", "00000002"]
 
 
 @pytest.mark.parametrize("damage", ["byte", "truncated", "missing", "manifest"])
 def test_a_corrupt_newest_checkpoint_is_passed_over_with_one_line(tmp_path, damage):
-    save(tmp_path, state(1.0), 1, 1)
-    newest = save(tmp_path, state(2.0), 2, 2)
+    save(tmp_path, state(1.0), at(1))
+    newest = save(tmp_path, state(2.0), at(2))
     if damage == "byte":
         flip_a_byte(newest)
     elif damage == "manifest":
@@ -60,7 +64,7 @@ def test_a_corrupt_newest_checkpoint_is_passed_over_with_one_line(tmp_path, dama
         file.write_bytes(file.read_bytes()[:10]) if damage == "truncated" else file.unlink()
     lines: list[str] = []
     restored, manifest = restore(tmp_path, jax.eval_shape(state), lines.append)
-    assert manifest.iteration == 1
+    assert manifest.at == at(1)
     assert_same(restored, state(1.0))
     assert len(lines) == 1 and "00000002 is corrupt" in lines[0] and "\n" not in lines[0]
 
@@ -68,49 +72,49 @@ def test_a_corrupt_newest_checkpoint_is_passed_over_with_one_line(tmp_path, dama
 def test_no_sound_checkpoint_is_one_clear_error(tmp_path):
     with pytest.raises(CheckpointError, match="no checkpoint in"):
         restore(tmp_path, jax.eval_shape(state))
-    flip_a_byte(save(tmp_path, state(), 1, 1))
+    flip_a_byte(save(tmp_path, state(), at(1)))
     with pytest.raises(CheckpointError, match="is corrupt"):
         restore(tmp_path, jax.eval_shape(state), lambda line: None)
 
 
 def test_another_train_state_is_refused_by_the_leaf_that_differs(tmp_path):
-    save(tmp_path, state(), 1, 1)
+    save(tmp_path, state(), at(1))
     other = {**state(), "params": {"w": jnp.zeros((2, 4)), "empty": jnp.zeros((0, 3))}}
     with pytest.raises(CheckpointError, match=r"params\.w is float32\[2, 3\], not float32\[2, 4\]"):
         restore(tmp_path, jax.eval_shape(lambda: other))
 
 
 def test_a_full_disk_is_one_error_and_the_last_good_checkpoint_stays(tmp_path, monkeypatch):
-    good = save(tmp_path, state(1.0), 1, 1)
+    good = save(tmp_path, state(1.0), at(1))
 
     def full(*args, **kwargs):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(checkpoint.ocp.Checkpointer, "save", full)
     with pytest.raises(CheckpointError, match=f"No space left on device; the last good one is {good}"):
-        save(tmp_path, state(2.0), 2, 2)
+        save(tmp_path, state(2.0), at(2))
     assert checkpoints(tmp_path) == [good] and not list(tmp_path.glob("*.part"))
     assert_same(restore(tmp_path, jax.eval_shape(state))[0], state(1.0))
 
 
 def test_what_a_killed_process_left_behind_is_ignored_and_cleared(tmp_path):
-    save(tmp_path, state(), 1, 1)
+    save(tmp_path, state(), at(1))
     (tmp_path / "00000002.part" / "state").mkdir(parents=True)
     assert [p.name for p in checkpoints(tmp_path)] == ["00000001"]
-    save(tmp_path, state(), 3, 3)
+    save(tmp_path, state(), at(3))
     assert not list(tmp_path.glob("*.part"))
 
 
 def test_a_replay_that_is_left_out_comes_back_empty_and_says_since_when(tmp_path):
     ts = state() | {"replay": {"obs": jnp.ones((5, 2)), "first": jnp.ones(5, bool)}}
     assert checkpoint.replay_bytes(ts) == 5 * 2 * 4 + 5
-    save(tmp_path, ts, 7, 70, since=2)
+    save(tmp_path, ts, at(7), since=2)
     kept, manifest = restore(tmp_path, ts)
     assert_same(kept, ts)
     assert manifest.since == 2
-    save(tmp_path, ts, 8, 80, since=2, replay=False)
+    save(tmp_path, ts, at(8), since=2, replay=False)
     back, manifest = restore(tmp_path, ts)
     assert_same(back, ts | {"replay": jax.tree.map(jnp.zeros_like, ts["replay"])})
-    assert (manifest.iteration, manifest.since) == (8, 8)
-    save(tmp_path, state(), 9, 90)  # of another algorithm: its replay is not empty but absent
+    assert (manifest.at, manifest.since) == (at(8), 8)
+    save(tmp_path, state(), at(9))  # of another algorithm: its replay is not empty but absent
     assert checkpoint.replay_bytes(state()) == 0 and restore(tmp_path, state())[1].since == 0

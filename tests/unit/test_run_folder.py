@@ -11,16 +11,16 @@ from toys import Clock
 from jaxsafe.config import ConfigError
 from jaxsafe.learn.acting import reflex
 from jaxsafe.report import evaluation, plots, scores
-from jaxsafe.run import evaluate, run_folder
+from jaxsafe.run import checkpoint, evaluate, run_folder
+from jaxsafe.run.checkpoint import Progress
 from jaxsafe.run.run_folder import Metrics, read_config, read_metrics
 
 
 def write(folder, iterations, resume_at=0):
     log = Metrics(folder, ["train/cost", "train/return"], resume_at)
     for i in iterations:
-        log.append(
-            i, 10 * i, [4, 5], float(i), {"train/return": [i, math.nan], "train/cost": [0.1, 2.0]}
-        )
+        values = {"train/return": [i, math.nan], "train/cost": [0.1, 2.0]}
+        log.append(Progress(i, 10 * i, 2 * i), [4, 5], float(i), values)
     log.close()
     return log
 
@@ -28,9 +28,9 @@ def write(folder, iterations, resume_at=0):
 def test_metrics_have_a_row_for_each_seed_and_empty_cells_for_no_value(tmp_path):
     write(tmp_path, [1])
     assert (tmp_path / "metrics.csv").read_text().splitlines() == [
-        "iteration,steps,seed,seconds,train/cost,train/return",
-        "1,10,4,1.000,0.1,1.0",
-        "1,10,5,1.000,2.0,",
+        "iteration,steps,updates,seed,seconds,train/cost,train/return",
+        "1,10,2,4,1.000,0.1,1.0",
+        "1,10,2,5,1.000,2.0,",
     ]
     assert np.isnan(read_metrics(tmp_path)["train/return"][1])
 
@@ -39,7 +39,7 @@ def test_resuming_drops_rows_after_the_checkpoint_and_a_torn_last_line(tmp_path)
     write(tmp_path, [1, 2, 3, 4])
     whole = (tmp_path / "metrics.csv").read_text()
     with (tmp_path / "metrics.csv").open("a") as file:
-        file.write("5,50,4,5.0")
+        file.write("5,50,10,4,5.0")
     log = write(tmp_path, [3, 4], resume_at=2)
     assert (tmp_path / "metrics.csv").read_text() == whole
     assert log.seconds == 2.0
@@ -48,7 +48,7 @@ def test_resuming_drops_rows_after_the_checkpoint_and_a_torn_last_line(tmp_path)
 def test_packed_metrics_are_read_like_the_plain_ones(tmp_path):
     write(tmp_path, [1, 2])
     plain, path = read_metrics(tmp_path), tmp_path / "metrics.csv"
-    path.with_name("metrics.csv.xz").write_bytes(lzma.compress(path.read_bytes() + b"3,30,4"))
+    path.with_name("metrics.csv.xz").write_bytes(lzma.compress(path.read_bytes() + b"3,30,6,4"))
     path.unlink()
     packed = read_metrics(tmp_path)
     assert packed.keys() == plain.keys()
@@ -139,6 +139,11 @@ def test_unconstrained_ppo_scores_one_and_a_safe_policy_violates_by_zero():
 
 def test_progress_reads_the_newest_manifest(tmp_path):
     assert run_folder.progress(tmp_path) is None
+    for done in (Progress(3, 30, 6), Progress(4, 40, 8)):
+        newest = checkpoint.save(tmp_path / "checkpoints", {"x": np.ones(2)}, done)
+    assert run_folder.progress(tmp_path) == Progress(4, 40, 8)
+    (newest / "manifest.json").write_text("{")
+    assert run_folder.progress(tmp_path) == Progress(3, 30, 6)
 
 
 def test_the_command_of_a_run_is_recorded_as_it_was_typed(tmp_path, monkeypatch):

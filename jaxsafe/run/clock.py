@@ -1,0 +1,56 @@
+"""What a run counts: iterations, environment steps and gradient steps, the last two of one seed.
+
+A run ends at `total_updates` gradient steps where that is given, else at `total_steps` environment
+steps. What a user reads names environment steps, or gradient steps where an update takes no
+environment step.
+"""
+
+from typing import NamedTuple
+
+from jaxsafe.config import ConfigError
+from jaxsafe.run.checkpoint import Progress
+from jaxsafe.run.settings import TrainConfig
+from jaxsafe.types import Clocks
+
+
+class Unit(NamedTuple):
+    """What is shown of how far a run is."""
+
+    name: str  # 'steps' or 'updates', which are columns of metrics.csv too
+    each: int  # in one iteration
+
+    def at(self, iteration: int) -> int:
+        return iteration * self.each
+
+    def crosses(self, every: int, iteration: int) -> bool:
+        """Whether `iteration` reaches or passes a multiple of `every`; never one of 0."""
+        return every > 0 and self.at(iteration) // every > self.at(iteration - 1) // every
+
+
+def unit(clocks: Clocks) -> Unit:
+    return Unit("steps", clocks.steps) if clocks.steps else Unit("updates", clocks.updates)
+
+
+def after(iteration: int, clocks: Clocks) -> Progress:
+    return Progress(iteration, iteration * clocks.steps, iteration * clocks.updates)
+
+
+def iterations(settings: TrainConfig, clocks: Clocks) -> int:
+    """Iterations of a whole run: as many as `total_updates` or `total_steps` needs, rounded up.
+
+    Raises:
+        ConfigError: an update does not take any of the steps that are to be counted.
+    """
+    name, total, each, kind = "total_steps", settings.total_steps, clocks.steps, "environment"
+    if settings.total_updates is not None:
+        name, total, each, kind = "total_updates", settings.total_updates, clocks.updates, "gradient"
+    if not each:
+        raise ConfigError(f"{name}={total}: the algorithm takes no {kind} steps")
+    return -(-total // each)
+
+
+def ended(settings: TrainConfig, done: Progress) -> bool:
+    """Whether a run that is so far is at its end."""
+    if settings.total_updates is not None:
+        return done.updates >= settings.total_updates
+    return done.steps >= settings.total_steps

@@ -1,0 +1,191 @@
+"""Runs that learn from a data set: trained, evaluated, stopped, resumed, compared, refused."""
+
+import shutil
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from shell import TOY, assert_same_run, start, typed, wait_for
+
+import jaxsafe
+from jaxsafe.config import ConfigError
+from jaxsafe.learn.offline import DataSet
+from jaxsafe.report import read
+from jaxsafe.run import checkpoint, dataset, run_folder, session
+from jaxsafe.run.arguments import compose
+from jaxsafe.run.dataset import read_dataset, write_dataset
+from jaxsafe.run.policies import open_run
+
+BC = (TOY, "algo=bc", "algo.updates=10", "algo.hidden=[8]", "eval_episodes=2", "video=false")
+
+
+def make_data(n: int = 100) -> DataSet:
+    rng = np.random.default_rng(0)
+    obs, action = rng.normal(size=(n, 4)), rng.uniform(-1, 1, (n, 2))
+    fields: Any = (obs, action, rng.normal(size=n), np.zeros(n), obs + 0.1, np.zeros(n))
+    return DataSet(*(x.astype(np.float32) for x in fields[:5]), terminated=fields[5].astype(bool))
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    path = tmp_path_factory.mktemp("data") / "data.npz"
+    write_dataset(path, make_data())
+    return path
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory, data):
+    run = tmp_path_factory.mktemp("whole") / "run"
+    args = (*BC, f"dataset={data}", "total_updates=400", "num_seeds=2", f"run_dir={run}")
+    assert typed("train", *args) == 0
+    return run
+
+
+def test_a_data_set_comes_back_from_its_file(data):
+    for x, y in zip(read_dataset(str(data)), make_data(), strict=True):
+        assert x.dtype == y.dtype
+        np.testing.assert_array_equal(x, y)
+
+
+def test_a_run_counts_gradient_steps_and_needs_no_data_to_be_evaluated(whole, data, capsys):
+    table = run_folder.read_metrics(whole)
+    assert table["updates"][::2].tolist() == [10.0 * (i + 1) for i in range(40)]
+    assert not table["steps"].any() and table["train/actor_loss"][-1] < table["train/actor_loss"][0]
+    assert run_folder.progress(whole) == (40, 0, 400)
+    config = run_folder.read_config(whole)
+    assert (config["dataset"], config["total_updates"]) == (str(data), 400)
+    assert run_folder.dataset_of(whole) == dataset.sha256(str(data))
+    assert (whole / "curves.png").exists() and (whole / "evaluation.json").exists()
+    config["dataset"] = "/nowhere.npz"
+    copy = whole.parent / "copy"
+    shutil.copytree(whole, copy)
+    run_folder.write_config(copy, config)
+    assert open_run(copy, (TOY,)).params.normaliser.mean.shape == (2, 4)
+    assert typed("evaluate", str(copy), TOY, "--episodes", "2") == 0
+    assert "return" in capsys.readouterr().out
+
+
+def test_the_normaliser_that_acts_is_that_of_the_data(whole):
+    params = open_run(whole, (TOY,)).params
+    np.testing.assert_allclose(params.normaliser.mean[1], make_data().obs.mean(0), atol=1e-5)
+
+
+def test_killed_and_resumed_it_ends_bit_for_bit_as_if_uninterrupted(whole, data, tmp_path, capsys):
+    run, moved = tmp_path / "run", tmp_path / "moved.npz"
+    args = (*BC, "total_updates=400", "num_seeds=2", f"run_dir={run}", "checkpoint_iterations=1")
+    process = start("train", *args, f"dataset={data}", cwd=tmp_path)
+    wait_for(lambda: len(checkpoint.checkpoints(run / "checkpoints")) == 2, process)
+    process.kill()
+    process.communicate()
+    reached = run_folder.progress(run)
+    assert reached is not None and 0 < reached.iteration < 40, "killed too late to test anything"
+    shutil.copy(data, moved)
+    assert typed("train", *args, f"dataset={moved}", "resume=true") == 0
+    assert f"resuming at {reached.updates} updates" in capsys.readouterr().out
+    assert_same_run(run, whole)
+
+
+def test_another_data_set_is_refused_on_resumption(whole, data, tmp_path, capsys):
+    other = tmp_path / "other.npz"
+    write_dataset(other, make_data(50))
+    args = (f"resume={whole}", TOY, f"dataset={other}")
+    assert typed("train", *args) == 2
+    assert f"dataset={other} is not the file that {whole} was trained with" in capsys.readouterr().err
+    assert not session.same(compose([*BC, f"dataset={other}"]), whole)
+
+
+def test_a_comparison_holds_runs_without_training_episodes(whole):
+    (run,) = read.read([whole])
+    assert run.steps == 400 and run.ended
+    assert np.isnan(run.values["return"]).all() and np.isfinite(run.values["final return"]).all()
+    assert typed("plot", str(whole), "--out", str(whole.parent / "comparison")) == 0
+
+
+def test_evaluation_during_training_stands_in_for_its_episodes(data, tmp_path):
+    run = tmp_path / "run"
+    args = (*BC, f"dataset={data}", "total_updates=100", "eval_every=30", f"run_dir={run}")
+    assert typed("train", *args) == 0
+    table = run_folder.read_metrics(run)
+    assert table["updates"][np.isfinite(table["eval/cost"])].tolist() == [30, 60, 90, 100]
+    np.testing.assert_array_equal(table["eval/return"], table["eval/return_sampled"])  # deterministic
+    (found,) = read.read([run])
+    assert found.values["return"][0] == pytest.approx(table["eval/return"][-1], rel=1e-6)
+
+
+def test_python_trains_on_a_path(data, tmp_path, capsys):
+    run = jaxsafe.train("toys:Corridor", "bc", dataset=data, total_updates=10, updates=10, hidden=(8,),
+                        eval_episodes=0, video=False, run_dir=tmp_path / "run")  # fmt: skip
+    assert run.settings.train.dataset == str(data) and run.metrics["updates"].tolist() == [10]
+    assert "1 seed | cpu" in capsys.readouterr().out
+
+
+def test_a_data_set_has_100_000_updates_unless_told_otherwise(data):
+    assert compose([*BC, f"dataset={data}"]).train.total_updates == 100_000
+    assert compose([*BC]).train.total_updates is None
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        (["algo=bc"], "an offline algorithm learns from a data set: give dataset=PATH"),
+        (["algo=bc", "dataset=nowhere.npz"], "dataset=nowhere.npz: there is no such file"),
+        (["algo=ppo_lag", "dataset=DATA"], "this algorithm learns from no data set"),
+        (["algo=bc", "dataset=DATA", "num_envs=4"], "num_envs=4: bc trains without environments"),
+        (["algo=bc", "dataset=DATA", "env=toys:Clock"], "observations have 4 numbers, those of the"),
+        (["algo=bc", "dataset=DATA", "algo.updates=0"], "updates=0: expected at least 1"),
+        (["algo=bc", "dataset=DATA", "total_updates=0"], "total_updates=0: expected at least 1"),
+    ],
+)
+def test_what_cannot_work_is_one_line(tmp_path, data, capsys, options, message):
+    options = [text.replace("DATA", str(data)) for text in options]
+    assert typed("train", TOY, f"run_dir={tmp_path / 'run'}", *options) == 2
+    said = capsys.readouterr()
+    assert message in said.err and len((said.out + said.err).strip().splitlines()) == 1
+
+
+def test_a_lone_seed_without_environments_does_not_split_over_devices(data, monkeypatch):
+    monkeypatch.setattr(session, "check_devices", lambda train: None)
+    with pytest.raises(ConfigError, match="devices=2: a lone seed has no environments to split"):
+        session.prepare(compose([*BC, f"dataset={data}", "devices=2"]))
+
+
+@pytest.mark.parametrize(
+    "name, array, message",
+    [
+        ("terminals", None, "has no terminals; did you mean"),
+        ("rewards", np.zeros((100, 1)), r"rewards is float64\[100, 1\], expected numbers \[n\]"),
+        ("actions", np.zeros((99, 2)), r"actions is float64\[99, 2\], expected numbers \[n, size\]"),
+        ("costs", np.full(100, np.nan), "costs holds numbers that are not finite"),
+        ("costs", np.full(100, 1e300), "costs holds numbers that are not finite"),
+        ("costs", np.full(100, "1"), "costs is <U1"),
+        ("costs", np.array([{}] * 100), "cannot be read as .npz: Object arrays cannot be loaded"),
+    ],
+)
+def test_wrong_arrays_are_one_line(tmp_path, data, name, array, message):
+    with np.load(data) as file:
+        arrays: dict[str, Any] = {k: file[k] for k in file.files} | {"terminated": np.zeros(1)}
+    arrays = {k: x for k, x in (arrays | {name: array}).items() if x is not None}
+    np.savez(tmp_path / "wrong.npz", **arrays)
+    with pytest.raises(ConfigError, match=message) as error:
+        read_dataset(str(tmp_path / "wrong.npz"))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 torn", b"text"])
+def test_a_file_of_another_kind_is_one_line(tmp_path, content):
+    path = tmp_path / "data.npz"
+    path.write_bytes(content)
+    with pytest.raises(ConfigError, match="cannot be read as"):
+        read_dataset(str(path))
+    with path.open("wb") as file:
+        np.save(file, np.zeros(3))
+    with pytest.raises(ConfigError, match="cannot be read as"):
+        read_dataset(str(path))
+
+
+def test_members_share_one_copy_of_the_data_and_nothing_of_it_is_given_up(data):
+    _, program = session.prepare(compose([*BC, f"dataset={data}", "num_seeds=3"]))
+    like = jax.eval_shape(program.init, program.start, program.shared())
+    count = len(read_dataset(str(data)).reward)
+    assert not any(count in x.shape for x in jax.tree.leaves(like))
