@@ -67,10 +67,10 @@ def curves(
         for i, (setting, table) in enumerate(settings.items()):
             if name in table and len(table["steps"]):
                 draw(axes, *by_seed(table, name), f"C{i % 10}", setting)
-            for end, (label, marker) in EVALUATED.items():
+            for end, (called, marker) in EVALUATED.items():
                 if (column := name.replace("train/", "eval/") + end) in table:
                     look = {"marker": marker, "mfc": "none" if end else None, "color": f"C{i % 10}"}
-                    axes.plot(*evaluated(table, column), ls="--", lw=1, label=label, **look)
+                    axes.plot(*evaluated(table, column), ls="--", lw=1, label=called, **look)
         if name in limits:
             common, column = limits[name]
             own = {t[column][0]: i for i, t in enumerate(settings.values()) if column in t}

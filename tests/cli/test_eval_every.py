@@ -91,6 +91,7 @@ def test_curves_show_evaluations_as_points_on_dashed_lines(watched, monkeypatch)
 
     monkeypatch.setattr(plots.Figure, "savefig", savefig)
     plots.curves(run_folder.read_metrics(watched), Path("curves.png"), "title", 25.0)
+    assert [axes.get_ylabel() for axes in drawn[0].axes] == [label for _, label in plots.PANELS]
     for axes in drawn[0].axes:
         lines = {line.get_label(): line for line in axes.lines}
         for name in ("evaluated, mean action", "evaluated, sampled"):
