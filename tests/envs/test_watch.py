@@ -117,8 +117,8 @@ def test_held_keys_take_over_from_the_policy(session):
 def test_play_shows_all_the_time_and_steps_at_the_pace_of_the_robot_unless_paused(session):
     def seconds(playing: bool) -> tuple[int, int]:
         stepped, shown, session.playing = [], [], playing
-        fake = dataclasses.make_dataclass("Fake", ["env", "playing", "step"])(
-            session.env, playing, lambda: stepped.append(1)
+        fake = dataclasses.make_dataclass("Fake", ["seconds", "playing", "step"])(
+            session.seconds, playing, lambda: stepped.append(1)
         )
         end = time.monotonic() + 0.5
         watch.Session.play(fake, lambda: shown.append(1), lambda: time.monotonic() > end)  # type: ignore[arg-type]
