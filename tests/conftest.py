@@ -1,8 +1,11 @@
+import sys
+import tempfile
 from collections.abc import Iterator
 
 import jax
 import pytest
 
+from jaxsafe import algos, envs
 from jaxsafe.envs.view import render
 from jaxsafe.run.devices import use_compilation_cache
 
@@ -19,6 +22,22 @@ def forgotten_programs(request: pytest.FixtureRequest) -> Iterator[None]:
     yield
     if request.path.parent.name != "envs":
         jax.clear_caches()
+
+
+@pytest.fixture(autouse=True)
+def forgotten_code() -> Iterator[None]:
+    """Forget the environments, algorithms and modules that a test brought with it."""
+    registries = [(registry, dict(registry)) for registry in (envs.ENVS, algos.ALGOS)]
+    modules, path = {*sys.modules}, [*sys.path]
+    yield
+    for registry, before in registries:
+        if registry.keys() != before.keys():
+            registry.clear()
+            registry.update(before)
+    for name in {*sys.modules} - modules:
+        if str(getattr(sys.modules[name], "__file__", None)).startswith(tempfile.gettempdir()):
+            del sys.modules[name]
+    sys.path[:] = path
 
 
 @pytest.fixture(scope="session")
