@@ -8,7 +8,7 @@ import optax
 
 from jaxsafe.config import config
 from jaxsafe.learn.batch import pmean
-from jaxsafe.learn.off_policy import Fit, Learner, Turn
+from jaxsafe.learn.learner import Fit, Learner, Turn
 from jaxsafe.learn.offline import OfflineConfig, offline
 from jaxsafe.learn.replay import Transitions
 from jaxsafe.learn.row import Row

@@ -8,7 +8,8 @@ import optax
 
 from jaxsafe.config import ConfigError, config
 from jaxsafe.learn.batch import pmean, select
-from jaxsafe.learn.off_policy import Fit, Learner, OffPolicyConfig, Turn, off_policy
+from jaxsafe.learn.learner import Fit, Learner, Turn
+from jaxsafe.learn.off_policy import OffPolicyConfig, off_policy
 from jaxsafe.learn.replay import Transitions
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.steps import adam

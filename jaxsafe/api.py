@@ -114,7 +114,9 @@ class Run:
         seeds = f"{s.train.num_seeds} seed{'s' * (s.train.num_seeds > 1)}"
         settings = f"{len(s.configs)} settings, " * (len(s.configs) > 1)
         name = f"{s.env_name}, {s.algo_name}, {settings}{seeds}"
-        return f"Run({str(self.folder)!r}: {name}, {self.steps:,} steps)"
+        done = run_folder.progress(self.folder)
+        far = f"{done.updates:,} updates" if done and not done.steps else f"{self.steps:,} steps"
+        return f"Run({str(self.folder)!r}: {name}, {far})"
 
     @property
     def config(self) -> dict[str, Any]:
@@ -448,7 +450,7 @@ def choose_algo(algo: Any) -> tuple[dict[str, Any], dict[str, Row]]:
     """As `choose_env`, for one algorithm or a list."""
     if algo is None:
         return {}, {}
-    several = type(algo) in (list, tuple)  # an entry is a tuple too
+    several = type(algo) in (list, tuple)  # a Row is a tuple too
     names, own = [], {}
     for one in algo if several else [algo]:
         if isinstance(one, str):

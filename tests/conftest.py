@@ -13,13 +13,20 @@ use_compilation_cache()  # what a first run of the tests compiles, the next one 
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 
 
+OURS = [(registry, dict(registry)) for registry in (envs.ENVS, algos.ALGOS)]
+
+
 @pytest.fixture(autouse=True, scope="module")
 def forgotten_programs(request: pytest.FixtureRequest) -> Iterator[None]:
     """Free the compiled programs of a file when it ends; those of environments are shared by several.
 
-    A process that keeps some thousands of them runs out of memory maps, and XLA crashes.
+    A process that keeps some thousands of them runs out of memory maps, and XLA crashes. What the file
+    registered is forgotten, too.
     """
     yield
+    for registry, ours in OURS:
+        registry.clear()
+        registry.update(ours)
     if request.path.parent.name != "envs":
         jax.clear_caches()
 

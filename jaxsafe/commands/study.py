@@ -100,7 +100,8 @@ def listing(study: Study, runs: Path) -> str:
     for run, state in states(study).items():
         folder = runs / condensed.name_of(run)
         if not state and (progress := run_folder.progress(folder)):
-            state = f"begun, at {progress.steps or progress.updates:,} steps"
+            steps, updates = progress.steps, progress.updates
+            state = f"begun, at {steps:,} steps" if steps else f"begun, at {updates:,} updates"
         lines.append(f"{condensed.name_of(run)}: {state or 'to do'}")
     return "\n".join(lines)
 

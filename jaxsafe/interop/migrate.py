@@ -293,8 +293,8 @@ def omnisafe(config: dict[str, Any], algo: str = "", env: str = "") -> Migrated:
             raise ConfigError(f"unknown key {key} of OmniSafe{nearest(key, OMNISAFE)}")
     name = find_algorithm(algo or values.get("algo"))
     target = find_environment(env or values.get("env_id"))
-    entry = algos.ALGOS[name]
-    preset = algo_options(entry, "published", "omnisafe")
+    row = algos.ALGOS[name]
+    preset = algo_options(row, "published", "omnisafe")
     start = {f"algo.{k}": v for k, v in preset.items()}
     start |= {"num_envs": preset["num_envs"], "seed": 0, "total_steps": 10_000_000}
     facts = Facts(values, start)
@@ -321,7 +321,7 @@ def omnisafe(config: dict[str, Any], algo: str = "", env: str = "") -> Migrated:
         text = " ".join(written(k, v) for k, v in fits.items())
         lines.append(Line(key, value, text + "".join(f" in place of {r}" for r in replaced)))
     checked = from_dict(
-        entry.config, {k[5:]: v for k, v in found.items() if k.startswith("algo.")}, "algo."
+        row.config, {k[5:]: v for k, v in found.items() if k.startswith("algo.")}, "algo."
     )
     for key, value in found.items():
         found[key] = getattr(checked, key[5:]) if key.startswith("algo.") else convert(value, int, key)
@@ -340,7 +340,7 @@ def find_algorithm(theirs: Any) -> str:
         raise ConfigError(f"no algorithm in the file: add --algo, one of {', '.join(known)}")
     for kind, names in MISSING.items():
         if theirs in names.split():
-            raise ConfigError(f"{theirs} has no counterpart: it is {kind}, ours are on-policy")
+            raise ConfigError(f"{theirs} cannot be migrated yet: it is {kind}")
     if theirs not in known:
         raise ConfigError(f"unknown algorithm {theirs} of OmniSafe{nearest(str(theirs), known)}")
     return known[theirs]

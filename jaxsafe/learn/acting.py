@@ -1,12 +1,28 @@
 """Playing a policy: what training, evaluation, films, the live view and adapters have in common."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import flax.struct
 import jax
 import jax.numpy as jnp
 
 from jaxsafe.types import Env, Policy, PyTree, State
+
+
+@flax.struct.dataclass
+class Learned:
+    """What acts: `config`, `params`, `dual` and `normaliser` of a train state."""
+
+    config: Any
+    params: dict[str, PyTree]
+    dual: PyTree
+    normaliser: PyTree
+
+
+def learned_of(ts: Any) -> Learned:
+    """What acts, of a train state that has its fields."""
+    return Learned(ts.config, ts.params, ts.dual, ts.normaliser)
 
 
 class Player(NamedTuple):

@@ -46,3 +46,8 @@ def select(condition: jax.Array, new: PyTree, old: PyTree) -> PyTree:
 
 def all_finite(tree: PyTree) -> jax.Array:
     return jnp.all(jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(tree)]))
+
+
+def device_key(key: jax.Array, axis_name: str | None) -> jax.Array:
+    """A key of this device's own."""
+    return key if axis_name is None else jax.random.fold_in(key, jax.lax.axis_index(axis_name))

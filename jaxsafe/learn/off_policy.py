@@ -20,14 +20,16 @@ import jax.numpy as jnp
 import optax
 
 from jaxsafe.config import ConfigError, config
-from jaxsafe.learn.batch import all_finite, masked_mean, pmean, psum, select
-from jaxsafe.learn.normalise import init_normaliser, merge, normalise
-from jaxsafe.learn.on_policy import Learned, episode_metrics, own
+from jaxsafe.learn.acting import learned_of
+from jaxsafe.learn.batch import all_finite, device_key, masked_mean, pmean, psum, select
+from jaxsafe.learn.learner import Fit, Learner, Turn, policy_by, seen
+from jaxsafe.learn.metrics import episode_metrics
+from jaxsafe.learn.normalise import init_normaliser, merge
 from jaxsafe.learn.replay import Row, Transitions, draw, empty_ring, held, ring_rows, transitions, write
 from jaxsafe.learn.returns import mean_length
 from jaxsafe.learn.rollout import Episode, RolloutState, init_rollout, restart, sums
 from jaxsafe.learn.steps import remaining
-from jaxsafe.types import Algorithm, Clocks, Env, Metrics, Policy, PyTree, Shared
+from jaxsafe.types import Algorithm, Clocks, Env, Metrics, PyTree, Shared
 
 
 @config
@@ -117,38 +119,6 @@ class TrainState:
     key: jax.Array
 
 
-class Fit(NamedTuple):
-    """What gradient steps move."""
-
-    params: dict[str, PyTree]
-    opt_state: dict[str, PyTree]
-
-
-class Turn(NamedTuple):
-    """Of one gradient step: how many were due before it, int32 []; what share of training is left,
-    float []; a key, this device's own."""
-
-    count: jax.Array
-    left: jax.Array
-    key: jax.Array
-
-
-class Learner(NamedTuple):
-    """What a method adds to the loop. Observations are normalised before they come here.
-
-    init(key, obs_size, action_size, cfg) -> Fit.
-    act(params, obs [..., O], key, cfg) -> action [..., A], the mean one where key is None.
-    explore(params, obs [N, O], key, cfg) -> action [N, A], how training acts.
-    step(fit, batch, turn, cfg, axis_name) -> (Fit, metrics), one gradient step. The weights of `batch`
-        sum to 1 over a device's share, on average over devices: a mean is `pmean((weight * x).sum())`.
-    """
-
-    init: Callable[[jax.Array, int, int, Any], Fit]
-    act: Callable[[PyTree, jax.Array, jax.Array | None, Any], jax.Array]
-    explore: Callable[[PyTree, jax.Array, jax.Array, Any], jax.Array]
-    step: Callable[[Fit, Transitions, Turn, Any, str | None], tuple[Fit, Metrics]]
-
-
 class Cycle(NamedTuple):
     """What passes from one round to the next."""
 
@@ -166,7 +136,7 @@ def off_policy(env: Env, learner: Learner, axis_name: str | None = None) -> Algo
         cfg = jax.tree.map(jnp.float32, cfg)
         params_key, walk_key, key = jax.random.split(key, 3)
         fit = learner.init(params_key, env.obs_size, env.action_size, cfg)
-        rollout = init_rollout(env, own(walk_key, axis_name), cfg.num_envs, cfg.stagger)
+        rollout = init_rollout(env, device_key(walk_key, axis_name), cfg.num_envs, cfg.stagger)
         no = jnp.zeros(cfg.num_envs, bool)
         walk = Walk(rollout, first=~no, terminated=no, truncated=no)
         actions = jnp.zeros((cfg.num_envs, env.action_size))
@@ -194,7 +164,7 @@ def off_policy(env: Env, learner: Learner, axis_name: str | None = None) -> Algo
 
             def step(fit: Fit, x: tuple[jax.Array, jax.Array]) -> tuple[Fit, Metrics]:
                 count, key = x
-                draw_key, step_key = jax.random.split(own(key, axis_name))
+                draw_key, step_key = jax.random.split(device_key(key, axis_name))
                 index = draw(draw_key, replay, span, sizes.batch)
                 discounts = {"discount": cfg.discount, "cost_discount": cfg.cost_discount}
                 found = transitions(replay, span, index, n_step=cfg.n_step, **discounts)
@@ -223,15 +193,15 @@ def off_policy(env: Env, learner: Learner, axis_name: str | None = None) -> Algo
                 uniform = jax.random.uniform(random_key, chosen.shape, minval=-1.0, maxval=1.0)
                 return jnp.where(begun, uniform, chosen)
 
-            keys = jax.random.split(own(walk_key, axis_name), cfg.learn_every)
+            keys = jax.random.split(device_key(walk_key, axis_name), cfg.learn_every)
             walk, (rows, steps) = walked(env, act, cycle.walk, keys)
             span = held(sizes.rows, cfg.horizon, written, iteration, shared.since)
             replay = write(cycle.replay, rows, span)
             normaliser, skipped = cycle.normaliser, jnp.bool_(False)
             if cfg.obs_normalize:
                 merged = merge(normaliser, rows.obs, axis_name)
-                skipped = ~all_finite(merged)
-                normaliser = select(skipped, normaliser, merged)
+                finite = all_finite(merged)
+                normaliser, skipped = select(finite, merged, normaliser), ~finite
 
             filled = (iteration - shared.since) * cfg.horizon + written + cfg.learn_every
             ready = filled >= jnp.maximum(sizes.warm_up, 2)
@@ -271,21 +241,11 @@ def off_policy(env: Env, learner: Learner, axis_name: str | None = None) -> Algo
         )
         return ts, jax.tree.map(jnp.float32, metrics)
 
-    def act(
-        learned: Learned, carry: PyTree, obs: jax.Array, key: jax.Array | None
-    ) -> tuple[jax.Array, PyTree, dict[str, Any]]:
-        now = seen(learned.normaliser, obs, learned.config)
-        return learner.act(learned.params, now, key, learned.config), carry, {}
-
-    def params(ts: TrainState) -> Learned:
-        return Learned(ts.config, ts.params, ts.dual, ts.normaliser)
-
     def clocks(cfg: Any) -> Clocks:
         sizes = sizes_of(cfg, None)
         return Clocks(cfg.num_envs * cfg.horizon, sizes.rounds * sizes.updates)
 
-    policy = Policy(init=lambda learned: (), act=act)
-    return Algorithm(init, update, policy, params, lambda learned: env, clocks)
+    return Algorithm(init, update, policy_by(learner), learned_of, lambda learned: env, clocks)
 
 
 # ---- environments that reset on the next step --------------------------------------------------
@@ -341,11 +301,6 @@ def walked(
         return Walk(rollout, row.last, terminated, truncated), (row, steps)
 
     return jax.lax.scan(step, walk, keys)
-
-
-def seen(normaliser: PyTree, obs: jax.Array, cfg: Any) -> jax.Array:
-    """`obs` [..., O] as the networks see it."""
-    return normalise(normaliser, obs) if cfg.obs_normalize else obs
 
 
 def usable(found: Transitions, axis_name: str | None) -> tuple[Transitions, jax.Array]:

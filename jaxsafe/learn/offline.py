@@ -14,13 +14,13 @@ import numpy as np
 import optax
 
 from jaxsafe.config import ConfigError, config
+from jaxsafe.learn.acting import learned_of
 from jaxsafe.learn.batch import select
+from jaxsafe.learn.learner import Fit, Learner, Turn, policy_by, seen
 from jaxsafe.learn.normalise import init_normaliser, merge
-from jaxsafe.learn.off_policy import Fit, Learner, Turn, seen
-from jaxsafe.learn.on_policy import Learned
 from jaxsafe.learn.replay import Transitions
 from jaxsafe.learn.steps import remaining
-from jaxsafe.types import Algorithm, Clocks, Env, Metrics, Policy, PyTree, Shared
+from jaxsafe.types import Algorithm, Clocks, Env, Metrics, PyTree, Shared
 
 
 class DataSet(NamedTuple):
@@ -125,21 +125,11 @@ def offline(env: Env, learner: Learner) -> Algorithm:
         ts = dataclasses.replace(ts, params=fit.params, opt_state=fit.opt_state, key=key)
         return ts, metrics
 
-    def act(
-        learned: Learned, carry: PyTree, obs: jax.Array, key: jax.Array | None
-    ) -> tuple[jax.Array, PyTree, dict[str, Any]]:
-        now = seen(learned.normaliser, obs, learned.config)
-        return learner.act(learned.params, now, key, learned.config), carry, {}
-
-    def params(ts: TrainState) -> Learned:
-        return Learned(ts.config, ts.params, ts.dual, ts.normaliser)
-
     def clocks(cfg: Any) -> Clocks:
         check(cfg)
         return Clocks(0, cfg.updates)
 
-    policy = Policy(init=lambda learned: (), act=act)
-    return Algorithm(init, update, policy, params, lambda learned: env, clocks)
+    return Algorithm(init, update, policy_by(learner), learned_of, lambda learned: env, clocks)
 
 
 def taken(data: DataSet, rows: jax.Array, cfg: Any, normaliser: PyTree) -> Transitions:

@@ -1,9 +1,9 @@
 """The on-policy loop: rollout, estimates, treatment, step, as one pure update.
 
-`jit(update)` compiles an iteration, `vmap(update)` runs seeds or floats of the config side by side,
-and `shard_map(update)` with `axis_name` set splits environments over devices: each device then holds
-`cfg.num_envs` of its own and the same parameters, and gets the same key, which is folded with the
-device's index where devices must differ.
+`jit(update)` compiles an iteration, `vmap(update, in_axes=(0, None))` runs seeds or floats of the
+config side by side, and `shard_map(update)` with `axis_name` set splits environments over devices. Each
+device then holds `cfg.num_envs` of its own and the same parameters. It gets the same key, which is
+folded with the device's index where devices must differ.
 """
 
 import dataclasses
@@ -17,11 +17,20 @@ import jax
 import jax.numpy as jnp
 
 from jaxsafe.config import ConfigError, config
-from jaxsafe.learn.acting import begun_anew
+from jaxsafe.learn.acting import Learned, begun_anew, learned_of
 from jaxsafe.learn.augment import Augmentation, nothing
-from jaxsafe.learn.batch import all_finite, batch_mean, centre, masked_mean, psum, select, standardise
+from jaxsafe.learn.batch import (
+    all_finite,
+    batch_mean,
+    centre,
+    device_key,
+    psum,
+    select,
+    standardise,
+)
 from jaxsafe.learn.constraints import Names, check_names, each, limit, signal, spread, unnamed
 from jaxsafe.learn.conventions import Convention
+from jaxsafe.learn.metrics import episode_metrics, explained_variance
 from jaxsafe.learn.normalise import init_normaliser, merge, normalise
 from jaxsafe.learn.returns import Estimator, Window, advantages, empty_window, mean_length, window_mean
 from jaxsafe.learn.rollout import RolloutState, Trajectory, collect, init_rollout
@@ -55,8 +64,8 @@ class OnPolicyConfig:
         ),
     )
 
-    # Environments side by side, per device. With `horizon` a batch has 20,480 steps, near OmniSafe's
-    # 20,000.
+    # Environments side by side, of all devices together. With `horizon` a batch has 20,480 steps, near
+    # OmniSafe's 20,000.
     num_envs: int = 512
     # Steps of each environment in an iteration. Shorter ones learn less from a step.
     horizon: int = 40
@@ -149,16 +158,6 @@ class TrainState:
     episode_length: jax.Array
     past_costs: Window
     key: jax.Array
-
-
-@flax.struct.dataclass
-class Learned:
-    """What acts: `config`, `params`, `dual` and `normaliser` of a train state."""
-
-    config: Any
-    params: dict[str, PyTree]
-    dual: PyTree
-    normaliser: PyTree
 
 
 @flax.struct.dataclass
@@ -289,7 +288,7 @@ def loop(
         if cfg.trunk == "gru":
             critics = 1 + (len(names) or 1)
             params, opt_critics = init_recurrent(params_key, *sizes, critics, cfg), ()
-        rollout = init_rollout(wrapped, own(rollout_key, axis_name), cfg.num_envs, cfg.stagger)
+        rollout = init_rollout(wrapped, device_key(rollout_key, axis_name), cfg.num_envs, cfg.stagger)
         carry = jnp.zeros((cfg.num_envs, cfg.hidden[-1])) if cfg.trunk == "gru" else ()
         return TrainState(
             config=cfg,
@@ -326,13 +325,13 @@ def loop(
             task(ts),
             behave,
             dataclasses.replace(ts.rollout, pool=pool),
-            own(rollout_key, axis_name),
+            device_key(rollout_key, axis_name),
             cfg.horizon,
             lambda episode: augmentation.stop(episode, cfg),
         )
         names = named(cfg)
         charged = signal(env, traj, names)
-        reward, cost, signals = learned(ts, augmentation.reward(traj, cfg), charged, axis_name)
+        reward, cost, signals = scaled_signals(ts, augmentation.reward(traj, cfg), charged, axis_name)
         last_obs = augmentation.last_obs(traj, cfg)
         carry = ts.rollout.carry
         batch, explained = estimate(ts, traj, carry, last_obs, reward, cost, names, axis_name)
@@ -408,10 +407,6 @@ def nothing_yet(learned: Learned) -> PyTree:
     return jnp.zeros(learned.config.hidden[-1]) if learned.config.trunk == "gru" else ()
 
 
-def learned_of(ts: TrainState) -> Learned:
-    return Learned(ts.config, ts.params, ts.dual, ts.normaliser)
-
-
 def clocks(cfg: Any) -> Clocks:
     check(cfg)
     return Clocks(cfg.num_envs * cfg.horizon, cfg.critic_epochs * cfg.minibatches)
@@ -437,11 +432,6 @@ def fit_critics(
     return params, opt_state, skipped.sum(), metrics
 
 
-def own(key: jax.Array, axis_name: str | None) -> jax.Array:
-    """A key of this device's own."""
-    return key if axis_name is None else jax.random.fold_in(key, jax.lax.axis_index(axis_name))
-
-
 def see(ts: TrainState | Learned, obs: jax.Array) -> jax.Array:
     """`obs` [..., O] as the networks see it: what an augmentation appended is left as it is."""
     if not ts.config.obs_normalize:
@@ -454,7 +444,7 @@ def init_signals(cfg: Any, costs: int) -> PyTree:
     return init_normaliser(1 + costs) if cfg.reward_normalize or cfg.cost_normalize else ()
 
 
-def learned(
+def scaled_signals(
     ts: TrainState, reward: jax.Array, cost: jax.Array, axis_name: str | None
 ) -> tuple[jax.Array, jax.Array, PyTree]:
     """Reward [T, N] and cost, [T, N] or [T, N, K], as the learner sees them, and `ts.signals` with
@@ -555,23 +545,3 @@ def steps(x: jax.Array) -> jax.Array:
 def sequences(x: jax.Array) -> jax.Array:
     """[N, T, ...] of [T, N, ...]."""
     return jnp.swapaxes(x, 0, 1)
-
-
-def explained_variance(error: jax.Array, target: jax.Array, axis_name: str | None) -> jax.Array:
-    """1 - var(target - value) / var(target): 1 is a perfect critic, 0 one that knows the mean only."""
-    total = batch_mean(centre(target, axis_name) ** 2, axis_name)
-    return 1 - batch_mean(centre(error, axis_name) ** 2, axis_name) / jnp.maximum(total, 1e-8)
-
-
-def episode_metrics(env: Env, traj: Trajectory, axis_name: str | None) -> Metrics:
-    """Means over the complete episodes that ended in the batch; NaN where there are none."""
-    over = partial(masked_mean, mask=traj.ended, axis_name=axis_name)
-    episode = traj.episode
-    return {
-        "train/episodes": psum(traj.ended.sum(), axis_name),
-        "train/return": over(episode.ret),
-        "train/cost": over(episode.cost),
-        "train/episode_length": over(traj.length),
-        **{f"train/cost_{name}": over(episode.costs[..., k]) for k, name in enumerate(env.cost_names)},
-        **{f"train/{name}": over(x) for name, x in episode.info.items()},
-    }

@@ -7,6 +7,7 @@ holds fewer entries than there are environments done.
 
 import dataclasses
 from collections.abc import Callable
+from typing import NamedTuple
 
 import flax.struct
 import jax
@@ -165,17 +166,24 @@ def collect(
     return jax.lax.scan(step, rollout, jax.random.split(key, horizon))
 
 
+class Pool(NamedTuple):
+    """Fresh resets, State of N, and how many of them are used, int32 []."""
+
+    resets: State
+    used: jax.Array
+
+
 def restart(env: Env, rollout: RolloutState, done: jax.Array, key: jax.Array) -> RolloutState:
     """Put fresh resets where `done` [N] holds."""
     num_envs, ends = done.shape[0], done.sum()
 
-    def refill(carry: tuple[State, jax.Array]) -> tuple[State, jax.Array]:
-        _, used = carry  # the draw must depend on it, or XLA hoists it out of the loop
-        return reset_all(env, jax.random.fold_in(key, used), num_envs), jnp.zeros_like(used)
+    def refill(now: Pool) -> Pool:  # the draw must depend on `used`, or XLA hoists it out of the loop
+        fresh = reset_all(env, jax.random.fold_in(key, now.used), num_envs)
+        return Pool(fresh, jnp.zeros_like(now.used))
 
     # runs at most once; a cond would turn into a select under vmap over seeds and pay at every step
     pool, used = jax.lax.while_loop(
-        lambda carry: carry[1] + ends > num_envs, refill, (rollout.pool, rollout.used)
+        lambda now: now.used + ends > num_envs, refill, Pool(rollout.pool, rollout.used)
     )
     entry = used + jnp.cumsum(done) - 1
     return dataclasses.replace(

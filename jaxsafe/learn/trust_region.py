@@ -5,7 +5,7 @@ Vectors are flat, float [P]: the policy's parameters through `ravel_pytree`.
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -110,6 +110,13 @@ def conjugate_gradient(matvec: Matvec, b: jax.Array, iterations: int) -> tuple[j
     return scale * x, jnp.sqrt(rr)
 
 
+class Search(NamedTuple):
+    """Whether a step was accepted, bool [], and how many were tried before it, int32 []."""
+
+    accepted: jax.Array
+    tried: jax.Array
+
+
 def line_search(
     accept: Callable[[jax.Array], jax.Array],
     start: jax.Array,
@@ -129,10 +136,14 @@ def line_search(
     def candidate(i: jax.Array) -> jax.Array:
         return start + shrink ** i.astype(start.dtype) * step
 
+    def attempt(now: Search) -> Search:
+        ok = accept(candidate(now.tried))
+        return Search(ok, now.tried + jnp.where(ok, 0, 1))
+
     accepted, i = jax.lax.while_loop(
-        lambda carry: ~carry[0] & (carry[1] < tries),
-        lambda carry: (ok := accept(candidate(carry[1])), carry[1] + jnp.where(ok, 0, 1)),
-        (jnp.bool_(False), jnp.int32(0)),
+        lambda now: ~now.accepted & (now.tried < tries),
+        attempt,
+        Search(jnp.bool_(False), jnp.int32(0)),
     )
     return jnp.where(accepted, candidate(i), start), accepted, i
 

@@ -184,9 +184,9 @@ def more_figures(
 
     - Return and cost as the learner estimates them, which needs no whole episode, over the last 10%.
     - Of each window (begin, end]: means of return and cost, and how far the cost swings.
-    - Of algorithms that linearise the cost: what a step promises to take off it, a step, and which
-      share of that comes true: the slope of the change of the violation on the sum of the promises,
-      from one span of `SPAN` iterations to the next.
+    - Of algorithms that linearise the cost: what a step promises to take off it, and which share of
+      the promise is realised. That share is the slope of the change of the violation on the sum of the
+      promises, from one span of `SPAN` iterations to the next.
     """
     estimates = [k for k in ("return_estimate", "cost_estimate") if f"train/{k}" in table]
     late = {k.replace("_", " "): run_folder.last_tenth(dict(table), f"train/{k}") for k in estimates}

@@ -102,7 +102,7 @@ def policy_of(settings: Settings, env: Env, folder: Path) -> tuple[Algorithm, Py
 
 
 def policy_folder(folder: Path) -> Path:
-    """Where the policies of a run lie: beside its checkpoints or, in runs before 0.2, in them."""
+    """Where the policies of a run lie: in policy/ or, in older runs, in the checkpoints."""
     alone = folder / "policy"
     return alone if checkpoint.checkpoints(alone) else folder / "checkpoints"
 

@@ -2,11 +2,11 @@
 
 config.yaml     every setting, resolved
 versions.json   package versions, commit, device and command of each start
-metrics.csv     one row an iteration and seed; an empty cell where there was no value (read packed
-                as metrics.csv.xz too). Where settings
-                train side by side, a row for each with each seed, and a column a float they differ in
-tensorboard/    the same for TensorBoard, one folder a seed (and setting)
-checkpoints/    see jaxsafe.checkpoint
+metrics.csv     a row for each iteration and seed, or metrics.csv.xz. A cell without a value is empty.
+                With several settings: a row for each of them too, and a column for each swept float
+tensorboard/    the same for TensorBoard, a folder for each seed (and setting)
+checkpoints/    train states, to resume from: see jaxsafe.run.checkpoint
+policy/         what acts, alone: all that evaluation, films and init_from read
 curves.png, video.mp4, evaluation.json   written at the end
 """
 

@@ -153,7 +153,7 @@ def build(
 
 
 def over_rows(fn: Callable[[PyTree, Shared], PyTree], rows: int) -> Callable[[PyTree, Shared], PyTree]:
-    """`fn` over a leading axis of `rows`. One row is no vmap, which would run both sides of a cond."""
+    """`fn` over a leading axis of `rows`. With one row, skip vmap: there a cond runs both branches."""
 
     def strong(tree: PyTree) -> PyTree:  # no weak types, so that a restored state is the same program
         return jax.tree.map(lambda x: x if checkpoint.is_key(x) else jnp.asarray(x, x.dtype), tree)

@@ -43,7 +43,7 @@ from jax.sharding import AxisType, PartitionSpec as P
 from tasks import FAST
 from toys import FIRST, Corridor, updated
 from jaxsafe.algos import ALGOS
-from jaxsafe.learn.on_policy import learned
+from jaxsafe.learn.on_policy import scaled_signals
 
 mesh = jax.make_mesh((2,), ("devices",), axis_types=(AxisType.Auto,))
 def split(fn):
@@ -73,9 +73,9 @@ for name in sys.argv[2:]:
 
 keys = jax.random.split(jax.random.key(1))  # rewards and costs of 2 x 4 environments, by both at once
 reward, cost = (jax.random.normal(key, (2, 10, 4)) for key in keys)
-halves = split(lambda x: learned(*x, "devices"))((ts, reward, cost))
+halves = split(lambda x: scaled_signals(*x, "devices"))((ts, reward, cost))
 one, flat = jax.tree.map(lambda x: x[0], ts), lambda x: jnp.concatenate(list(x), 1)
-whole = learned(one, flat(reward), flat(cost), None)
+whole = scaled_signals(one, flat(reward), flat(cost), None)
 np.testing.assert_allclose(flat(halves[0]), whole[0], rtol=1e-4, atol=1e-5)
 for x, y in zip(jax.tree.leaves(halves[2]), jax.tree.leaves(whole[2])):
     np.testing.assert_allclose(x[0], y, rtol=1e-5)

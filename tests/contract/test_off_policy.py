@@ -19,7 +19,8 @@ from toys import FIRST, Clock, Corridor, Lever
 from jaxsafe.algos import ALGOS, sac
 from jaxsafe.config import ConfigError
 from jaxsafe.learn.acting import Player
-from jaxsafe.learn.off_policy import Fit, OffPolicyConfig, Turn, walked
+from jaxsafe.learn.learner import Fit, Turn
+from jaxsafe.learn.off_policy import OffPolicyConfig, walked
 from jaxsafe.learn.replay import Transitions
 from jaxsafe.nn.critics import q_values
 from jaxsafe.types import Env, Shared, State

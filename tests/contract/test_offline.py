@@ -11,7 +11,7 @@ from toys import Corridor
 
 from jaxsafe.algos import ALGOS, bc
 from jaxsafe.config import ConfigError
-from jaxsafe.learn.off_policy import Fit, Turn
+from jaxsafe.learn.learner import Fit, Turn
 from jaxsafe.learn.offline import DataSet, OfflineConfig, blank, data_of, taken
 from jaxsafe.types import Shared
 

@@ -1,0 +1,39 @@
+"""Metrics of a batch that all loops report."""
+
+from functools import partial
+from typing import Protocol
+
+import jax
+import jax.numpy as jnp
+
+from jaxsafe.learn.batch import batch_mean, centre, masked_mean, psum
+from jaxsafe.learn.rollout import Episode
+from jaxsafe.types import Env, Metrics
+
+
+class Ends(Protocol):
+    """Where complete episodes ended, bool [T, N], with their sums and lengths so far, [T, N]."""
+
+    ended: jax.Array
+    episode: Episode
+    length: jax.Array
+
+
+def explained_variance(error: jax.Array, target: jax.Array, axis_name: str | None) -> jax.Array:
+    """1 - var(target - value) / var(target): 1 is a perfect critic, 0 one that knows the mean only."""
+    total = batch_mean(centre(target, axis_name) ** 2, axis_name)
+    return 1 - batch_mean(centre(error, axis_name) ** 2, axis_name) / jnp.maximum(total, 1e-8)
+
+
+def episode_metrics(env: Env, ends: Ends, axis_name: str | None) -> Metrics:
+    """Means over the complete episodes that ended in the batch; NaN where there are none."""
+    over = partial(masked_mean, mask=ends.ended, axis_name=axis_name)
+    episode = ends.episode
+    return {
+        "train/episodes": psum(ends.ended.sum(), axis_name),
+        "train/return": over(episode.ret),
+        "train/cost": over(episode.cost),
+        "train/episode_length": over(ends.length),
+        **{f"train/cost_{name}": over(episode.costs[..., k]) for k, name in enumerate(env.cost_names)},
+        **{f"train/{name}": over(x) for name, x in episode.info.items()},
+    }
