@@ -4,7 +4,7 @@
 import importlib
 import pkgutil
 
-from jaxsafe.config import ConfigError, named_object
+from jaxsafe.config import ConfigError, import_object
 from jaxsafe.learn.row import Row
 
 
@@ -45,7 +45,7 @@ def load(address: str) -> None:
     Raises:
         ConfigError: no such module, nothing of that name in it, or no Row.
     """
-    register(address, named_object("algo", address))
+    register(address, import_object("algo", address))
 
 
 __all__ = ["ALGOS", "Row", "load", "register"]

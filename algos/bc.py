@@ -8,12 +8,12 @@ import optax
 
 from jaxsafe.config import config
 from jaxsafe.learn.batch import pmean
-from jaxsafe.learn.learner import Fit, Learner, Turn
+from jaxsafe.learn.learner import GradientStep, Learner
 from jaxsafe.learn.offline import OfflineConfig, offline
 from jaxsafe.learn.replay import Transitions
 from jaxsafe.learn.row import Row
-from jaxsafe.learn.steps import adam
-from jaxsafe.nn.critics import net
+from jaxsafe.learn.steps import Trainable, adam
+from jaxsafe.nn.networks import coarse_mlp
 from jaxsafe.types import Algorithm, Env, Metrics, PyTree
 
 
@@ -32,35 +32,39 @@ class BCConfig(OfflineConfig):
     """
 
 
-def init(key: jax.Array, obs_size: int, action_size: int, cfg: Any) -> Fit:
-    actor = net(cfg, action_size).init(key, jnp.zeros(obs_size))
-    return Fit({"actor": actor}, {"actor": adam(cfg.lr, cfg).init(actor)})
+def init(key: jax.Array, obs_size: int, action_size: int, cfg: Any) -> Trainable:
+    actor = coarse_mlp(cfg, action_size).init(key, jnp.zeros(obs_size))
+    return Trainable({"actor": actor}, {"actor": adam(cfg.lr, cfg).init(actor)})
 
 
 def learner(action_size: int) -> Learner:
     def mu(actor: PyTree, obs: jax.Array, cfg: Any) -> jax.Array:
-        out: Any = net(cfg, action_size).apply(actor, obs)
+        out: Any = coarse_mlp(cfg, action_size).apply(actor, obs)
         return jnp.tanh(out)
 
     def act(params: PyTree, obs: jax.Array, key: jax.Array | None, cfg: Any) -> jax.Array:
         return mu(params["actor"], obs, cfg)
 
     def step(
-        fit: Fit, batch: Transitions, turn: Turn, cfg: Any, axis_name: str | None
-    ) -> tuple[Fit, Metrics]:
+        nets: Trainable, batch: Transitions, at: GradientStep, cfg: Any, axis_name: str | None
+    ) -> tuple[Trainable, Metrics]:
         wanted = jnp.clip(batch.action, -1.0, 1.0)
 
         def loss(actor: PyTree) -> jax.Array:
             error = ((mu(actor, batch.obs, cfg) - wanted) ** 2).sum(-1)
             return (batch.weight * error).sum()  # this device's share
 
-        error, grads = jax.value_and_grad(loss)(fit.params["actor"])
-        left = turn.left if cfg.lr_decay else 1.0
-        change, state = adam(cfg.lr * left, cfg).update(pmean(grads, axis_name), fit.opt_state["actor"])
-        actor = optax.apply_updates(fit.params["actor"], change)
-        return Fit({"actor": actor}, {"actor": state}), {"train/actor_loss": pmean(error, axis_name)}
+        error, grads = jax.value_and_grad(loss)(nets.params["actor"])
+        share = at.remaining if cfg.lr_decay else 1.0
+        change, state = adam(cfg.lr * share, cfg).update(
+            pmean(grads, axis_name), nets.opt_state["actor"]
+        )
+        actor = optax.apply_updates(nets.params["actor"], change)
+        return Trainable({"actor": actor}, {"actor": state}), {
+            "train/actor_loss": pmean(error, axis_name)
+        }
 
-    return Learner(init=init, act=act, explore=act, step=step)
+    return Learner(init=init, act=act, step=step)
 
 
 def make(env: Env, axis_name: str | None = None) -> Algorithm:

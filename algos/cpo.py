@@ -9,14 +9,14 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from jaxsafe.algos import trpo
-from jaxsafe.config import config
+from jaxsafe.config import Iterations, Weight, config
 from jaxsafe.learn.batch import all_finite, pmean
-from jaxsafe.learn.constraints import LimitsConfig, limit, named
+from jaxsafe.learn.constraints import LimitsConfig, constrained_costs, limit
 from jaxsafe.learn.conventions import Convention
-from jaxsafe.learn.halfspaces import dot, furthest_point
+from jaxsafe.learn.halfspaces import cosines, dot, furthest_point
 from jaxsafe.learn.on_policy import on_policy_pair
 from jaxsafe.learn.row import Row
-from jaxsafe.learn.steps import Context, Pair, Step, own_trunk
+from jaxsafe.learn.steps import Context, Pair, PolicyStep, require_separate_trunk
 from jaxsafe.learn.surrogates import plain
 from jaxsafe.learn.trust_region import conjugate_gradient, distance, fisher_product, line_search
 from jaxsafe.nn.networks import policy
@@ -54,7 +54,7 @@ class CPOConfig(LimitsConfig, trpo.TRPOConfig):
     most sqrt(2 delta s). A margin far beyond that does nothing more while the cost is high, and takes
     long to fall when the cost is low.
 
-    With several constraints (`cost_limits`) each has its own b, c and margin. The step satisfies all of
+    With several constraints (`cost_limits`) each has a b, a c and a margin. The step satisfies all of
     them. If no step does, it goes towards the nearest x that would.
 
     OmniSafe's c = v is per episode (`per_step=False`), about a thousand times as large as b'x can be.
@@ -71,19 +71,19 @@ class CPOConfig(LimitsConfig, trpo.TRPOConfig):
         ),
     )
 
-    line_search_tries: int = 20  # Steps that the line search tries at most, as in OmniSafe.
+    line_search_tries: Iterations = 20  # Steps that the line search tries at most, as in OmniSafe.
     # Whether the violation v is in cost per step, as b is. OmniSafe's is per episode.
     per_step: bool = True
-    violation_gain: float = 5.0  # A step is asked to take back this many times v.
+    violation_gain: Weight = 5.0  # A step is asked to take back this many times v.
     # How fast the margin grows with v, as in safety-starter-agents, where it is off. 0: no margin.
-    margin_lr: float = 0.05
-    margin_max: float = 2.0  # Bound of the margin, as a multiple of the most that a step can promise.
+    margin_lr: Weight = 0.05
+    margin_max: Weight = 2.0  # Bound of the margin, as a multiple of the most that a step can promise.
 
 
 RECOVER, RETURN, BOUNDED, FREE = range(4)  # cases of the dual
 
 
-def dual(
+def multipliers(
     q: jax.Array, r: jax.Array, s: jax.Array, c: jax.Array, delta: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Multipliers of the trust region and of the cost constraint, and the case.
@@ -120,8 +120,12 @@ def dual(
     # floor keeps rounding and the solver's residual out of it, and acts within 0.01 rad of parallel.
     alpha = jnp.sqrt((1 - meets**2) / jnp.maximum(1 - rho**2, 1e-4))
     alpha = jnp.maximum(alpha, 1e-6)  # at kappa = 1 the step is -e_b, and lam stays finite
-    beta = jnp.maximum(0.0, meets + rho * alpha)
+    beta = meets + rho * alpha
     active = rho + kappa > 0
+    # Where the floor makes alpha so small that beta < 0, the constraint only bounds alpha.
+    straight = jnp.clip(-kappa / jnp.where(rho > 0, rho, 1.0), 1e-6, 1.0)
+    alpha = jnp.where(active & (beta < 0), straight, alpha)
+    beta = jnp.maximum(0.0, beta)
     recover = kappa >= 1
 
     per_g = jnp.sqrt(2 * delta) / jnp.sqrt(q)  # the length of alpha = 1 along H^-1 g
@@ -132,23 +136,17 @@ def dual(
     return jnp.where(recover, 0.0, lam), jnp.where(recover, per_b, nu), case
 
 
-def duals(
+def multipliers_of_several(
     q: jax.Array, r: jax.Array, s: jax.Array, c: jax.Array, delta: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """`dual` of several constraints: r, c and nu are float [K], s_ij = b_i'H^-1 b_j is [K, K]."""
-    q, own = jnp.maximum(q, 1e-20), jnp.maximum(jnp.diag(s), 1e-20)
-    gram, rho = cosines(s), r / (jnp.sqrt(q) * jnp.sqrt(own))
-    kappa = c / (jnp.sqrt(2 * delta) * jnp.sqrt(own))
+    """`multipliers` of K constraints: r, c and nu are float [K], s_ij = b_i'H^-1 b_j is [K, K]."""
+    q, s_ii = jnp.maximum(q, 1e-20), jnp.maximum(jnp.diag(s), 1e-20)
+    gram, rho = cosines(s), r / (jnp.sqrt(q) * jnp.sqrt(s_ii))
+    kappa = c / (jnp.sqrt(2 * delta) * jnp.sqrt(s_ii))
     alpha, beta, found = furthest_point(gram, rho, kappa)
     lam = jnp.where(found, jnp.sqrt(q) / (jnp.sqrt(2 * delta) * jnp.where(found, alpha, 1.0)), 0.0)
-    nu = jnp.where(found, lam, 1.0) * beta * jnp.sqrt(2 * delta) / jnp.sqrt(own)
-    return lam, nu, jnp.where(found, 1 + (kappa < 0).all() + (kappa <= -1).all(), RECOVER)
-
-
-def cosines(s: jax.Array) -> jax.Array:
-    """Cosines of K vectors, from their Gram matrix. A zero vector has cosine 0 with every other one."""
-    size = jnp.sqrt(jnp.maximum(jnp.diag(s), 1e-20))
-    return jnp.fill_diagonal(s / size / size[:, None], 1.0, inplace=False)
+    nu = jnp.where(found, lam, 1.0) * beta * jnp.sqrt(2 * delta) / jnp.sqrt(s_ii)
+    return lam, nu, jnp.where(found, RETURN + (kappa < 0).all() + (kappa <= -1).all(), RECOVER)
 
 
 class Problem(NamedTuple):
@@ -185,7 +183,7 @@ class Direction(NamedTuple):
 
 def solution(p: Problem, cfg: Any) -> Direction:
     """The solution of the linearised problem."""
-    lam, nu, case = (duals if p.c.ndim else dual)(p.q, p.r, p.s, p.c, p.delta)
+    lam, nu, case = (multipliers_of_several if p.c.ndim else multipliers)(p.q, p.r, p.s, p.c, p.delta)
     recover, back = case == RECOVER, dot(nu, p.h_b)
     step = jnp.where(recover, -back, (p.h_g - back) / jnp.where(recover, 1.0, lam))
     metrics = {"train/lam": lam, "train/nu": nu, "train/case": case}
@@ -196,14 +194,13 @@ class Margin(NamedTuple):
     margin: jax.Array  # float [] or [K], in the violation's unit, >= 0
 
 
-def step_by(rule: Rule) -> Step:
+def step_by(rule: Rule) -> PolicyStep:
     """A trust-region step where `rule` says, shortened until it keeps what it promised."""
 
     def init(actor: PyTree, cfg: Any) -> Margin:
-        own_trunk(actor, cfg)
-        return Margin(jnp.zeros(jnp.shape(limit(cfg, named(cfg)))))
+        return Margin(jnp.zeros(jnp.shape(limit(cfg, constrained_costs(cfg)))))
 
-    return Step(init, partial(update, rule))
+    return PolicyStep(init, partial(update, rule), require_separate_trunk)
 
 
 def update(
@@ -214,9 +211,9 @@ def update(
     batch: Any,
     context: Context,
 ) -> tuple[PyTree, Margin, Metrics]:
-    cfg, axis_name, excess = context.cfg, context.axis_name, context.excess
+    cfg, axis_name = context.cfg, context.axis_name
     start, unravel = ravel_pytree(actor)
-    violation = excess / context.length if cfg.per_step else excess
+    violation = context.violation / (context.episode_length if cfg.per_step else 1.0)
     delta = cfg.target_kl
 
     def evaluate(params: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -226,7 +223,7 @@ def update(
         return reward, cost, distance(batch.old, policy(actor, batch.obs, cfg), cfg, axis_name)
 
     g = pmean(jax.grad(lambda params: objectives.reward(unravel(params), batch)[0])(start), axis_name)
-    gradient = jax.jacrev if excess.ndim else jax.grad  # [K, P], or [P]
+    gradient = jax.jacrev if violation.ndim else jax.grad  # [K, P], or [P]
     b = pmean(gradient(lambda params: objectives.cost(unravel(params), batch)[0])(start), axis_name)
     product = fisher_product(
         lambda params: policy(unravel(params), batch.obs, cfg), start, batch.old, cfg, axis_name
@@ -248,12 +245,10 @@ def update(
         safe = jnp.all(new_cost - cost <= jnp.maximum(-c, 0.0))
         return good & safe & (divergence <= delta)
 
-    params, accepted, tries = line_search(
-        accept, start, step, cfg.line_search_tries, cfg.line_search_shrink
-    )
-    new_reward, new_cost, divergence = evaluate(params)
+    found = line_search(accept, start, step, cfg.line_search_tries, cfg.line_search_shrink)
+    new_reward, new_cost, divergence = evaluate(found.params)
     return (
-        unravel(params),
+        unravel(found.params),
         Margin(margin),
         {
             "train/kl": divergence,
@@ -261,10 +256,10 @@ def update(
             "train/objective_c": new_cost - cost,  # cost per step
             "train/violation": violation,  # cost per step, as the margin, or per episode
             "train/margin": margin,
-            "train/accepted": accepted,
-            "train/line_search": tries,
+            "train/accepted": found.accepted,
+            "train/line_search": found.tried,
             "train/cg_residual_r": residual[0],
-            "train/cg_residual_c": residual[1:].reshape(excess.shape),
+            "train/cg_residual_c": residual[1:].reshape(violation.shape),
             "train/nonfinite": ~all_finite((g, b, step)),
             **metrics,
         },
@@ -275,7 +270,7 @@ cpo_step = step_by(solution)
 
 
 def make(env: Env, axis_name: str | None = None) -> Algorithm:
-    return on_policy_pair(env, plain, cpo_step, axis_name, named=named)
+    return on_policy_pair(env, plain, cpo_step, axis_name, constrained_costs=constrained_costs)
 
 
 ROWS = {

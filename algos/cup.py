@@ -1,15 +1,15 @@
 """CUP: a PPO step and a projection, one after the other."""
 
 import dataclasses
-from typing import Any
+from typing import Annotated, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 
 from jaxsafe.algos import pg, ppo
-from jaxsafe.config import config
-from jaxsafe.learn.constraints import each, named
-from jaxsafe.learn.on_policy import Batch, TrainState, loop
+from jaxsafe.config import Bounds, Cap, KLStop, config
+from jaxsafe.learn.constraints import constrained_costs, each
+from jaxsafe.learn.on_policy import Batch, Improved, Method, TrainState, on_policy_loop
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.steps import Context, adam_epochs
 from jaxsafe.learn.surrogates import clipped, plain, with_entropy
@@ -36,9 +36,13 @@ class CUPConfig(LagrangianConfig, ppo.PPOConfig):
     On a shared trunk both steps train the values, too.
     """
 
+    POLICY_STEPS: ClassVar = 2
+
     # Passes of each of the two steps stop when the KL is above this (nats), as in OmniSafe.
-    target_kl: float = 0.01
-    lam_max: float = 2.0  # The highest price, as in OmniSafe.
+    target_kl: KLStop = 0.01
+    # Discount of costs. The projection divides by 1 - cost_discount.
+    cost_discount: Annotated[float, Bounds(0, 0.9999)] = 0.99
+    lam_max: Cap = 2.0  # The highest price, as in OmniSafe.
 
 
 def projection(
@@ -47,14 +51,14 @@ def projection(
     """What the second step maximises, with `batch.old` the policy of the first."""
     dist = policy(actor, batch.obs, cfg)
     scale = (1 - cfg.cost_discount * cfg.cost_gae_lambda) / (1 - cfg.cost_discount)
-    cost, _ = each(lambda adv_c: plain(dist, batch, adv_c, cfg), named(cfg))(batch.adv_c)
+    cost, _ = each(lambda adv_c: plain(dist, batch, adv_c, cfg), constrained_costs(cfg))(batch.adv_c)
     return -(jnp.sum(lam * scale * cost) + jnp.mean(kl(dist, batch.old))), {}
 
 
 def make(env: Env, axis_name: str | None = None) -> Algorithm:
-    def improve(ts: TrainState, batch: Batch, context: Context):
+    def improve(ts: TrainState, batch: Batch, context: Context) -> Improved:
         cfg = context.cfg
-        dual = lagrangian.update(ts.dual, context.cost, cfg)
+        dual = lagrangian.update(ts.dual, context.episode_cost, cfg, context.iteration)
         contexts = [context._replace(key=key) for key in jax.random.split(context.key)]
 
         def earn(actor: PyTree, batch: Batch) -> tuple[jax.Array, Metrics]:
@@ -72,9 +76,10 @@ def make(env: Env, axis_name: str | None = None) -> Algorithm:
         actor, opt_state, second = adam_epochs.update(actor, opt_state, project, better, contexts[1])
         metrics |= {f"{name}_projection": x for name, x in second.items()}
         metrics["train/nonfinite"] += metrics.pop("train/nonfinite_projection")
-        return actor, opt_state, dual, metrics | lagrangian.metrics(dual)
+        return Improved(actor, opt_state, dual, metrics | lagrangian.metrics(dual))
 
-    return loop(env, adam_epochs.init, lagrangian.init, improve, axis_name, named=named)
+    method = Method(adam_epochs.check, adam_epochs.init, lagrangian.init, improve, constrained_costs)
+    return on_policy_loop(env, method, axis_name)
 
 
 ROWS = {

@@ -1,9 +1,9 @@
 """FOCOPS: a surrogate of its own with PPO-Lagrangian's price on cost."""
 
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 from jaxsafe.algos import pg
-from jaxsafe.config import config
+from jaxsafe.config import Bounds, Cap, Weight, config
 from jaxsafe.learn.conventions import Convention
 from jaxsafe.learn.on_policy import on_policy
 from jaxsafe.learn.row import Row
@@ -39,12 +39,12 @@ class FOCOPSConfig(LagrangianConfig, pg.PGConfig):
 
     # Advantages are divided by it (lambda of the paper), as in OmniSafe: higher keeps closer to the
     # old policy.
-    temperature: float = 1.5
-    near_kl: float = 0.02  # eta: states whose KL is above this (nats) do not count, as in OmniSafe.
+    temperature: Annotated[float, Bounds(1e-6, 1e6)] = 1.5
+    near_kl: Weight = 0.02  # eta: states whose KL is above this (nats) do not count, as in OmniSafe.
     # Whether the KL of a state gates its own gain. In OmniSafe the share of near states multiplies
     # the mean gain.
     per_state: bool = True
-    lam_max: float = 2.0  # The highest price, nu_max of the paper, as in OmniSafe.
+    lam_max: Cap = 2.0  # The highest price, nu_max of the paper, as in OmniSafe.
 
 
 def make(env: Env, axis_name: str | None = None) -> Algorithm:

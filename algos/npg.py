@@ -7,7 +7,7 @@ from jaxsafe.config import config
 from jaxsafe.learn.on_policy import OMNISAFE, OnPolicyConfig, on_policy
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.surrogates import plain
-from jaxsafe.learn.treatments import LagrangianConfig, Treatment, lagrangian, none
+from jaxsafe.learn.treatments import LagrangianConfig, Treatment, lagrangian, no_treatment
 from jaxsafe.learn.trust_region import NaturalConfig, natural_gradient
 from jaxsafe.types import Algorithm, Env
 
@@ -40,7 +40,7 @@ class RCPOConfig(LagrangianConfig, NPGConfig):
     """
 
 
-def make(env: Env, axis_name: str | None = None, treatment: Treatment = none) -> Algorithm:
+def make(env: Env, axis_name: str | None = None, treatment: Treatment = no_treatment) -> Algorithm:
     return on_policy(env, treatment, plain, natural_gradient, axis_name)
 
 

@@ -6,12 +6,12 @@ import jax
 import jax.numpy as jnp
 
 from jaxsafe.algos import pg, ppo
-from jaxsafe.config import config
+from jaxsafe.config import Weight, config
 from jaxsafe.learn.batch import pmean
 from jaxsafe.learn.conventions import Convention
 from jaxsafe.learn.on_policy import on_policy_pair
 from jaxsafe.learn.row import Row
-from jaxsafe.learn.steps import Context, Pair, Step, adam_epochs
+from jaxsafe.learn.steps import Context, Objective, Pair, PolicyStep, adam_epochs
 from jaxsafe.learn.surrogates import clipped, pessimistic, plain
 from jaxsafe.nn.gaussian import Gaussian
 from jaxsafe.types import Algorithm, Env, Metrics, PyTree
@@ -28,24 +28,47 @@ class P3OConfig(ppo.PPOConfig):
     Source: Zhang et al. (2022), "Penalized Proximal Policy Optimization for Safe Reinforcement
     Learning", arXiv:2205.11814, equation 13.
     Differs from it: the paper's c is (1 - gamma) times the discounted violation, which is another mean
-    per step. OmniSafe takes c per episode (`per_step=False`) and does not clip the cost's surrogate
+    per step. The mean of A_c over a minibatch is subtracted from its surrogate. That mean is noise,
+    which max would rectify, so that costs would end well below the limit. OmniSafe does not subtract it
+    (`centre_cost=False`), takes c per episode (`per_step=False`) and does not clip the cost's surrogate
     (`clip_cost=False`).
     """
 
     CONVENTIONS: ClassVar = (
         Convention(
-            {"per_step": False, "clip_cost": False},
-            "kappa max(0, E[w A_c] + J_c - cost_limit), per episode",
-            "the paper's, clipped and per step",
+            {"per_step": False, "clip_cost": False, "centre_cost": False},
+            "the penalty is kappa max(0, E[w A_c] + J_c - cost_limit), per episode",
+            "it is the paper's, clipped and per step, without the noise of a minibatch's mean of A_c",
         ),
     )
 
     # Price of a unit of cost beyond the limit, in standard deviations of A_r, as in OmniSafe.
-    kappa: float = 20.0
+    kappa: Weight = 20.0
     # Whether the violation c is in cost per step. OmniSafe's is per episode.
     per_step: bool = True
     # Whether the cost's surrogate is max(w A_c, clip(w) A_c). OmniSafe's is w A_c.
     clip_cost: bool = True
+    # Whether the mean of A_c over each minibatch is subtracted. OmniSafe does not.
+    centre_cost: bool = True
+
+
+def penalised(objectives: Pair, context: Context) -> Objective:
+    """The reward's objective less the penalty on the cost's."""
+    cfg = context.cfg
+    violation = context.violation / (context.episode_length if cfg.per_step else 1.0)
+
+    def objective(actor: PyTree, batch: Any) -> tuple[jax.Array, Metrics]:
+        reward, metrics = objectives.reward(actor, batch)
+        cost, _ = objectives.cost(actor, batch)
+        # A_c is centred over the whole batch. Its mean over a minibatch is noise, which max(0, x) would
+        # turn into a penalty.
+        cost -= jnp.mean(batch.adv_c) if cfg.centre_cost else 0.0
+        # max(0, x) of the mean over all devices, as a factor: its gradient is this device's share
+        beyond = jax.lax.stop_gradient(pmean(cost, context.axis_name) + violation)
+        penalty = cfg.kappa * jnp.where(beyond > 0, cost + violation, 0.0)
+        return reward - penalty, metrics | {"train/penalty": penalty}
+
+    return objective
 
 
 def update(
@@ -55,18 +78,7 @@ def update(
     batch: Any,
     context: Context,
 ) -> tuple[PyTree, PyTree, Metrics]:
-    cfg = context.cfg
-    violation = context.excess / context.length if cfg.per_step else context.excess
-
-    def objective(actor: PyTree, batch: Any) -> tuple[jax.Array, Metrics]:
-        reward, metrics = objectives.reward(actor, batch)
-        cost, _ = objectives.cost(actor, batch)
-        # max(0, x) of the mean over all devices, as a factor: its gradient is this device's share
-        beyond = jax.lax.stop_gradient(pmean(cost, context.axis_name) + violation)
-        penalty = cfg.kappa * jnp.where(beyond > 0, cost + violation, 0.0)
-        return reward - penalty, metrics | {"train/penalty": penalty}
-
-    return adam_epochs.update(actor, opt_state, objective, batch, context)
+    return adam_epochs.update(actor, opt_state, penalised(objectives, context), batch, context)
 
 
 def surrogate_c(
@@ -76,7 +88,7 @@ def surrogate_c(
 
 
 def make(env: Env, axis_name: str | None = None) -> Algorithm:
-    step = Step(adam_epochs.init, update)
+    step = PolicyStep(adam_epochs.init, update)
     return on_policy_pair(env, clipped, step, axis_name, surrogate_c=surrogate_c)
 
 

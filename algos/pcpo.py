@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 
 from jaxsafe.algos import cpo, trpo
-from jaxsafe.config import config
-from jaxsafe.learn.constraints import named
+from jaxsafe.config import Iterations, Weight, config
+from jaxsafe.learn.constraints import constrained_costs
 from jaxsafe.learn.conventions import Convention
-from jaxsafe.learn.halfspaces import dot, nearest_point
+from jaxsafe.learn.halfspaces import cosines, dot, nearest_point
 from jaxsafe.learn.on_policy import on_policy_pair
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.surrogates import plain
@@ -40,35 +40,38 @@ class PCPOConfig(cpo.CPOConfig):
         ),
     )
 
-    line_search_tries: int = 200  # Steps that the line search tries at most, as in OmniSafe.
+    line_search_tries: Iterations = 200  # Steps that the line search tries at most, as in OmniSafe.
     # Whether the reward's step is along H^-1 g. OmniSafe's is along g.
     natural: bool = True
     # Bound of the margin, as a multiple of the most that a step can promise. It is larger than CPO's,
     # because the reward's step is taken first, whatever c is.
-    margin_max: float = 5.0
+    margin_max: Weight = 5.0
 
 
 def projection(p: cpo.Problem, cfg: Any) -> cpo.Direction:
     """The reward's step, moved back along H^-1 b to where b'x + c = 0, if it lies beyond."""
     scale = jnp.sqrt(2 * p.delta / jnp.maximum(p.q, 1e-20))
-    back = (backs if p.c.ndim else back_to)(scale * p.r + p.c, p.s)
+    back = (projection_multipliers if p.c.ndim else projection_multiplier)(scale * p.r + p.c, p.s)
     step = scale * (p.h_g if cfg.natural else p.g) - dot(back, p.h_b)
     return cpo.Direction(step, jnp.bool_(False), {"train/nu": back})
 
 
-def back_to(excess: jax.Array, s: jax.Array) -> jax.Array:
-    return jnp.maximum(0.0, excess / jnp.maximum(s, 1e-20))
+def projection_multiplier(overshoot: jax.Array, s: jax.Array) -> jax.Array:
+    """How far to go back along H^-1 b, float [], >= 0."""
+    return jnp.maximum(0.0, overshoot / jnp.maximum(s, 1e-20))
 
 
-def backs(excess: jax.Array, s: jax.Array) -> jax.Array:
-    """`back_to` of several constraints: excess [K], s [K, K]."""
+def projection_multipliers(overshoot: jax.Array, s: jax.Array) -> jax.Array:
+    """`projection_multiplier` of several constraints: overshoot [K], s [K, K]."""
     size = jnp.sqrt(jnp.maximum(jnp.diag(s), 1e-20))
-    unit = jnp.maximum(jnp.abs(excess / size).max(), 1e-20)
-    return nearest_point(cpo.cosines(s), excess / size / unit) * unit / size
+    unit = jnp.maximum(jnp.abs(overshoot / size).max(), 1e-20)
+    return nearest_point(cosines(s), overshoot / size / unit) * unit / size
 
 
 def make(env: Env, axis_name: str | None = None) -> Algorithm:
-    return on_policy_pair(env, plain, cpo.step_by(projection), axis_name, named=named)
+    return on_policy_pair(
+        env, plain, cpo.step_by(projection), axis_name, constrained_costs=constrained_costs
+    )
 
 
 ROWS = {

@@ -8,7 +8,7 @@ from jaxsafe.learn.on_policy import OMNISAFE, OnPolicyConfig, on_policy
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.steps import AdamConfig, adam_epochs
 from jaxsafe.learn.surrogates import plain
-from jaxsafe.learn.treatments import LagrangianConfig, Treatment, lagrangian, none
+from jaxsafe.learn.treatments import LagrangianConfig, Treatment, lagrangian, no_treatment
 from jaxsafe.types import Algorithm, Env
 
 
@@ -40,7 +40,7 @@ class PDOConfig(LagrangianConfig, PGConfig):
     """
 
 
-def make(env: Env, axis_name: str | None = None, treatment: Treatment = none) -> Algorithm:
+def make(env: Env, axis_name: str | None = None, treatment: Treatment = no_treatment) -> Algorithm:
     return on_policy(env, treatment, plain, adam_epochs, axis_name)
 
 

@@ -1,10 +1,10 @@
 """PPO, and PPO with each treatment of the constraint and each augmentation of the task."""
 
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 
 from jaxsafe.algos import pg
-from jaxsafe.config import config
+from jaxsafe.config import Bounds, config
 from jaxsafe.learn.augment import (
     OMNISAFE_SAUTE,
     OMNISAFE_SIMMER,
@@ -13,7 +13,7 @@ from jaxsafe.learn.augment import (
     SauteConfig,
     SimmerConfig,
     early,
-    nothing,
+    no_augmentation,
     saute,
     schedule,
     simmer,
@@ -30,7 +30,7 @@ from jaxsafe.learn.treatments import (
     Treatment,
     barrier,
     lagrangian,
-    none,
+    no_treatment,
     penalty,
     pid,
 )
@@ -49,7 +49,8 @@ class PPOConfig(pg.PGConfig):
     trained for its metrics alone.
     """
 
-    clip: float = 0.2  # eps: ratios count as if they were at most this far from 1, as in the paper.
+    # eps: ratios count as if they were at most this far from 1, as in the paper.
+    clip: Annotated[float, Bounds(1e-6, 100)] = 0.2
 
 
 @config
@@ -166,8 +167,8 @@ class PPOEarlyTerminatedConfig(EarlyConfig, PPOConfig):
 def make(
     env: Env,
     axis_name: str | None = None,
-    treatment: Treatment = none,
-    augmentation: Augmentation = nothing,
+    treatment: Treatment = no_treatment,
+    augmentation: Augmentation = no_augmentation,
 ) -> Algorithm:
     return on_policy(env, treatment, clipped, adam_epochs, axis_name, augmentation)
 

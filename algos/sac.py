@@ -1,20 +1,20 @@
 """Soft actor-critic, for a thousand environments or for one."""
 
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
 import optax
 
-from jaxsafe.config import ConfigError, config
+from jaxsafe.config import Bounds, Iterations, Rate, config
 from jaxsafe.learn.batch import pmean, select
-from jaxsafe.learn.learner import Fit, Learner, Turn
+from jaxsafe.learn.learner import GradientStep, Learner
 from jaxsafe.learn.off_policy import OffPolicyConfig, off_policy
 from jaxsafe.learn.replay import Transitions
 from jaxsafe.learn.row import Row
-from jaxsafe.learn.steps import adam
-from jaxsafe.nn.critics import init_critics, init_squashed, q_values, squashed_policy
-from jaxsafe.nn.distributions import squashed_mean, squashed_sample
+from jaxsafe.learn.steps import Trainable, adam
+from jaxsafe.nn.critics import init_critics, q_values
+from jaxsafe.nn.squashed import init_squashed, squashed_mean, squashed_policy, squashed_sample
 from jaxsafe.types import Algorithm, Env, Metrics, PyTree
 
 
@@ -37,18 +37,17 @@ class SACConfig(OffPolicyConfig):
     targets follow faster, the critics have layer norm, and observations are normalised.
     """
 
-    alpha_init: float = 1.0  # The temperature at first, as in the authors' code.
+    # The temperature at first, as in the authors' code.
+    alpha_init: Annotated[float, Bounds(1e-10, 1e6)] = 1.0
     # The learning rate of log alpha, by Adam, as in the authors' code. With 0, alpha stays as it is.
-    alpha_lr: float = 3e-4
+    alpha_lr: Rate = 3e-4
     # The entropy that alpha aims at, in nats for each dimension of the action, as in the paper.
-    target_entropy: float = -1.0
+    target_entropy: Annotated[float, Bounds(-100, 100)] = -1.0
     # Gradient steps of the critics for each one of policy, alpha and targets. The paper has 1.
-    policy_delay: int = 1
+    policy_delay: Iterations = 1
 
 
-def init(key: jax.Array, obs_size: int, action_size: int, cfg: Any) -> Fit:
-    if cfg.policy_delay < 1:
-        raise ConfigError(f"policy_delay={cfg.policy_delay}: expected at least 1")
+def init(key: jax.Array, obs_size: int, action_size: int, cfg: Any) -> Trainable:
     actor_key, critic_key = jax.random.split(key)
     critics = init_critics(critic_key, obs_size, action_size, 2, cfg)
     params = {
@@ -62,7 +61,7 @@ def init(key: jax.Array, obs_size: int, action_size: int, cfg: Any) -> Fit:
         "critic_r": adam(cfg.critic_lr, cfg).init(critics),
         "log_alpha": optax.adam(cfg.alpha_lr).init(params["log_alpha"]),
     }
-    return Fit(params, opt_state)
+    return Trainable(params, opt_state)
 
 
 def learner(action_size: int) -> Learner:
@@ -74,17 +73,17 @@ def learner(action_size: int) -> Learner:
         return squashed_mean(dist) if key is None else squashed_sample(dist, key)[0]
 
     def step(
-        fit: Fit, batch: Transitions, turn: Turn, cfg: Any, axis_name: str | None
-    ) -> tuple[Fit, Metrics]:
-        params, opt_state = fit
-        next_key, key = jax.random.split(turn.key)
+        nets: Trainable, batch: Transitions, at: GradientStep, cfg: Any, axis_name: str | None
+    ) -> tuple[Trainable, Metrics]:
+        params, opt_state = nets
+        next_key, key = jax.random.split(at.key)
         alpha = jnp.exp(params["log_alpha"])
-        left = turn.left if cfg.lr_decay else 1.0
+        share = at.remaining if cfg.lr_decay else 1.0
 
         def mean(x: jax.Array) -> jax.Array:
             return (batch.weight * x).sum()  # this device's share
 
-        def moved(name: str, optimiser: Any, grads: PyTree) -> tuple[PyTree, PyTree]:
+        def adam_step(name: str, optimiser: Any, grads: PyTree) -> tuple[PyTree, PyTree]:
             change, state = optimiser.update(pmean(grads, axis_name), opt_state[name])
             return optax.apply_updates(params[name], change), state
 
@@ -99,7 +98,7 @@ def learner(action_size: int) -> Learner:
             return mean(((q - y) ** 2).sum(0)), mean(q.mean(0))
 
         (critic_error, q), grads = jax.value_and_grad(critic_loss, has_aux=True)(params["critic_r"])
-        critics, opt_critics = moved("critic_r", adam(cfg.critic_lr * left, cfg), grads)
+        critics, opt_critics = adam_step("critic_r", adam(cfg.critic_lr * share, cfg), grads)
 
         # policy
         def actor_loss(actor: PyTree) -> tuple[jax.Array, jax.Array]:
@@ -108,24 +107,24 @@ def learner(action_size: int) -> Learner:
             return mean(alpha * log_prob - q), mean(log_prob)
 
         (loss, log_prob), grads = jax.value_and_grad(actor_loss, has_aux=True)(params["actor"])
-        actor, opt_actor = moved("actor", adam(cfg.lr * left, cfg), grads)
+        actor, opt_actor = adam_step("actor", adam(cfg.lr * share, cfg), grads)
 
         # temperature, and the critics' targets
         too_sure = log_prob + cfg.target_entropy * action_size * batch.weight.sum()
-        log_alpha, opt_alpha = moved("log_alpha", optax.adam(cfg.alpha_lr), -too_sure)
+        log_alpha, opt_alpha = adam_step("log_alpha", optax.adam(cfg.alpha_lr), -too_sure)
         targets = optax.incremental_update(critics, params["target_r"], cfg.tau)
 
         old = {name: params[name] for name in ("actor", "target_r", "log_alpha")}
         new = {"actor": actor, "target_r": targets, "log_alpha": log_alpha}
         old_state = {name: opt_state[name] for name in ("actor", "log_alpha")}
-        due = (turn.count + 1) % cfg.policy_delay == 0
+        due = (at.number + 1) % cfg.policy_delay == 0
         new, state = select(due, (new, {"actor": opt_actor, "log_alpha": opt_alpha}), (old, old_state))
         metrics = {"train/critic_loss": critic_error, "train/q": q, "train/actor_loss": loss}
         metrics = pmean(metrics | {"train/entropy": -log_prob}, axis_name)
-        fit = Fit(new | {"critic_r": critics}, state | {"critic_r": opt_critics})
-        return fit, metrics | {"train/alpha": alpha}
+        nets = Trainable(new | {"critic_r": critics}, state | {"critic_r": opt_critics})
+        return nets, metrics | {"train/alpha": alpha}
 
-    return Learner(init=init, act=act, explore=act, step=step)
+    return Learner(init=init, act=act, step=step)
 
 
 def make(env: Env, axis_name: str | None = None) -> Algorithm:

@@ -13,7 +13,7 @@ from jaxsafe.learn.augment import (
     SauteConfig,
     SimmerConfig,
     early,
-    nothing,
+    no_augmentation,
     saute,
     schedule,
     simmer,
@@ -27,7 +27,7 @@ from jaxsafe.learn.treatments import (
     SwitchConfig,
     Treatment,
     lagrangian,
-    none,
+    no_treatment,
     pid,
     switch,
 )
@@ -124,8 +124,8 @@ class TRPOEarlyTerminatedConfig(EarlyConfig, TRPOConfig):
 def make(
     env: Env,
     axis_name: str | None = None,
-    treatment: Treatment = none,
-    augmentation: Augmentation = nothing,
+    treatment: Treatment = no_treatment,
+    augmentation: Augmentation = no_augmentation,
 ) -> Algorithm:
     return on_policy(env, treatment, plain, trust_region, axis_name, augmentation)
 

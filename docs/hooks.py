@@ -1,8 +1,7 @@
 """What mkdocs does on the way to a page, so that the same files read well on GitHub.
 
-- The list of pages: those of SECTIONS, and all there are in its folders, by their titles.
-- A line LINK <!-- readme: SECTION --> becomes that section of the README, without its heading; with
-  <!-- readme: SECTION: WORDS --> the part of it that begins with **WORDS**. GitHub shows LINK.
+- The list of pages: those of SECTIONS, and all there are in its folders, by their titles. The menu has
+  the part of a title before its colon.
 - Links to files that are no part of the site lead to copies of them in source/, as text; links to
   folders without README.md to a list of what is in them.
 - Docstrings of the reference get lists of fields, and blank lines before sections: `laid_out`.
@@ -17,14 +16,13 @@ ROOT = Path(__file__).parent.parent
 SOURCES = "docs/source/"  # if it were a folder: where the copies are on the site
 SECTIONS: list[tuple[str, list[str]]] = [
     ("Home", ["index.md"]),
-    ("Start", ["start.md", "concepts.md"]),
+    ("Start", ["start.md", "choosing.md", "concepts.md"]),
     ("How to", ["howto/"]),
     ("Environments", ["environments/"]),
-    ("Algorithms", ["algorithms/"]),
+    ("Algorithms", ["algorithms/", "theory/"]),
     ("Results", ["results/", "benchmark.md", "performance.md", "fidelity.md"]),
-    ("Reference", ["reference/"]),
+    ("Reference", ["reference/", "developing.md"]),
 ]
-MARK = re.compile(r"^.*<!-- readme: (?P<section>[^:\n]+?)(?:: (?P<words>[^\n]+?))? -->$", re.M)
 LINK = re.compile(r"(\]\(|src=\")([^)\"\s]+)")
 FIELD = re.compile(r"^(?=[a-z_])([\w, ]+(?:\([\w, ]+\))?(?: \[[^\]]*\])?): (?=\S)", re.M)
 BEFORE_SECTION = re.compile(r"(?<=\S)\n(?=(?:Args|Returns|Raises|Source):)")
@@ -34,12 +32,12 @@ def listed(docs: Path) -> list[Any]:
     """The site's list of pages, as mkdocs wants it; README.md of a folder comes first."""
     nav: list[Any] = []
     for title, names in SECTIONS:
-        pages: list[str] = []
+        pages: list[Any] = []
         for name in names:
             found = [*(docs / name).rglob("*.md")] if name.endswith("/") else [docs / name]
             found.sort(key=lambda path: (path != docs / name / "README.md", heading(path)))
-            pages += [str(path.relative_to(docs)) for path in found]
-        nav.append({title: pages[0] if len(pages) == 1 else pages})
+            pages += [{heading(path).partition(":")[0]: str(path.relative_to(docs))} for path in found]
+        nav.append({title: pages})
     return nav
 
 
@@ -47,49 +45,15 @@ def heading(page: Path) -> str:
     return page.read_text().partition("\n")[0].lstrip("# ")
 
 
-def section(readme: str, title: str, words: str | None = None) -> str:
-    """The text under `## title`, or under the title of the file; with `words` the part they begin.
-
-    Raises:
-        KeyError: the README has nothing of that name.
-    """
-    for part in re.split(r"^##? ", f"\n{readme}", flags=re.M)[1:]:
-        head, _, body = part.partition("\n")
-        if head != title:
-            continue
-        if words is None:
-            return body.strip()
-        for block in re.split(r"\n(?=\*\*)", body):
-            if block.startswith(f"**{words}**"):
-                return block.strip()
-    raise KeyError(f"README.md has no {title}{f', {words}' if words else ''}")
-
-
-def homes(docs: Path) -> dict[str, str]:
-    """Where each section of the README is on the site: '#train' -> 'start.md'."""
-    found = {}
-    for page in sorted(docs.rglob("*.md")):
-        for mark in MARK.finditer(page.read_text()):
-            if not mark["words"]:
-                slug = re.sub(r"[^\w -]", "", mark["section"].lower()).replace(" ", "-")
-                found[f"#{slug}"] = page.relative_to(docs).as_posix()
-    return found
-
-
-def relinked(text: str, origin: str, page: str, docs: Path) -> str:
-    """`text` of the file `origin`, with links that work on `page`; both are paths in the repository."""
+def relinked(text: str, page: str) -> str:
+    """`text` of a page, with links that work on the site; `page` is its path in the repository."""
 
     def replace(match: re.Match[str]) -> str:
         before, target = match.groups()
         path, hash, anchor = target.partition("#")
-        if re.match(r"\w+:", target) or (not path and origin == page):
+        if re.match(r"\w+:", target) or not path:
             return match[0]
-        full = posixpath.normpath(posixpath.join(posixpath.dirname(origin), path or "README.md"))
-        if full == "README.md" and hash:  # a section of it: where the site has it, if anywhere
-            home = homes(docs).get(hash + anchor)
-            if home and f"docs/{home}" == page:
-                return f"{before}{hash}{anchor}"
-            full, hash, anchor = f"docs/{home}" if home else full, "", ""
+        full = posixpath.normpath(posixpath.join(posixpath.dirname(page), path))
         if (ROOT / full / "README.md").exists():
             full = f"{full}/README.md"
         if not full.startswith("docs/") or full.endswith(".py") or (ROOT / full).is_dir():
@@ -101,24 +65,12 @@ def relinked(text: str, origin: str, page: str, docs: Path) -> str:
     return LINK.sub(lambda m: m[0] if any(a <= m.start() < b for a, b in kept) else replace(m), text)
 
 
-def composed(text: str, page: str, docs: Path) -> str:
-    """A page as the site has it. `page` is its path in the repository."""
-    readme = (ROOT / "README.md").read_text()
-    parts, last = [], 0
-    for mark in MARK.finditer(text):
-        included = section(readme, mark["section"], mark["words"])
-        parts += [relinked(text[last : mark.start()], page, page, docs)]
-        parts += [relinked(included, "README.md", page, docs)]
-        last = mark.end()
-    return "".join([*parts, relinked(text[last:], page, page, docs)])
-
-
 def sources(docs: Path) -> set[str]:
     """The files of the repository to which pages link and that are no part of the site."""
     found = set()
     for path in docs.rglob("*.md"):
         page = path.relative_to(ROOT).as_posix()
-        for _, target in LINK.findall(composed(path.read_text(), page, docs)):
+        for _, target in LINK.findall(relinked(path.read_text(), page)):
             full = posixpath.normpath(posixpath.join(posixpath.dirname(page), target))
             if full.startswith(SOURCES):
                 found.add(full.removeprefix(SOURCES).removesuffix(".txt"))
@@ -153,4 +105,4 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
-    return composed(markdown, f"docs/{page.file.src_uri}", Path(config.docs_dir))
+    return relinked(markdown, f"docs/{page.file.src_uri}")

@@ -15,7 +15,7 @@ import numpy as np
 from jaxsafe.report import plots, stats, studies
 from jaxsafe.report.group import Group, group, ordered
 from jaxsafe.report.published import beside, read_published
-from jaxsafe.report.read import Run, read
+from jaxsafe.report.read import SettingRun, read
 from jaxsafe.report.tables import between_marks, cell
 
 HERE = Path(__file__).parent
@@ -26,52 +26,9 @@ EXTRA = ("crpo", "ipo", "pdo", "ppo_penalty")  # trained on two tasks alone, so 
 # OmniSafe: evaluated policies. We know of no constrained table of Push.
 PUBLISHED = read_published(RESULTS / "published.csv")
 SWEEP = "jaxsafe, and dynamics"  # `solver` of the rows that are compared with each other
-# Why cells lie outside the published spread, by algorithm, or of one task alone.
-FIRST = "first-order learners earn less there (see below)"
-SAMPLED = "sampled actions while training; the final policy is within"
-BUTTON = "not known; unconstrained learners earn up to 3 more here on Button, and cost less on Car's"
-PRICE = "OmniSafe's conventions, which make up most of it on Goal 1 (see below)"
-UNSAFE = "at these settings nobody earns on Button: theirs lose 0.6 to 3.1, ours 1.3 at most"
-WHOLE = "training ends an episode once its cost exceeds the limit; their evaluation, once it reaches it"
-BUTTONS = [f"{robot}_button{level}" for robot in ("point", "car") for level in (1, 2)]
-REASONS = {
-    "cpo": "here the cost is [held at the limit](margin/README.md), there it stays above",
-    "pcpo": "there the reward's step lacks H^-1; here the cost [comes down](margin/README.md)",
-    "cppo_pid": FIRST,
-    "p3o": f"{FIRST}, and little of that is the penalty per episode",
-    "ppo_saute": FIRST,
-    "ppo_simmer_pid": FIRST,
-    "ppo_early_terminated": WHOLE,
-    "trpo_early_terminated": WHOLE,
-    "trpo": SAMPLED,
-    "npg": SAMPLED,
-    "trpo_lag": PRICE,
-    "trpo_pid": PRICE,
-    "focops": "its multiplier is at its bound of 2 (`algo.lam_max`)",
-    "pg": "a slip there: their training curve costs 58",
-    "cup": FIRST,
-    "car_goal1 rcpo": "the crest of a swing of 4 million steps: the last 40% make 21.3 at a cost of 25",
-    "point_button2 rcpo": "within their training curve; the policies of their table cost 45",
-    "car_button1 trpo_lag": "here as their curve, which is that of RCPO, too: 0.7 at cost 23",
-    "car_goal1 trpo_lag": "here above their curve, which is that of RCPO, too: 21.8 at cost 24",
-    "car_goal2 trpo_lag": "sampled actions while training; the final policy is within, as theirs",
-    "car_button1 trpo_pid": "within their training curve",
-    "car_goal2 ppo_saute": "few seeds: the interval is 25 to 35",
-    "car_goal2 ppo_simmer_pid": "few seeds",
-}
-REASONS |= {f"{task} {algo}": BUTTON for task in BUTTONS for algo in ("npg", "trpo")}
-REASONS |= {
-    f"{task} {algo}_{kind}": UNSAFE
-    for task in BUTTONS
-    for algo in ("ppo", "trpo")
-    for kind in ("saute", "simmer_pid")
-}
-# Where a run's evaluation.json was not kept: what its command printed.
-PRINTED = {
-    "point_goal1-ppo_lag": "19.21 [15.68, 21.97], cost 22.91 [18.99, 27.05]",
-    "point_goal1-cpo": "20.34 [18.71, 21.86], cost 19.24 [14.78, 23.79]",
-    "point_goal1-cpo-published": "22.64 and 21.11, cost 26.75 and 38.90",  # a command a seed
-}
+SHOWN = ("cpo", "cppo_pid", "cup", "focops", "p3o", "pcpo", "ppo_lag", "rcpo", "trpo_lag", "trpo_pid")
+FREE = ("pg", "npg", "trpo", "ppo")  # blind to cost
+EARLY = ("ppo_early_terminated", "trpo_early_terminated")  # evaluated in cut episodes there
 
 
 def beyond(value: float, spread: tuple[float, float]) -> float:
@@ -80,38 +37,64 @@ def beyond(value: float, spread: tuple[float, float]) -> float:
     return float(np.sign(value - mean) * max(0.0, abs(value - mean) - width))
 
 
-def outside(groups: Sequence[Group]) -> str:
-    """The cells whose mean lies outside the published spread, the published training curve, and why."""
+def evaluated(runs: Sequence[SettingRun]) -> list[SettingRun]:
+    """The runs with what their final policies made in fresh episodes in place of what training made;
+    without those whose evaluation was not kept."""
+    names = ("return", "cost")
+    known = [run for run in runs if np.isfinite(run.values.get("final cost", np.nan)).all()]
+    return [
+        run._replace(values={**run.values, **{name: run.values[f"final {name}"] for name in names}})
+        for run in known
+    ]
+
+
+def their_curves() -> dict[tuple[str, str], tuple[str, str]]:
+    """Return and cost at the end of OmniSafe's training by (env, algorithm); '' where unreadable."""
     with (RESULTS / "published_curves.csv").open() as file:
-        curves = {(r["env"], r["algo"]): (r["return"], r["cost"]) for r in csv.DictReader(file)}
-    lines, within, count = ["| run | return | cost | ours | their curve | why |"], 0, 0
-    lines.append("|---|---:|---:|---:|---:|---|")
-    for g in sorted(groups, key=lambda g: (g.name, g.env)):
-        if theirs := beside(g, PUBLISHED):
-            off = beyond(g.ret.mean, theirs.ret), beyond(g.cost.mean, theirs.cost)
-            count, within = count + 1, within + (not any(off))
-            if any(off):
-                figures = (f"{x:+.2g}" if x else "" for x in off)
-                why = REASONS.get(f"{g.env} {g.name}") or REASONS[g.name]
-                ours = f"{g.ret.mean:.1f}, {g.cost.mean:.0f}"
-                curve = ", ".join(x or "-" for x in curves.get((g.env, g.name), ()))
-                lines.append(
-                    f"| `{g.env}` `{g.name}` | {' | '.join(figures)} | {ours} | {curve} | {why} |"
-                )
-    summary = f"{within} of {count} cells lie within the published spreads in both."
+        return {(r["env"], r["algo"]): (r["return"], r["cost"]) for r in csv.DictReader(file)}
+
+
+def outside(training: Sequence[Group], final: Sequence[Group]) -> str:
+    """The cells whose evaluated policies lie outside the spread of the published ones, and beside them
+    what both made in training."""
+    curves, before = their_curves(), {(g.env, g.name): g for g in training}
+    lines = ["| run | ours | OmniSafe | return | cost | ours, training | their curve |"]
+    lines.append("|---|---:|---:|---:|---:|---:|---:|")
+    within, count = 0, 0
+    for g in sorted(final, key=lambda g: (g.name, g.env)):
+        theirs = None if g.name in EARLY else beside(g, PUBLISHED)
+        if theirs is None:
+            continue
+        off = beyond(g.ret.mean, theirs.ret), beyond(g.cost.mean, theirs.cost)
+        count, within = count + 1, within + (not any(off))
+        if any(off):
+            trained = before[g.env, g.name]
+            cells = [f"{g.ret.mean:.1f}, {g.cost.mean:.0f}"]
+            cells.append(f"{theirs.ret[0]:.1f}, {theirs.cost[0]:.0f}")
+            cells += [f"{x:+.2g}" if x else "" for x in off]
+            cells.append(f"{trained.ret.mean:.1f}, {trained.cost.mean:.0f}")
+            cells.append(", ".join(x or "-" for x in curves.get((g.env, g.name), ())))
+            lines.append(f"| `{g.env}` `{g.name}` | {' | '.join(cells)} |")
+    summary = f"{within} of {count} cells lie within the published spreads in both return and cost."
     return "\n".join([summary, "", *lines])
 
 
-def held(groups: Sequence[Group]) -> str:
-    """How many constrained cells cost at most 1.2 times the limit, ours in training and published."""
-    free = {"pg", "npg", "trpo", "ppo"}
-    cells = [(g, beside(g, PUBLISHED)) for g in groups if g.name not in free]
-    kept = [theirs for g, theirs in cells if g.cost.mean <= 30]
-    costs = [theirs.cost[0] for _, theirs in cells if theirs]
+def held(training: Sequence[Group], final: Sequence[Group]) -> str:
+    """In how many constrained cells the cost is at most 1.2 times the limit, ours and OmniSafe's:
+    evaluated policies beside evaluated policies, training beside training."""
+    pairs = [(g, beside(g, PUBLISHED)) for g in final if g.name not in (*FREE, *EARLY)]
+    known = [(g.cost.mean, theirs.cost[0]) for g, theirs in pairs if theirs]
+    curves = their_curves()
+    ends = [(g, curves.get((g.env, g.name), ("", ""))[1]) for g in training if g.name not in FREE]
+    trained = [(g.cost.mean, float(cost)) for g, cost in ends if cost]
+
+    def count(pairs: Sequence[tuple[float, float]]) -> str:
+        ours, theirs = (sum(cost <= 30 for cost in costs) for costs in zip(*pairs, strict=True))
+        return f"{ours} of {len(pairs)} cells, OmniSafe's in {theirs}"
+
     return (
-        f"While training ours cost at most 30, a fifth over the limit, in {len(kept)} of {len(cells)} "
-        f"constrained cells; of the {len(costs)} with a published figure ours do in "
-        f"{sum(map(bool, kept))}, OmniSafe's evaluated policies in {sum(c <= 30 for c in costs)}."
+        f"A cost of at most 30 is a fifth over the limit. Our evaluated policies keep to it in "
+        f"{count(known)}. At the end of training ours do in {count(trained)}."
     )
 
 
@@ -218,13 +201,32 @@ def throughput(path: Path) -> None:
     plt.close(figure)
 
 
+def learning(runs: Sequence[SettingRun], path: Path) -> None:
+    """Return and cost over training on car_goal1 of four algorithms, with the limit: the README's."""
+    names = ("ppo", "ppo_lag", "trpo_lag", "cpo")
+    figure, panels = plt.subplots(1, 2, figsize=(9, 3), layout="constrained")
+    chosen = [run for run in runs if run.env == "car_goal1" and run.config["algo.name"] in names]
+    groups = group(chosen, ["algo.name"])
+    edges = np.linspace(0, max(run.steps for run in chosen), 51)
+    for g in sorted(groups, key=lambda g: names.index(g.name)):
+        for axes, name in zip(panels, ("train/return", "train/cost"), strict=True):
+            values = np.concatenate([plots.stretches(run.table, name, edges) for run in g.runs])
+            plots.band(axes, edges[1:] / 1e6, values, g.name)
+    panels[1].axhline(25, color="0.4", ls="--", lw=1, label="limit")
+    for axes, what in zip(panels, ("return", "cost"), strict=True):
+        axes.set(xlabel="million environment steps", ylabel=f"{what} of an episode")
+    panels[1].legend(ncols=2, fontsize=8)
+    figure.savefig(path, dpi=110, metadata={"Software": None})
+    plt.close(figure)
+
+
 def gains(algorithms: Sequence[str], tasks: Sequence[str], window: tuple[float, float]) -> str:
     """Return, cost and its swing by the settings of the margin, between two counts of steps.
 
     The swing is the standard deviation of means over 20 iterations, for each seed, and then its mean.
     """
     names = [f"algo.{name}" for name in ("violation_gain", "margin_lr", "margin_max")]
-    settings: dict[tuple, dict[str, Run]] = {}
+    settings: dict[tuple, dict[str, SettingRun]] = {}
     for run in read([RESULTS / "margin"]):
         algo = run.config["algo.name"]
         known = np.isfinite(run.values.get(f"return {studies.window_name(*window)}", np.nan)).all()
@@ -245,7 +247,7 @@ def gains(algorithms: Sequence[str], tasks: Sequence[str], window: tuple[float, 
     return "\n".join(lines)
 
 
-def kept(runs: Sequence[Run]) -> str:
+def kept(runs: Sequence[SettingRun]) -> str:
     """How much of the cost that CPO's steps promise to take off comes true, on Goal and Button."""
     found = [run for run in runs if run.config["algo.name"] == "cpo" and "push" not in run.env]
     promised = np.concatenate([run.values["promised"] for run in found])
@@ -289,12 +291,17 @@ def pages() -> dict[Path, str]:
     runs = read([RESULTS / name for name in TABLE])
     runs = [run for run in runs if run.config["algo.name"] not in EXTRA]
     groups = ordered(group(runs, ["algo.name"]))
+    final = ordered(group(evaluated(runs), ["algo.name"]))
     theirs = read([RESULTS / "omnisafe"])
     theirs = [run for run in theirs if run.config["compat"] == "omnisafe"]
     margin = ["car_goal2", "point_button1", "point_goal2"]
     written = {
-        RESULTS / "README.md": {"matrix": studies.matrix(groups, {})},
-        RESULTS / "published.md": {"outside": outside(groups), "held": held(groups)},
+        RESULTS / "README.md": {
+            "matrix": studies.matrix(groups, {}),
+            "evaluated": studies.matrix(final, PUBLISHED),
+            "held": held(groups, final),
+        },
+        RESULTS / "published.md": {"outside": outside(groups, final), "held": held(groups, final)},
         RESULTS / "omnisafe" / "README.md": {
             "conventions": conventions(groups, group(theirs, ["algo.name"]))
         },
@@ -305,9 +312,9 @@ def pages() -> dict[Path, str]:
         },
         RESULTS / "first_attempts" / "README.md": {"attempts": attempts()},
         RESULTS / "devices" / "README.md": {"devices": devices()},
+        HERE.parent / "README.md": {"held": held(groups, final)},
         HERE / "benchmark.md": {"speeds": algorithm_speeds()},
         HERE / "performance.md": {"throughput": throughput_table(), "engine jax": engine_jax()},
-        HERE.parent / "README.md": {"results": studies.matrix(groups, PUBLISHED)},
     }
     found = {path.parent / "README.md": studies.page(studies.read(path.parent))[0] for path in STUDIES}
     for path, parts in written.items():
@@ -320,10 +327,11 @@ def main() -> None:
     for path in STUDIES:
         studies.write_page(studies.read(path.parent))
     runs = read([RESULTS / name for name in TABLE])
-    groups = ordered(group(runs, ["algo.name"]))
-    groups = [g for g in groups if g.name not in EXTRA]
+    learning(runs, HERE / "images" / "learning.png")
+    shown = [run for run in evaluated(runs) if run.config["algo.name"] in SHOWN]
+    groups = ordered(group(shown, ["algo.name"]))
     published = {(g.env, g.name): beside(g, PUBLISHED) for g in groups}
-    picture = plots.trade_off(groups, "last 10 % of training", published)
+    picture = plots.trade_off(groups, "evaluated policies", published)
     studies.save_small(picture, RESULTS / "images" / "trade_off.png")
     for path, text in pages().items():
         path.write_text(text)

@@ -17,8 +17,9 @@ import re
 import sys
 import textwrap
 import tokenize
+import typing
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from jaxsafe.algos import ALGOS, Row
 from jaxsafe.envs import ENVS
@@ -26,7 +27,7 @@ from jaxsafe.learn.offline import OfflineConfig
 from jaxsafe.report import stats, studies
 from jaxsafe.report import tables as report
 from jaxsafe.report.published import read_published
-from jaxsafe.report.read import Run, read
+from jaxsafe.report.read import SettingRun, read
 from jaxsafe.run import compat
 
 HERE = Path(__file__).parent
@@ -40,11 +41,64 @@ TASKS = {  # what a robot is paid for
     "circle": "Run along a circle of 1.5 m around the origin.",
     "grid": "Go to a goal straight ahead, once, between hazards at given places.",
 }
+FAMILIES = {  # the pages of docs/theory
+    "prices": ("ppo_lag", "trpo_lag", "rcpo", "pdo", "cup", "cppo_pid", "trpo_pid"),
+    "trust_region": ("cpo", "pcpo"),
+    "penalties": ("ipo", "p3o", "focops"),
+    "budgets": ("ppo_saute", "trpo_saute", "ppo_simmer_pid", "trpo_simmer_pid"),
+}
+ALGORITHMS = """# Algorithms
+
+Each page has the equations, the sources, every setting with its origin, the departures from the paper,
+and what it made in our runs. Which one to take: [choosing](../choosing.md#an-algorithm).
+
+How families work, with the code's letters: [prices](../theory/prices.md),
+[trust regions](../theory/trust_region.md), [penalties](../theory/penalties.md),
+[budgets in the state](../theory/budgets.md).
+
+The on-policy algorithms share these options:
+
+| option | values |
+|---|---|
+| `algo.estimator` | `gae`, `gae_rtg`, `plain`, `vtrace` |
+| `algo.reward_normalize`, `algo.cost_normalize` | whether the learner sees scaled rewards and costs |
+| `algo.entropy_coef`, `algo.entropy_decay` | a bonus for exploring, and whether it falls to 0 |
+| `algo.activation`, `algo.init` | `tanh`, `relu`; `orthogonal`, `torch` |
+| `algo.std` | `free`: a parameter; `state`: the network computes it |
+| `algo.trunk` | `separate`: a network each; `shared`: common hidden layers; `gru`: with a memory |
+
+With `shared` and `gru` policy and critics have one loss. Both are for the algorithms whose steps are
+Adam's, such as `ppo_lag` and `focops`. They go best with `reward_normalize` and `cost_normalize`.
+
+| | |
+|---|---|
+"""
 ENVIRONMENTS = """# Environments
 
-`point_TASK`, `car_TASK` and `doggo_TASK`, as in `point_goal1`; Safety Gym's ids, as in
-`Safexp-PointGoal1-v0`, work too. Every option of Safety Gym's Engine but vision is `env.OPTION`, and
-[`env.rules`](../howto/safety_gymnasium.md) takes Safety-Gymnasium's rules where they differ.
+A name is a robot and a task: `point_goal1`, `car_push2`, `doggo_button1`. Safety Gym's ids, as in
+`Safexp-PointGoal1-v0`, work too. Goal, Button and Push are the suite's 27 tasks. Run, Circle and the
+grids are the original's tests. Vision is not there yet.
+
+Every other option of Safety Gym's Engine is `env.OPTION`.
+[`env.rules`](../howto/safety_gymnasium.md) takes Safety-Gymnasium's rules where they differ. How close
+the physics is to the original: [fidelity](../fidelity.md).
+
+In Python an environment is two pure functions without a batch axis. `jax.vmap(env.step)` steps
+thousands.
+
+```python
+import jax
+
+from jaxsafe import envs
+
+env = envs.make("point_goal1", hazards_num=12, lidar_num_bins=32)
+state = env.reset(jax.random.key(0))
+state = jax.jit(env.step)(state, jax.numpy.array([1.0, 0.2]))
+print(state.obs.shape, state.reward, state.cost, dict(zip(env.cost_names, state.costs)))
+```
+
+The table has the size of each robot's observation. The vase of `goal1` and the pillar of `push1` are
+observed and cost nothing, as in the original.
 
 """
 COSTS = {
@@ -86,15 +140,29 @@ def comments_of(cls: type) -> dict[str, str]:
     return found
 
 
+def values(kind: Any) -> str:
+    """The bounds of a number, wherever it stands in the type; the words of a choice."""
+    if typing.get_origin(kind) is typing.Literal:
+        return ", ".join(f"`{word}`" for word in typing.get_args(kind))
+    if typing.get_origin(kind) is Annotated:
+        bounds = typing.get_args(kind)[1]
+        infinite = f"; `inf`: {bounds.inf}" if bounds.inf else ""
+        return f"{bounds.low:.12g} to {bounds.high:.12g}{infinite}"
+    return next(filter(None, map(values, typing.get_args(kind))), "")
+
+
 def settings(config: type) -> str:
-    """A row a field: its default, and the comment in the class that defines it."""
+    """A row a field: its default, the values it takes, and the comment in the class that defines it."""
     comments: dict[str, str] = {}
     for cls in reversed(config.__mro__[:-1]):
         comments |= {name: note or comments.get(name, "") for name, note in comments_of(cls).items()}
-    rows = ["| setting | default | |", "|---|---|---|"]
+    rows = ["| setting | default | values | |", "|---|---|---|---|"]
+    hints = typing.get_type_hints(config, include_extras=True)
     for field in dataclasses.fields(config):
         note = comments[field.name].replace("|", "\\|")
-        rows.append(f"| `algo.{field.name}` | `{field.default}` | {note} |")
+        rows.append(
+            f"| `algo.{field.name}` | `{field.default}` | {values(hints[field.name])} | {note} |"
+        )
     return "\n".join(rows)
 
 
@@ -112,10 +180,10 @@ def published(row: Row) -> str:
 
 
 @functools.cache
-def trained() -> list[Run]:
+def trained() -> list[SettingRun]:
     """The runs of the tables of results, by task and then by whose settings they have."""
 
-    def place(run: Run) -> tuple[str, str]:
+    def place(run: SettingRun) -> tuple[str, str]:
         preset, compat = run.config["preset"], run.config["compat"]
         return run.env, compat if compat != "none" else preset if preset != "fast" else ""
 
@@ -146,6 +214,12 @@ def measured(name: str) -> str:
     return head + "\n".join(rows)
 
 
+def derivation(name: str) -> str:
+    """A link to the page that derives the algorithm's family."""
+    found = next((page for page, names in FAMILIES.items() if name in names), None)
+    return f" The derivation: [{found.replace('_', ' ')}](../theory/{found}.md)." if found else ""
+
+
 def page(name: str) -> str:
     row = ALGOS[name]
     title, text = prose(row.config.__doc__ or "")
@@ -157,7 +231,7 @@ def page(name: str) -> str:
 
 {text}
 
-The code: [algos/{module}.py](../../algos/{module}.py).
+The code: [algos/{module}.py](../../algos/{module}.py).{derivation(name)}
 
 ## Settings
 
@@ -271,7 +345,7 @@ of boxes, vases and gremlins; those of Point's task. An episode has {env.episode
 def algorithms() -> str:
     """The index of the algorithms' pages."""
     lines = [f"| [`{name}`]({name}.md) | {row.summary} |" for name, row in ALGOS.items()]
-    return "# Algorithms\n\n| | |\n|---|---|\n" + "\n".join(lines) + "\n"
+    return ALGORITHMS + "\n".join(lines) + "\n"
 
 
 def pages() -> dict[Path, str]:
@@ -280,11 +354,12 @@ def pages() -> dict[Path, str]:
     found[HERE / "algorithms" / "README.md"] = algorithms()
     tasks = list(dict.fromkeys(name.split("_")[1] for name in ENVS))
     found |= {HERE / "environments" / f"{task}.md": task_page(task) for task in tasks}
-    lines = ["| task | | costs |", "|---|---|---|"]
+    lines = ["| task | | point | car | doggo | costs |", "|---|---|---:|---:|---:|---|"]
     for task in tasks:
         about = TASKS[next(kind for kind in TASKS if task.startswith(kind))]
-        costs = ", ".join(tables.robots(task)[f"point_{task}"].cost_names) or "none"
-        lines.append(f"| [`{task}`]({task}.md) | {about} | {costs} |")
+        made = list(tables.robots(task).values())
+        cells = [f"[`{task}`]({task}.md)", about, *(str(env.obs_size) for env in made)]
+        lines.append(f"| {' | '.join(cells)} | {', '.join(made[0].cost_names) or 'none'} |")
     text = ENVIRONMENTS + "\n".join(lines) + "\n"
     return found | {HERE / "environments" / "README.md": text}
 

@@ -1,4 +1,4 @@
-"""Write the tables of the README and of the docs from the code: python docs/tables.py
+"""Write the tables of the docs from the code: python docs/tables.py
 
 Each table stands between <!-- table: NAME --> and <!-- end -->; a test holds the files to them.
 """
@@ -7,7 +7,7 @@ import functools
 from pathlib import Path
 
 from jaxsafe import algos
-from jaxsafe.envs import ENVS, SafetyGym, make
+from jaxsafe.envs import SafetyGym, make
 from jaxsafe.interop import migrate
 from jaxsafe.learn.conventions import Convention, conventions
 from jaxsafe.report.tables import between_marks
@@ -20,21 +20,6 @@ ROBOTS = ("point", "car", "doggo")
 def robots(task: str) -> dict[str, SafetyGym]:
     """The environments of a task by name."""
     return {name: make(name, engine="c") for name in (f"{robot}_{task}" for robot in ROBOTS)}
-
-
-def environments() -> str:
-    """A row a task: the size of each robot's observation, and its costs."""
-    lines = ["| task | point | car | doggo | costs |", "|---|---:|---:|---:|---|"]
-    for task in dict.fromkeys(name.split("_")[1] for name in ENVS):
-        made = list(robots(task).values())
-        sizes = " | ".join(str(env.obs_size) for env in made)
-        lines.append(f"| `{task}` | {sizes} | {', '.join(made[0].cost_names) or 'none'} |")
-    return "\n".join(lines)
-
-
-def algorithms() -> str:
-    lines = ["| algorithm | what it does |", "|---|---|"]
-    return "\n".join(lines + [f"| `{name}` | {row.summary} |" for name, row in algos.ALGOS.items()])
 
 
 def omnisafe_algorithms() -> str:
@@ -70,7 +55,6 @@ def omnisafe_keys() -> str:
 
 
 TABLES = {
-    HERE.parent / "README.md": {"environments": environments, "algorithms": algorithms},
     HERE / "howto" / "migrate.md": {
         "omnisafe algorithms": omnisafe_algorithms,
         "omnisafe conventions": omnisafe_conventions,

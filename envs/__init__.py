@@ -4,13 +4,14 @@ from jaxsafe.envs.registry import (
     ALIASES,
     ENVS,
     canonical,
+    check_options,
     env_defaults,
     load,
     make,
     register,
 )
 from jaxsafe.envs.safety_gym import suite
-from jaxsafe.envs.safety_gym.config import SafetyGymConfig, defaults, read
+from jaxsafe.envs.safety_gym.config import SafetyGymConfig, config_from_plain, defaults
 from jaxsafe.envs.safety_gym.task import SafetyGym
 from jaxsafe.envs.wrap import raw_steps
 
@@ -20,12 +21,13 @@ __all__ = [
     "SafetyGym",
     "SafetyGymConfig",
     "canonical",
+    "check_options",
+    "config_from_plain",
     "defaults",
     "env_defaults",
     "load",
     "make",
     "raw_steps",
-    "read",
     "register",
     "suite",
 ]

@@ -6,18 +6,20 @@
 import dataclasses
 import inspect
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 
-from jaxsafe.config import ConfigError, convert, from_dict, named_object, nearest
+from jaxsafe.config import ConfigError, convert, from_dict, import_object, nearest, shown
 from jaxsafe.envs.check import check_env
+from jaxsafe.envs.engines.choose import ENGINES
 from jaxsafe.envs.safety_gym import layout, suite
-from jaxsafe.envs.safety_gym.config import SafetyGymConfig, defaults, read
+from jaxsafe.envs.safety_gym.config import SafetyGymConfig, config_from_plain, defaults
 from jaxsafe.envs.safety_gym.task import SafetyGym
 from jaxsafe.envs.wrap import WrapConfig, wrapped
 from jaxsafe.types import Env
 
 # name -> options that differ from Safety Gym's defaults, or a function that makes another environment
-ENVS: dict[str, Any] = {**suite.suite()}
+SUITE = suite.suite()
+ENVS: dict[str, Any] = {**SUITE}
 PLAIN = (type(None), bool, int, float, str, list, tuple, dict)
 ANY_ENV = "wrap"  # the option that every environment has
 OF_MAKE = ("engine", ANY_ENV)  # options of a Safety Gym environment that are no `SafetyGymConfig`'s
@@ -42,7 +44,7 @@ def register(name: str, env: Any) -> None:
     if isinstance(env, SafetyGymConfig):
         env = dataclasses.asdict(env)
     if isinstance(env, dict):
-        read({k: v for k, v in defaults(**env).items() if k not in OF_MAKE})
+        config_from_plain({k: v for k, v in defaults(**env).items() if k not in OF_MAKE})
         wrap_config(env.get(ANY_ENV, {}))
         ENVS[name] = dict(env)
     elif callable(env):
@@ -60,7 +62,7 @@ def load(address: str) -> None:
     Raises:
         ConfigError: no such module, or nothing of that name in it.
     """
-    register(address, named_object("env", address))
+    register(address, import_object("env", address))
 
 
 def canonical(name: str) -> str:
@@ -114,7 +116,7 @@ def arguments(factory: Callable[..., Env], name: str) -> list[inspect.Parameter]
     return [p for p in named if isinstance(p.default, PLAIN)]
 
 
-def make(env: str | SafetyGymConfig, **overrides: Any) -> SafetyGym:
+def make(env: str | SafetyGymConfig, **overrides: Any) -> Any:
     """Build an environment.
 
     Args:
@@ -122,38 +124,63 @@ def make(env: str | SafetyGymConfig, **overrides: Any) -> SafetyGym:
         overrides: options by name. Safety Gym's are those of `SafetyGymConfig`, and `engine`: 'auto',
             'c', 'warp' or 'jax'. Every environment has `wrap`, a dict of `WrapConfig`'s fields.
     Returns:
-        A `SafetyGym`, or the `Env` that was registered; in its wrappers, if `wrap` asks for any.
+        A `SafetyGym`, or the `Env` that was registered; in its wrappers, if `wrap` asks for any. Only
+        the name decides which, so that type checkers see `Any`.
     Raises:
         ConfigError: an unknown name or option (with the nearest valid one), a value of the wrong
             type, or a task that cannot be built or has no valid layout.
     """
+    return planned(env, overrides)()  # type: ignore[return-value]
+
+
+def check_options(env: str, **overrides: Any) -> None:
+    """Raise ConfigError for what `make` would not take, as far as it shows before anything is built."""
+    planned(env, overrides)
+
+
+def planned(env: str | SafetyGymConfig, overrides: dict[str, Any]) -> Callable[[], Env]:
+    """What builds the environment. Names, types and bounds are checked by now."""
+    if not isinstance(env, str | SafetyGymConfig):
+        raise ConfigError(f"env={shown(env)}: expected a name or a SafetyGymConfig")
     name = "custom" if isinstance(env, SafetyGymConfig) else canonical(env)
     options = dataclasses.asdict(env) if isinstance(env, SafetyGymConfig) else ENVS[name]
     given = {k: v for k, v in overrides.items() if k != ANY_ENV}
-    wrap = wrap_config(overrides.get(ANY_ENV, {}))
+    wrap = overrides.get(ANY_ENV, {})
     if isinstance(options, dict):
-        wrap = wrap_config({**options.get(ANY_ENV, {}), **overrides.get(ANY_ENV, {})})
-        made: Env = safety_gym(name, {k: v for k, v in options.items() if k != ANY_ENV}, given)
+        wrap = {**options.get(ANY_ENV, {}), **wrap} if isinstance(wrap, dict) else wrap
+        plan = safety_gym(name, {k: v for k, v in options.items() if k != ANY_ENV}, given)
     else:
-        made = registered(name, options, given)
-    return wrapped(made, wrap)  # type: ignore[return-value]
+        plan = registered(name, options, given)
+    wrappers = wrap_config(wrap)
+    return lambda: wrapped(plan(), wrappers)
 
 
-def safety_gym(name: str, options: dict[str, Any], overrides: dict[str, Any]) -> SafetyGym:
+def safety_gym(name: str, options: dict[str, Any], overrides: dict[str, Any]) -> Callable[[], Env]:
     options = {"engine": "auto"} | defaults(**options) | overrides
-    engine = convert(options.pop("engine"), str, "env.engine")
-    made = SafetyGym(read(options), engine, name)
-    if name in ALIASES.values() and overrides.keys() <= {"engine"}:  # known to have layouts
+    engine = convert(options.pop("engine"), Literal["auto", *ENGINES], "env.engine")  # type: ignore
+    cfg = config_from_plain(options)
+
+    def build() -> Env:
+        made = SafetyGym(cfg, engine, name)
+        # the suite's own tasks are known to have layouts
+        if name in SUITE and ENVS[name] is SUITE[name] and overrides.keys() <= {"engine"}:
+            return made
+        if not layout.feasible(made.place):
+            raise ConfigError(
+                f"env: no valid layout in {layout.LAYOUTS:,} tries: fewer or smaller objects, smaller "
+                "keepouts or larger placements_extents"
+            )
         return made
-    if not layout.feasible(made.place):
+
+    if not layout.has_room(layout.placement(cfg)):
         raise ConfigError(
-            f"env: no valid layout in {layout.LAYOUTS:,} tries: fewer or smaller objects, smaller "
-            "keepouts or larger placements_extents"
+            "env: the objects do not fit into the area: fewer of them, smaller keepouts or larger "
+            "placements_extents"
         )
-    return made
+    return build
 
 
-def registered(name: str, factory: Callable[..., Env], overrides: dict[str, Any]) -> Env:
+def registered(name: str, factory: Callable[..., Env], overrides: dict[str, Any]) -> Callable[[], Env]:
     kinds = {p.name: p.annotation for p in arguments(factory, name)}
     for option in overrides:
         if option not in kinds:
@@ -162,4 +189,4 @@ def registered(name: str, factory: Callable[..., Env], overrides: dict[str, Any]
         k: v if kinds[k] is inspect.Parameter.empty else convert(v, kinds[k], f"env.{k}")
         for k, v in overrides.items()
     }
-    return check_env(factory(**typed), name)
+    return lambda: check_env(factory(**typed), name)

@@ -7,12 +7,13 @@ whatever draws or inspects it works on a wrapped environment too.
 """
 
 from dataclasses import dataclass
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsafe.config import ConfigError
+from jaxsafe.config import Amount, Bounds, ConfigError, Real, check_values
 from jaxsafe.types import Env, State
 
 Bound = float | tuple[float, ...]
@@ -181,10 +182,15 @@ class WrapConfig:
     The first is the innermost. The defaults change nothing.
     """
 
-    action_bounds: tuple[float, float] | None = None  # the environment's own, if not [-1, 1]
-    time_limit: int | None = None  # raw steps; null: the environment's own
-    action_repeat: int = 1  # raw steps in a step
-    frame_stack: int = 1  # observations side by side
+    action_bounds: tuple[Real, Real] | None = None  # the environment's own, if not [-1, 1]
+    time_limit: Amount | None = None  # raw steps; null: the environment's own
+    action_repeat: Annotated[int, Bounds(1, 1000)] = 1  # raw steps in a step
+    frame_stack: Annotated[int, Bounds(1, 1000)] = 1  # observations side by side
+
+    def __post_init__(self) -> None:
+        check_values(self, "env.wrap.")
+        if (bounds := self.action_bounds) is not None and not bounds[0] < bounds[1]:
+            raise ConfigError(f"env.wrap.action_bounds={[*bounds]}: expected low < high")
 
 
 def wrapped(env: Env, cfg: WrapConfig) -> Env:
@@ -205,3 +211,22 @@ def wrapped(env: Env, cfg: WrapConfig) -> Env:
     except ConfigError as error:
         raise ConfigError(f"env.wrap: {error}") from None
     return env
+
+
+def wrap_config_of(env: Env) -> WrapConfig | None:
+    """The config with which `wrapped` makes `env` of what is innermost; None if there is none, as where
+    wrappers stand in another order."""
+    found: dict[str, Any] = {}
+    inside = env
+    while isinstance(inside, Wrapper):
+        if isinstance(inside, FrameStack):
+            found["frame_stack"] = inside.frames
+        elif isinstance(inside, ActionRepeat):
+            found["action_repeat"] = inside.repeat
+        elif isinstance(inside, TimeLimit):
+            found["time_limit"] = inside.steps
+        elif isinstance(inside, ActionScale):
+            found["action_bounds"] = (inside.low, inside.high)
+        inside = inside.env
+    cfg = WrapConfig(**found)
+    return cfg if wrapped(inside, cfg) == env else None

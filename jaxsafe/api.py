@@ -18,42 +18,45 @@ import numpy as np
 
 from jaxsafe import algos, envs
 from jaxsafe.algos import Row
-from jaxsafe.config import ConfigError, flat, nearest
+from jaxsafe.config import ConfigError, EpisodeCount, Index, Seed, convert, flat, nearest
 from jaxsafe.envs import SafetyGym, SafetyGymConfig
 from jaxsafe.envs.check import check_env
 from jaxsafe.envs.engines import default_engine
+from jaxsafe.envs.wrap import Wrapper, innermost, wrap_config_of
 from jaxsafe.learn.acting import Player
 from jaxsafe.report import evaluation, film, sweep_summary
 from jaxsafe.report.evaluation import Scores
 from jaxsafe.report.finish import finish
 from jaxsafe.report.group import Group
-from jaxsafe.run import distributed, run_folder, session
+from jaxsafe.run import distributed, files, run_folder, session
 from jaxsafe.run import sweep as sweeps
 from jaxsafe.run.devices import use_compilation_cache
-from jaxsafe.run.policies import Opened, open_run
-from jaxsafe.run.progress import Report
+from jaxsafe.run.loggers import Callback
+from jaxsafe.run.policies import ROBOT, RunPolicies, open_run
+from jaxsafe.run.progress import Reporter
 from jaxsafe.run.session import Session
 from jaxsafe.run.settings import (
     DEFAULT,
-    Entries,
     EnvEntry,
+    Extras,
     TrainConfig,
-    ask,
     find_env,
     load,
     nested,
-    settle,
+    settings_from_config,
+    settings_from_options,
     to_plain,
+    yours,
 )
 from jaxsafe.types import Env, PyTree
 
 __all__ = ["ConfigError", "Run", "SweepResult", "evaluate", "make", "render", "sweep", "train"]
 
-SETTINGS = [f.name for f in dataclasses.fields(TrainConfig)]
+RUN_OPTIONS = [f.name for f in dataclasses.fields(TrainConfig)]
 PLAIN = (bool, int, float, str, list, tuple, dict, type(None))
 
 
-def make(env: str | SafetyGymConfig, **options: Any) -> SafetyGym:
+def make(env: str | SafetyGymConfig, **options: Any) -> Any:
     """Build an environment: `reset(key)` and `step(state, action)`, pure and without a batch axis.
 
         env = jaxsafe.make("point_goal1", hazards_num=12)
@@ -80,7 +83,7 @@ def make(env: str | SafetyGymConfig, **options: Any) -> SafetyGym:
     """
     if isinstance(env, str):
         load("env", env)
-    return envs.make(env, **options)
+    return envs.make(env, **to_plain(options))
 
 
 class Run:
@@ -105,16 +108,17 @@ class Run:
     """
 
     def __init__(self, folder: str | Path, env: str | Env | None = None, algo: Any = None):
-        self._entries = chosen(env, algo).entries
+        choice = chosen(env, algo)
+        self._extras, self._given = choice.extras, {*flat(nested(choice.given))}
         self.folder = Path(folder).expanduser()
-        self.settings = settle(run_folder.read_config(self.folder), self._entries)
+        self.settings = settings_from_config(run_folder.read_config(self.folder), self._extras)
 
     def __repr__(self) -> str:
         s = self.settings
         seeds = f"{s.train.num_seeds} seed{'s' * (s.train.num_seeds > 1)}"
         settings = f"{len(s.configs)} settings, " * (len(s.configs) > 1)
         name = f"{s.env_name}, {s.algo_name}, {settings}{seeds}"
-        done = run_folder.progress(self.folder)
+        done = run_folder.newest_progress(self.folder)
         far = f"{done.updates:,} updates" if done and not done.steps else f"{self.steps:,} steps"
         return f"Run({str(self.folder)!r}: {name}, {far})"
 
@@ -126,7 +130,7 @@ class Run:
     @property
     def steps(self) -> int:
         """Environment steps of each seed up to the newest checkpoint; 0 without one."""
-        done = run_folder.progress(self.folder)
+        done = run_folder.newest_progress(self.folder)
         return done.steps if done else 0
 
     @property
@@ -195,9 +199,11 @@ class Run:
         return self.player(index).task
 
     @functools.cached_property
-    def _opened(self) -> Opened:
+    def _opened(self) -> RunPolicies:
         use_compilation_cache()
-        return open_run(self.folder, entries=self._entries)
+        saved = flat(self.settings.plain())
+        code = [f"{ROBOT}={saved[ROBOT]}"] if ROBOT in self._given else []
+        return open_run(self.folder, code, self._extras)
 
     @functools.cached_property
     def _act(self) -> Any:
@@ -228,7 +234,9 @@ class SweepResult(NamedTuple):
         return sweep_summary.markdown(self.rows)
 
 
-def train(env: str | Env | None = None, algo: Any = None, **options: Any) -> Run:
+def train(
+    env: str | Env | None = None, algo: Any = None, callback: Callback | None = None, **options: Any
+) -> Run:
     """Train, then evaluate and film the policy: scripts/train.py as a function.
 
         jaxsafe.train("point_goal1", "ppo_lag", cost_limit=10, num_seeds=4, total_steps=1e6)
@@ -244,6 +252,10 @@ def train(env: str | Env | None = None, algo: Any = None, **options: Any) -> Run
         algo: a name, default 'ppo_lag'; or one of yours: an object with `config`, a class under
             `jaxsafe.config.config`, and `make(env, axis_name=None)`, such as `jaxsafe.algos.Row`,
             which is recorded under the name of that class.
+        callback: called as `callback(clock, metrics)` once an iteration is written. `clock` has the
+            `iteration`, and the environment `steps` and `updates` of one seed; `metrics` are those of
+            metrics.csv, float32 [P] over policies. What it raises ends the training; the last
+            checkpoint stays.
         options: settings of the run as on the command line (`total_steps` of each seed, `num_envs`,
             `num_seeds`, `seed`, `devices`, `preset`, `compat`, `run_dir`, `resume`, `init_from`,
             `video`, ...) and of the algorithm, whose prefix may be left out (`cost_limit`:
@@ -259,25 +271,29 @@ def train(env: str | Env | None = None, algo: Any = None, **options: Any) -> Run
         ConfigError: where the script would print a line and end: an unknown name (with the nearest
             valid one), a value of the wrong type or out of bounds, a run that does not fit the memory.
         jaxsafe.run.checkpoint.CheckpointError, OSError: the disk failed; the last checkpoint stays.
+        jaxsafe.run.divergence.Diverged: the run learns no more; likewise.
         KeyboardInterrupt: stopped, see above.
     """
     for name in distributed.OPTIONS:
         if options.get(name) is not None:
-            raise ConfigError(f"{name}: several processes are for scripts/train.py")
+            raise ConfigError(f"{name}: several processes are for the command line")
     choice = chosen(env, algo)
-    settings = ask(nested(choice.given | named(choice, options)), choice.entries)
-    report = Report(hosted=True)
+    settings = settings_from_options(nested(choice.given | full_names(choice, options)), choice.extras)
+    report = Reporter(hosted=True)
     folder = session.choose_folder(settings, None, report.line)
     made, program = session.prepare(settings)
     choice.say_whose(report)
-    names = {"env": settings.env_name, "algo": settings.algo_name}
-    needed = {kind: repr(name) for kind, name in names.items() if ":" in name}
+    needed = {kind: repr(name) for kind, name in yours(settings).items()}
     needed |= {kind: f"<your {name}>" for kind, name in choice.objects.items()}
-    again = "".join(f"{kind}={what}, " for kind, what in needed.items())
-    again = f"jaxsafe.train({again}resume={str(folder)!r})"
-    if session.run(Session(settings, folder, made, program, again), report, finish):
-        raise KeyboardInterrupt(f"stopped; continue with {again}")
-    return Run(folder, env, algo)
+    words = [f"{k}={v}" if k.isidentifier() else f"**{{{k!r}: {v}}}" for k, v in needed.items()]
+    resume_command = f"jaxsafe.train({', '.join([*words, f'resume={str(folder)!r}'])})"
+    callbacks = () if callback is None else (callback,)
+    asked = Session(settings, folder, made, program, resume_command, callbacks)
+    if session.run(asked, report, finish):
+        raise KeyboardInterrupt(f"stopped; continue with {resume_command}")
+    run = Run(folder, env, algo)
+    run._given |= options.keys()
+    return run
 
 
 def sweep(env: Any = None, algo: Any = None, **options: Any) -> SweepResult:
@@ -303,19 +319,20 @@ def sweep(env: Any = None, algo: Any = None, **options: Any) -> SweepResult:
     Raises:
         ConfigError: as of `train`, or nothing to sweep.
         jaxsafe.run.checkpoint.CheckpointError, OSError: the disk failed; what was saved stays.
+        jaxsafe.run.divergence.Diverged: a run did, after the others were trained.
         KeyboardInterrupt: stopped, with a checkpoint.
     """
     choice = chosen(env, algo)
-    asked = sweeps.plan(*asked_for(choice, options), choice.entries)
-    report = Report(hosted=True)
+    asked = sweeps.plan(*asked_for(choice, options), choice.extras)
+    report = Reporter(hosted=True)
     choice.say_whose(report)
-    again = "the same call of jaxsafe.sweep"
-    summarise = functools.partial(sweep_summary.summarise, entries=choice.entries)
-    if sweeps.train(asked, again, report, sweeps.After(finish, summarise)):
-        raise KeyboardInterrupt(f"stopped; continue with {again}")
+    resume_command = "the same call of jaxsafe.sweep"
+    summarise = functools.partial(sweep_summary.summarise, extras=choice.extras)
+    if sweeps.train(asked, resume_command, report, sweeps.After(finish, summarise)):
+        raise KeyboardInterrupt(f"stopped; continue with {resume_command}")
     summarise(asked.folder)
-    rows = sweep_summary.rows_of(asked.folder, choice.entries)
-    folders = (path.parent for path in sorted(asked.folder.glob("*/config.yaml")))
+    rows = sweep_summary.rows_of(asked.folder, choice.extras)
+    folders = files.runs_in(asked.folder)
     return SweepResult(asked.folder, rows, [Run(folder, env, algo) for folder in folders])
 
 
@@ -329,7 +346,7 @@ def evaluate(run: Run | str | Path, episodes: int = 100, seed: int = 1, setting:
         setting: which one, of a run that trained several side by side.
 
     Returns:
-        Printed, a table. `scores.rows` has an estimate (mean, low, high: the 95 % bootstrap interval
+        Printed, a table. `scores.rows` has an estimate (mean, low, high: the 95 % interval
         over seeds, or over the episodes of a lone one) of 'return' and 'cost' (undiscounted sums of an
         episode), 'violation rate' (the share of episodes over the limit), 'episode length' (steps),
         'cost rate (training)' (cost a step) and, where known, Safety Gym's normalised scores;
@@ -342,11 +359,9 @@ def evaluate(run: Run | str | Path, episodes: int = 100, seed: int = 1, setting:
         Learning", section 5, for the measures.
     """
     run = run if isinstance(run, Run) else Run(run)
-    if episodes < 1 or seed < 0:
-        raise ConfigError(
-            f"episodes={episodes}, seed={seed}: expected at least 1 episode and a seed of at least 0"
-        )
-    if not 0 <= setting < (count := len(run.settings.configs)):
+    episodes, seed = convert(episodes, EpisodeCount, "episodes"), convert(seed, Seed, "seed")
+    setting = convert(setting, Index, "setting")
+    if not setting < (count := len(run.settings.configs)):
         raise ConfigError(f"setting {setting}: the run has {count}, from 0")
     return evaluation.evaluate(run._opened, episodes, seed)[setting]
 
@@ -373,6 +388,7 @@ def render(
     run = run if isinstance(run, Run) else Run(run)
     out = Path(path or run.folder / "video.mp4").expanduser()
     film.check_video(out)
+    index, seed = convert(index, Index, "index"), convert(seed, Seed, "seed")
     film.film([run._opened.actor(index)], out, seed)
     return out
 
@@ -384,10 +400,10 @@ class Chosen(NamedTuple):
     """An environment and an algorithm, as the arguments of `train` name them."""
 
     given: dict[str, Any]  # the options that choose them, as 'env' and 'env.hazards_num'
-    entries: Entries  # the caller's objects
+    extras: Extras  # the caller's objects
     objects: dict[str, str]  # 'env', 'algo': what the caller's objects are called
 
-    def say_whose(self, report: Report) -> None:
+    def say_whose(self, report: Reporter) -> None:
         if self.objects:
             report.line(
                 f"only this program knows {' and '.join(self.objects.values())}: the run continues and "
@@ -400,7 +416,7 @@ def chosen(env: Any, algo: Any) -> Chosen:
     algo_given, own_algos = choose_algo(algo)
     objects = {"env": ", ".join(own_envs), "algo": ", ".join(own_algos)}
     objects = {kind: names for kind, names in objects.items() if names}
-    return Chosen(env_given | algo_given, Entries(own_envs, own_algos), objects)
+    return Chosen(env_given | algo_given, Extras(own_envs, own_algos), objects)
 
 
 def choose_env(env: Any) -> tuple[dict[str, Any], dict[str, EnvEntry]]:
@@ -416,13 +432,17 @@ def choose_env(env: Any) -> tuple[dict[str, Any], dict[str, EnvEntry]]:
         for name in env:
             load("env", name)
         return {"env": list(env)}, {}
-    gym = isinstance(env, SafetyGym)
-    fields = to_plain(described(env))
-    if gym and isinstance(envs.ENVS.get(env.name), dict):  # a name and options say it all
-        defaults = find_env(env.name)[1].defaults
-        fields["engine"] = "auto" if env.engine == default_engine() else env.engine
-        return {"env": env.name} | {f"env.{k}": v for k, v in fields.items() if v != defaults[k]}, {}
-    name = env.name if gym else type(env).__name__
+    inner = innermost(env)
+    gym = isinstance(inner, SafetyGym)
+    fields = to_plain(plain_fields(env))
+    if gym and isinstance(envs.ENVS.get(inner.name), dict) and (wrap := wrap_config_of(env)):
+        # a name and options say it all
+        defaults = flat(find_env(inner.name)[1].defaults)
+        fields = to_plain(plain_fields(inner)) | {"wrap": to_plain(dataclasses.asdict(wrap))}
+        fields["engine"] = "auto" if inner.engine == default_engine() else inner.engine
+        options = {f"env.{k}": v for k, v in flat(fields).items() if v != defaults[k]}
+        return {"env": inner.name} | options, {}
+    name = inner.name if gym else type(env).__name__
     env = check_env(env, name)
 
     def made(**options: Any) -> Env:
@@ -434,16 +454,17 @@ def choose_env(env: Any) -> tuple[dict[str, Any], dict[str, EnvEntry]]:
         return env
 
     drawn = {} if gym else {"video": False}  # there is a picture of Safety Gym's alone
-    return {"env": name, **drawn}, {name: EnvEntry(fields, made)}
+    return {"env": name, **drawn}, {name: EnvEntry(fields, made, made)}
 
 
-def described(env: Any) -> dict[str, Any]:
+def plain_fields(env: Any) -> dict[str, Any]:
     """What config.yaml keeps of an environment: the plain fields of a dataclass."""
     fields = env.config if isinstance(env, SafetyGym) else env
     if not dataclasses.is_dataclass(fields):
         return {}
     values = {f.name: getattr(fields, f.name) for f in dataclasses.fields(fields)}
-    return {name: value for name, value in values.items() if isinstance(value, PLAIN)}
+    plain = {name: value for name, value in values.items() if isinstance(value, PLAIN)}
+    return plain | ({"inner": plain_fields(env.env)} if isinstance(env, Wrapper) else {})
 
 
 def choose_algo(algo: Any) -> tuple[dict[str, Any], dict[str, Row]]:
@@ -469,21 +490,21 @@ def choose_algo(algo: Any) -> tuple[dict[str, Any], dict[str, Row]]:
     return {"algo": names if several else names[0]}, own
 
 
-def named(choice: Chosen, options: dict[str, Any], *more: str) -> dict[str, Any]:
+def full_names(choice: Chosen, options: dict[str, Any], *more: str) -> dict[str, Any]:
     """Options by their full names: 'total_steps' stays, 'cost_limit' is 'algo.cost_limit'.
 
     Raises:
         ConfigError: no run and no algorithm has such an option.
     """
-    rows = {**algos.ALGOS, **choice.entries.algos}.values()
+    rows = {**algos.ALGOS, **choice.extras.algos}.values()
     fields = {f.name for row in rows for f in dataclasses.fields(row.config)}
 
     def full(name: str) -> str:
         head = name.partition(".")[0]
-        if head in DEFAULT or name in (*SETTINGS, *more):
+        if head in DEFAULT or name in (*RUN_OPTIONS, *more):
             return name
         if head not in fields:
-            raise ConfigError(f"unknown option {name}{nearest(name, [*SETTINGS, *more, *fields])}")
+            raise ConfigError(f"unknown option {name}{nearest(name, [*RUN_OPTIONS, *more, *fields])}")
         return f"algo.{name}"
 
     return {full(name): value for name, value in options.items()}
@@ -496,7 +517,7 @@ def asked_for(choice: Chosen, options: dict[str, Any]) -> tuple[dict[str, Any], 
         ConfigError: a list is empty, or there is no such option.
     """
     given, several = {}, {}
-    for name, value in {**choice.given, **named(choice, flat(options), "max_parallel")}.items():
+    for name, value in {**choice.given, **full_names(choice, flat(options), "max_parallel")}.items():
         values = as_list(value)
         if not isinstance(values, list):
             given[name] = value

@@ -1,15 +1,17 @@
 """Configs: frozen dataclasses whose floats are pytree leaves, read strictly from plain values."""
 
+import contextlib
 import dataclasses
 import difflib
 import importlib
 import math
+import numbers
 import sys
 import types
 import typing
 from collections import Counter
 from pathlib import Path
-from typing import Any, TypeVar, dataclass_transform
+from typing import Annotated, Any, NamedTuple, TypeVar, dataclass_transform
 
 import jax
 
@@ -24,6 +26,52 @@ def one_line(error: BaseException) -> str:
     """The first line of what an error says, or its kind if it says nothing."""
     lines = (line.strip() for line in str(error).splitlines())
     return next((line for line in lines if line), type(error).__name__)
+
+
+# ---- bounds ----------------------------------------------------------------------------------
+
+
+class Bounds(NamedTuple):
+    """Between which numbers a value lies, both included: `clip: Annotated[float, Bounds(0, 1)] = 0.2`.
+
+    NaN is never within them. inf: what infinity means where it is allowed, as in 'no bound'.
+    """
+
+    low: float
+    high: float
+    inf: str = ""
+
+    def __str__(self) -> str:
+        allowed = f", or inf ({self.inf})" if self.inf else ""
+        return f"between {self.low:.12g} and {self.high:.12g}{allowed}"
+
+    def hold(self, value: float) -> bool:
+        return self.low <= value <= self.high or (value == math.inf and bool(self.inf))
+
+
+FINITE = Bounds(-sys.float_info.max, sys.float_info.max)  # of a number without bounds of its own
+# What several configs have. A field with bounds of its own writes them out.
+Amount = Annotated[int, Bounds(1, 2**24)]  # of what exists side by side
+RunSteps = Annotated[int, Bounds(1, 10**15)]  # of a whole run
+Iterations = Annotated[int, Bounds(1, 10_000)]  # of a solver, of passes over a batch, of a window
+Period = Annotated[int, Bounds(0, 10**15)]  # steps or iterations; 0 is never
+Devices = Annotated[int, Bounds(1, 2**16)]  # or processes
+EpisodeCount = Annotated[int, Bounds(1, 10**6)]
+Index = Annotated[int, Bounds(0, 10**9)]  # of a policy, of a setting
+Port = Annotated[int, Bounds(1, 65535)]
+Seed = Annotated[int, Bounds(0, 2**31 - 1)]
+Units = Annotated[int, Bounds(1, 2**16)]  # of a layer
+Share = Annotated[float, Bounds(0, 1)]  # a discount, a probability, a part of a whole
+Rate = Annotated[float, Bounds(0, 10)]  # the step of an optimiser
+Weight = Annotated[float, Bounds(0, 1e6)]  # a gain, a price, a limit, a cost
+Real = Annotated[float, Bounds(-1e6, 1e6)]  # a reward, and whatever else may be negative
+Cap = Annotated[float, Bounds(0, 1e6, inf="no bound")]  # the highest price
+KLStop = Annotated[float, Bounds(0, 1e3, inf="never")]  # nats, beyond which passes stop
+Norm = Annotated[float, Bounds(1e-9, 1e9, inf="no bound")]  # the longest gradient
+EndOfDecay = Annotated[float, Bounds(1, 1e15, inf="the end of the run")]  # an iteration
+
+
+# ---- configs ---------------------------------------------------------------------------------
 
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
@@ -87,9 +135,10 @@ def from_dict(cls: type[T], values: dict[str, Any], where: str = "") -> T:
         values: field name -> value, as read from YAML or a command line.
         where: what to call the field in messages, e.g. 'env.'.
     Raises:
-        ConfigError: an unknown name (with the nearest valid one) or a value of the wrong type.
+        ConfigError: an unknown name (with the nearest valid one), a value of the wrong type or out of
+            its bounds.
     """
-    hints = typing.get_type_hints(cls)
+    hints = typing.get_type_hints(cls, include_extras=True)
     names = [f.name for f in dataclasses.fields(cls) if f.init]  # type: ignore[arg-type]
     for name in values:
         if name not in names:
@@ -97,19 +146,37 @@ def from_dict(cls: type[T], values: dict[str, Any], where: str = "") -> T:
     return cls(**{k: convert(v, hints[k], f"{where}{k}") for k, v in values.items()})
 
 
+def check_values(cfg: Any, where: str = "") -> None:
+    """Raise ConfigError for a number of the dataclass `cfg` that is out of its bounds. What stands for
+    a number while JAX traces is passed over."""
+    hints = typing.get_type_hints(type(cfg), include_extras=True)
+    for name in (f.name for f in dataclasses.fields(cfg)):
+        if isinstance(value := getattr(cfg, name), numbers.Real | tuple):
+            convert(value, hints[name], f"{where}{name}")
+
+
 def convert(value: Any, kind: Any, name: str) -> Any:
-    """`value` as the annotated type `kind`: whole floats serve as ints, lists as tuples."""
+    """`value` as the annotated type `kind`, within its bounds: the one check of every setting.
+
+    Whole floats serve as ints, lists as tuples, NumPy's numbers as Python's. A float without bounds is
+    finite all the same.
+    """
     origin, args = typing.get_origin(kind), typing.get_args(kind)
     if kind is Any:
         return value
     if origin in (typing.Union, types.UnionType):
         if value is None and type(None) in args:
             return None
-        for option in (a for a in args if a is not type(None)):
+        *others, last = (a for a in args if a is not type(None))
+        for option in others:
             try:
                 return convert(value, option, name)
             except ConfigError:
                 continue
+        if not others:
+            return convert(value, last, name)
+        with contextlib.suppress(ConfigError):
+            return convert(value, last, name)
     elif origin is tuple and isinstance(value, list | tuple):
         if args[-1] is Ellipsis:
             return tuple(convert(v, args[0], f"{name}[{i}]") for i, v in enumerate(value))
@@ -123,20 +190,39 @@ def convert(value: Any, kind: Any, name: str) -> Any:
         for option in args:  # the listed one: 2, where 2.0 came
             if value == option:
                 return option
-        raise ConfigError(f"{name}={value!r}{nearest(str(value), map(str, args))}")
+        raise ConfigError(f"{name}={shown(value)}{nearest(str(value), map(str, args))}")
     elif (kind is bool and isinstance(value, bool)) or (kind is str and isinstance(value, str)):
         return value
-    elif kind in (int, float) and isinstance(value, int | float) and not isinstance(value, bool):
-        if kind is float:
-            return float(value)
-        if math.isfinite(value) and value == int(value):
-            return int(value)
-    raise ConfigError(f"{name}={value!r}: expected {describe(kind)}")
+    elif (number := as_number(value, kind)) is not None:
+        return number
+    raise ConfigError(f"{name}={shown(value)}: expected {describe(kind)}")
+
+
+def as_number(value: Any, kind: Any) -> Any:
+    """`value` as int, float or one of them within Bounds; None if it is not of that kind."""
+    kind, bounds = typing.get_args(kind) if typing.get_origin(kind) is Annotated else (kind, FINITE)
+    if kind not in (int, float) or not isinstance(value, numbers.Real) or isinstance(value, bool):
+        return None
+    with contextlib.suppress(OverflowError, ValueError):  # 10**400 is no float, inf and NaN no int
+        number = kind(value)  # type: ignore[call-arg]
+        if bounds.hold(number) and (kind is float or number == value):
+            return number
+    return None
+
+
+def shown(value: Any) -> str:
+    """What came, short enough for a line."""
+    if isinstance(value, int) and value.bit_length() > 200:
+        return "a number of many digits"
+    text = repr(value)
+    return text if len(text) <= 80 else f"{text[:77]}..."
 
 
 def describe(kind: Any) -> str:
     """The annotated type in a user's words."""
     origin, args = typing.get_origin(kind), typing.get_args(kind)
+    if origin is Annotated:
+        return f"{describe(args[0])} {args[1]}"
     if origin in (typing.Union, types.UnionType):
         return " or ".join("null" if a is type(None) else describe(a) for a in args)
     if origin is tuple and args[-1] is Ellipsis:
@@ -150,7 +236,7 @@ def describe(kind: Any) -> str:
     )
 
 
-def named_object(option: str, address: str) -> Any:
+def import_object(option: str, address: str) -> Any:
     """What 'module:name' names, imported from the working directory or from what is installed.
 
     This executes the module, so an address comes from the user, never from a file.

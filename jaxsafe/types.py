@@ -66,8 +66,10 @@ class Policy(NamedTuple):
     init(params) -> carry, what the policy remembers at the start of an episode: () for a policy
         that only sees the present observation.
     act(params, carry, obs, key) -> (action [A], carry, extras): one step in one environment, without a
-        batch axis. `key` None asks for the mean action. extras is a dict, for whoever knows the policy.
-    privileged: `act` takes the environment's `State` for `obs`: the policy looks into the simulator.
+        batch axis. `key` None asks for the mean action. extras is a dict of what a policy reports
+        beside its action, as whether a shield overruled it; most report nothing.
+    privileged: `act` takes the environment's `State` for `obs`: the policy looks into the simulator, as
+        a planner with the true dynamics does.
     """
 
     init: Callable[[PyTree], PyTree]
@@ -80,7 +82,7 @@ class Shared(NamedTuple):
 
     iteration: int32 [], updates before this one. The loop owns it; cursors, warm-up and schedules are
         functions of it.
-    since: int32 [], the iteration from which on a replay holds everything: 0, or where a run was
+    since: int32 [], the iteration from which on the replay is complete: 0, or that at which a run was
         resumed without its replay.
     data: pytree, a data set.
     """
@@ -91,7 +93,10 @@ class Shared(NamedTuple):
 
 
 class Clocks(NamedTuple):
-    """What one update takes: environment steps of one seed, and at most so many gradient steps."""
+    """What one update takes of one seed: environment steps, and gradient steps.
+
+    Gradient steps of passes that stop early count, too.
+    """
 
     steps: int
     updates: int
@@ -100,11 +105,12 @@ class Clocks(NamedTuple):
 class Algorithm(NamedTuple):
     """A learner of one member, pure; `jax.vmap` makes several of it.
 
-    init(key, cfg, shared) -> ts, a train state.
+    init(key, cfg, shared) -> ts, a train state: a dataclass whose `config` is `cfg`, with its floats as
+        arrays.
     update(ts, shared) -> (ts, metrics).
     policy: see `Policy`; its `params` are those of the next line.
-    params(ts) -> pytree, what acts and what another run can start from: networks, normaliser, config.
-        No optimiser and no replay.
+    params(ts) -> pytree, the policy's parameters, from which another run can start, too: networks,
+        normaliser, config. No optimiser and no replay.
     task(params) -> the Env whose observations the policy takes.
     clocks(cfg) -> Clocks. Raises ConfigError for sizes that do not fit each other. Where an update
         takes no environment steps, the algorithm learns from the data set in `Shared`; elsewhere its

@@ -10,10 +10,10 @@ those of every run. Backends differ in their physics: figures are comparable wit
 import argparse
 
 import brax.envs
-import yaml
 
 import jaxsafe
 from jaxsafe.interop.brax import from_brax
+from jaxsafe.run.arguments import read_values
 
 
 def main() -> None:
@@ -24,10 +24,7 @@ def main() -> None:
     parser.add_argument("options", nargs="*", metavar="key=value")
     parser.add_argument("--backend", default="generalized", help="of Brax (generalized)")
     args = parser.parse_args()
-    options = {"total_steps": 3_000_000, "video": False}
-    for text in args.options:
-        name, _, value = text.partition("=")
-        options[name] = yaml.safe_load(value)
+    options = {"total_steps": 3_000_000, "video": False, **read_values(args.options).options}
     env = from_brax(brax.envs.get_environment(args.task, backend=args.backend), costs=())
     jaxsafe.train(env, options.pop("algo", "sac"), **options)
 

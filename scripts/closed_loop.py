@@ -15,9 +15,9 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from benchmark import versions
 
 from jaxsafe import envs
+from jaxsafe.commands.benchmark import versions
 from jaxsafe.config import ConfigError
 from jaxsafe.learn.rollout import collect, init_rollout, memoryless
 

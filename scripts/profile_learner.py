@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
-from benchmark import timed, training
 
 from jaxsafe import algos
+from jaxsafe.commands.benchmark import timed, training
 from jaxsafe.config import ConfigError, nearest
 from jaxsafe.types import State
 

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import pytest
-from tasks import FAST
-from toys import FIRST, Corridor, updated
+from compiling import FAST
+from toys import START, Corridor, updated
 
 from jaxsafe.algos import ALGOS
 from jaxsafe.config import ConfigError
@@ -38,7 +38,7 @@ OPTIONS: dict[str, Any] = {
 def on_policy_names(holds: str = "") -> list[str]:
     """The on-policy algorithms; with `holds` those whose row says so."""
     rows = {name: row for name, row in ALGOS.items() if issubclass(row.config, OnPolicyConfig)}
-    return sorted(name for name, row in rows.items() if holds in ("", row.holds))
+    return sorted(name for name, member in rows.items() if holds in ("", member.holds))
 
 
 def options_of(name: str) -> set[str]:
@@ -76,7 +76,7 @@ def normalises_cost(name: str) -> bool:
     cfg = ALGOS[name].config(**TINY, cost_normalize=True)
     algo = ALGOS[name].make(Corridor())
     try:
-        jax.eval_shape(lambda: algo.init(jax.random.key(0), cfg, FIRST))
+        jax.eval_shape(lambda: algo.init(jax.random.key(0), cfg, START))
     except ConfigError:
         return False
     return True
@@ -88,7 +88,7 @@ def every_option(name: str, estimator: str = "vtrace") -> dict[str, Any]:
     return options | {"estimator": estimator, "cost_normalize": normalises_cost(name)}
 
 
-class Learner(NamedTuple):
+class Compiled(NamedTuple):
     """An algorithm; `update(ts)`, and `together(ts)` of several members, both compiled."""
 
     algo: Algorithm
@@ -97,11 +97,11 @@ class Learner(NamedTuple):
 
 
 @cache
-def learner(name: str, env: Any = Corridor()) -> Learner:  # noqa: B008
+def compiled(name: str, env: Any = Corridor()) -> Compiled:  # noqa: B008
     algo = ALGOS[name].make(env)
     update = updated(algo)
     together = jax.vmap(update)
-    return Learner(
+    return Compiled(
         algo,
         jax.jit(update, compiler_options=FAST),
         jax.jit(together, compiler_options=FAST),
@@ -110,7 +110,7 @@ def learner(name: str, env: Any = Corridor()) -> Learner:  # noqa: B008
 
 def begin(name: str, env: Any = Corridor(), seed: int = 0, **options: Any) -> PyTree:  # noqa: B008
     """The train state of one member."""
-    return row(members(name, [seed], env, **options), 0)
+    return member(members(name, [seed], env, **options), 0)
 
 
 def members(name: str, seeds: list[int], env: Any = Corridor(), **options: Any) -> PyTree:  # noqa: B008
@@ -122,15 +122,15 @@ def members(name: str, seeds: list[int], env: Any = Corridor(), **options: Any) 
 
 @cache
 def initial(name: str, env: Any, cfg: Any) -> Callable[[jax.Array, dict[str, jax.Array]], PyTree]:
-    algo = learner(name, env).algo
+    algo = compiled(name, env).algo
 
     def init(key: jax.Array, swept: dict[str, jax.Array]) -> PyTree:
-        return algo.init(key, dataclasses.replace(cfg, **swept), FIRST)
+        return algo.init(key, dataclasses.replace(cfg, **swept), START)
 
     return jax.jit(jax.vmap(init), compiler_options=FAST)
 
 
-def row(tree: PyTree, i: int) -> PyTree:
+def member(tree: PyTree, i: int) -> PyTree:
     return jax.tree.map(operator.itemgetter(i), tree)
 
 

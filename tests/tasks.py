@@ -8,13 +8,17 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from compiling import FAST
 
 from jaxsafe.envs import SafetyGym, make
 from jaxsafe.envs.safety_gym.task import in_parts
 from jaxsafe.types import State
 
-FAST = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}  # to compile
-HERE = {"robot_locations": ((0.0, 0.0),), "robot_keepout": 0.0, "robot_rot": 0.0}  # robot at the origin
+ROBOT_AT_ORIGIN = {
+    "robot_locations": ((0.0, 0.0),),
+    "robot_keepout": 0.0,
+    "robot_rot": 0.0,
+}  # robot at the origin
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,7 +56,7 @@ def change(state: State, physics: dict[str, Any] | None = None, **world: Any) ->
     return state.replace(physics=new)  # type: ignore[attr-defined]
 
 
-def moved(state: State, columns: slice, values: Any) -> State:
+def with_qpos(state: State, columns: slice, values: Any) -> State:
     """`state` with some columns of qpos [n, nq] replaced."""
     return change(state, {"qpos": state.physics.physics.qpos.at[:, columns].set(jnp.asarray(values))})
 

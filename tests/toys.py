@@ -1,5 +1,6 @@
 """Environments small enough to know the answers of, and updates outside a training loop."""
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -8,15 +9,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsafe.learn.acting import Player
 from jaxsafe.learn.steps import Context
-from jaxsafe.types import Algorithm, Shared, State
+from jaxsafe.types import Algorithm, Env, Policy, Shared, State
 
-FIRST = Shared(np.int32(0))
+START = Shared(np.int32(0))
 
 
 def updated(algo: Algorithm) -> Callable:
     """ts -> (ts, metrics), for what does not depend on the iteration."""
-    return lambda ts: algo.update(ts, FIRST)
+    return lambda ts: algo.update(ts, START)
 
 
 def context(
@@ -24,13 +26,19 @@ def context(
     key: jax.Array | None = None,
     iteration: int = 0,
     axis_name: str | None = None,
-    excess: Any = 0.0,
-    length: float = 1.0,
+    violation: Any = 0.0,
+    episode_length: float = 1.0,
 ) -> Context:
     """What a step is told, for tests that take one outside a loop."""
     key = jax.random.key(1) if key is None else key
-    excess = jnp.asarray(excess, jnp.float32)
-    return Context(iteration, cfg, key, axis_name, excess, excess, jnp.float32(length))
+    violation = jnp.asarray(violation, jnp.float32)  # of a limit of 0
+    return Context(iteration, cfg, key, axis_name, violation, violation, jnp.float32(episode_length))
+
+
+def reflex(act: Callable[[jax.Array], jax.Array], task: Env) -> Player:
+    """A player that remembers nothing, from a function: obs [O] -> action [A]."""
+    policy = Policy(lambda params: (), lambda params, carry, obs, key: (act(obs), (), {}))
+    return Player(policy, (), task)
 
 
 @dataclass(frozen=True)
@@ -65,7 +73,7 @@ class Corridor:
 
 
 @dataclass(frozen=True)
-class Clock:
+class Ticker:
     """Counts its steps and knows which reset it came from; ignores actions.
 
     Observation [3]: the episode's random name, steps since the reset, steps until it terminates
@@ -80,8 +88,9 @@ class Clock:
     cost_names: tuple[str, ...] = ("a", "b")
 
     def reset(self, key: jax.Array) -> State:
-        life = jax.random.randint(key, (), self.lives[0], self.lives[1] + 1)
-        name = jax.random.uniform(jax.random.fold_in(key, 1))
+        life_key, name_key, key = jax.random.split(key, 3)
+        life = jax.random.randint(life_key, (), self.lives[0], self.lives[1] + 1)
+        name = jax.random.uniform(name_key)
         obs = jnp.stack([name, 0.0, life.astype(jnp.float32)])
         zero = jnp.zeros(())
         return State(key, obs, zero, zero, jnp.zeros(2), jnp.bool_(False), {"ticks": zero})
@@ -92,6 +101,25 @@ class Clock:
         return State(
             state.physics, obs, one, 2 * one, jnp.array([0.5, 1.5]), obs[1] >= obs[2], {"ticks": one}
         )
+
+
+@dataclass(frozen=True)
+class Lost(Ticker):
+    """A ticker that never has a finite reward."""
+
+    def step(self, state, action):
+        after = super().step(state, action)
+        return dataclasses.replace(after, reward=after.reward * jnp.nan)
+
+
+@dataclass(frozen=True)
+class Sometimes(Ticker):
+    """A ticker whose cost is NaN at step 3 of episodes with a name below 0.2."""
+
+    def step(self, state, action):
+        after = super().step(state, action)
+        bad = (after.obs[0] < 0.2) & (after.obs[1] == 3)
+        return dataclasses.replace(after, cost=jnp.where(bad, jnp.nan, after.cost))
 
 
 @dataclass(frozen=True)

@@ -1,15 +1,22 @@
-"""Draw the pictures beside this file: python docs/images/draw.py"""
+"""Draw the pictures beside this file: python docs/images/draw.py
 
+With --run RUN it writes policy.gif instead, of a policy trained on point_goal1. The one here is of
+`python scripts/train.py env=point_goal1 algo=ppo_lag total_steps=9e6`.
+"""
+
+import argparse
 from pathlib import Path
 
 import imageio
 import jax
 import mujoco
 import numpy as np
+from PIL import Image
 
 from jaxsafe import envs
 from jaxsafe.envs.safety_gym.suite import ROBOTS, TASKS
 from jaxsafe.envs.view import render
+from jaxsafe.run.policies import open_run
 
 HERE = Path(__file__).parent
 SCENES = {  # name: seed, steps into the episode, where the camera looks (m), its distance (m)
@@ -17,13 +24,16 @@ SCENES = {  # name: seed, steps into the episode, where the camera looks (m), it
     "car_push2": (5, 60, (-0.3, -0.4, 0.1), 3.6),
     "doggo_button2": (5, 30, (-0.1, -0.35, 0.1), 3.4),
 }
+STEPS, EVERY = 420, 3  # of the episode in policy.gif, and steps from a frame to the next
 SMALL = [f"{robot}_{task}" for robot in ROBOTS for task in TASKS if task not in ("run", "circle")]
 
 
-def camera(lookat: tuple[float, float, float], distance: float) -> mujoco.MjvCamera:
+def camera(
+    lookat: tuple[float, float, float], distance: float, elevation: float = -36
+) -> mujoco.MjvCamera:
     made = mujoco.MjvCamera()
     made.lookat[:] = lookat
-    made.distance, made.azimuth, made.elevation = distance, 90, -36
+    made.distance, made.azimuth, made.elevation = distance, 90, elevation
     return made
 
 
@@ -56,8 +66,32 @@ def draw_small(name: str) -> None:
     imageio.imwrite(path, smooth.round().astype(np.uint8), quality=88)
 
 
+def draw_policy(run: Path, seed: int, begin: int) -> None:
+    """A part of an episode of the policy in `run`, from step `begin` on, as a small GIF."""
+    actor = open_run(run).actor(0)
+    states = render.run_episode(actor.player, jax.random.key(seed), begin + STEPS)
+    drawing = render.Renderer(actor.env, 560, 400, camera((0.0, 0.0, 0.0), 4.5, elevation=-55))
+    frames = [
+        Image.fromarray(drawing.frame(jax.tree.map(lambda x, t=t: x[t], states)))
+        for t in range(begin, begin + STEPS, EVERY)
+    ]
+    colours = frames[0].quantize(128)  # of all frames, so that what rests stays the same pixels
+    frames = [frame.quantize(palette=colours, dither=Image.Dither.NONE) for frame in frames]
+    frames[0].save(
+        HERE / "policy.gif", save_all=True, append_images=frames[1:], duration=50, loop=0, optimize=True
+    )
+
+
 if __name__ == "__main__":
-    for name in SCENES:
-        draw(name)
-    for name in SMALL:
-        draw_small(name)
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--run", type=Path)
+    parser.add_argument("--seed", type=int, default=1, help="of the episode in policy.gif")
+    parser.add_argument("--begin", type=int, default=0, help="step at which policy.gif begins")
+    args = parser.parse_args()
+    if args.run:
+        draw_policy(args.run, args.seed, args.begin)
+    else:
+        for name in SCENES:
+            draw(name)
+        for name in SMALL:
+            draw_small(name)

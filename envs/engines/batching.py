@@ -16,7 +16,7 @@ def batched(run_batch: Callable) -> Callable:
 
     @flat.def_vmap
     def _(axis_size: int, in_batched: Any, *args: Any) -> Any:
-        args = spread(axis_size, in_batched, args)
+        args = broadcast_unbatched(axis_size, in_batched, args)
         each = jax.tree.leaves(args)[0].shape[1]
         out = flat(*jax.tree.map(lambda x: x.reshape(axis_size * each, *x.shape[2:]), args))
         out = jax.tree.map(lambda x: x.reshape(axis_size, each, *x.shape[1:]), out)
@@ -28,13 +28,13 @@ def batched(run_batch: Callable) -> Callable:
 
     @run.def_vmap
     def _(axis_size: int, in_batched: Any, *args: Any) -> Any:
-        out = flat(*spread(axis_size, in_batched, args))
+        out = flat(*broadcast_unbatched(axis_size, in_batched, args))
         return out, jax.tree.map(lambda _: True, out)
 
     return run
 
 
-def spread(axis_size: int, in_batched: Any, args: Any) -> Any:
+def broadcast_unbatched(axis_size: int, in_batched: Any, args: Any) -> Any:
     """Give every argument the batch axis."""
     return jax.tree.map(
         lambda x, batched: x if batched else jnp.broadcast_to(x, (axis_size, *x.shape)),

@@ -118,7 +118,7 @@ class Readings:
     overflow: jax.Array  # float [], 1 where this world's rows or the batch's contacts found no room
 
 
-Run = Callable[[Physics, jax.Array, jax.Array], tuple[Physics, Readings]]
+PhysicsCall = Callable[[Physics, jax.Array, jax.Array], tuple[Physics, Readings]]
 
 
 class Engine(NamedTuple):
@@ -130,8 +130,8 @@ class Engine(NamedTuple):
     name: str
     model: mujoco.MjModel  # compiled
     substeps: int  # of `Simulation`
-    advance: Run
-    show: Run
+    advance: PhysicsCall
+    show: PhysicsCall
 
     def run(
         self, physics: Physics, ctrl: jax.Array, substeps: jax.Array | int | None = None

@@ -7,14 +7,31 @@ Learning", and the Engine of the authors' package `safety_gym`.
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from jaxsafe.config import ConfigError, from_dict, nearest
+from jaxsafe.config import (
+    Amount,
+    Bounds,
+    ConfigError,
+    Real,
+    Share,
+    Weight,
+    check_values,
+    from_dict,
+    nearest,
+)
 
-Point2 = tuple[float, float]
-Rectangle = tuple[float, float, float, float]  # xmin, ymin, xmax, ymax (m)
+Distance = Annotated[float, Bounds(0, 1000)]  # m
+Size = Annotated[float, Bounds(1e-4, 1000)]  # m
+Coordinate = Annotated[float, Bounds(-1000, 1000)]  # m
+Angle = Annotated[float, Bounds(-1000, 1000)]  # rad
+Density = Annotated[float, Bounds(1e-6, 1e6)]  # kg/m^3
+Objects = Annotated[int, Bounds(0, 200)]  # of a kind
+Point2 = tuple[Coordinate, Coordinate]
+Rectangle = tuple[Coordinate, Coordinate, Coordinate, Coordinate]  # xmin, ymin, xmax, ymax (m)
 Rectangles = tuple[Rectangle, ...]
 Points = tuple[Point2, ...]
+Pixels = tuple[Annotated[int, Bounds(1, 10_000)], Annotated[int, Bounds(1, 10_000)]]  # width, height
 
 TASKS = ("goal", "button", "push", "x", "z", "circle", "none")
 # Observations that Safety-Gymnasium does not have.
@@ -34,18 +51,20 @@ class SafetyGymConfig:
 
     rules: Literal["safety_gym", "safety_gymnasium"] = "safety_gym"  # ours: whose, where they differ
     # Episode
-    num_steps: int = 1000  # time limit
-    action_noise: float = 0.0  # standard deviation, added after the action is clipped
+    num_steps: Amount = 1000  # time limit
+    action_noise: Weight = 0.0  # standard deviation, added after the action is clipped
     # Placement
     placements_extents: Rectangle = (-2.0, -2.0, 2.0, 2.0)
-    placements_margin: float = 0.0  # added to the distance required between any two objects
+    placements_margin: Annotated[float, Bounds(-2, 1000)] = (
+        0.0  # added to the distance required between any two objects
+    )
     floor_display_mode: bool = False  # rendering: the floor ends 0.1 m outside the extents
     # Robot
     robot_placements: Rectangles | None = None
     robot_locations: Points = ()
-    robot_keepout: float = 0.4
+    robot_keepout: Distance = 0.4
     robot_base: str = "xmls/car.xml"  # point, car or doggo, or a path to an MJCF file
-    robot_rot: float | None = None  # heading at the start; null is uniform
+    robot_rot: Angle | None = None  # heading at the start; null is uniform
     # Layout
     randomize_layout: bool = True  # false: every episode repeats one layout and its later draws
     build_resample: bool = True  # never read, as in the original
@@ -76,17 +95,17 @@ class SafetyGymConfig:
     # Rendering
     render_labels: bool = False
     render_lidar_markers: bool = True
-    render_lidar_radius: float = 0.15
-    render_lidar_size: float = 0.025
-    render_lidar_offset_init: float = 0.5
-    render_lidar_offset_delta: float = 0.06
-    vision_size: tuple[int, int] = (60, 40)  # these three: not read before vision is available
+    render_lidar_radius: Size = 0.15
+    render_lidar_size: Size = 0.025
+    render_lidar_offset_init: Distance = 0.5
+    render_lidar_offset_delta: Distance = 0.06
+    vision_size: Pixels = (60, 40)  # these three: not read before vision is available
     vision_render: bool = True
-    vision_render_size: tuple[int, int] = (300, 200)
+    vision_render_size: Pixels = (300, 200)
     # Lidar and compass
-    lidar_num_bins: int = 10
-    lidar_max_dist: float | None = None  # null: exp(-lidar_exp_gain distance) instead of linear
-    lidar_exp_gain: float = 1.0
+    lidar_num_bins: Annotated[int, Bounds(1, 1000)] = 10
+    lidar_max_dist: Size | None = None  # null: exp(-lidar_exp_gain distance) instead of linear
+    lidar_exp_gain: Weight = 1.0
     lidar_type: Literal["pseudo", "natural"] = "pseudo"
     lidar_alias: bool = True
     compass_shape: Literal[2, 3] = 2
@@ -94,48 +113,48 @@ class SafetyGymConfig:
     task: Literal["goal", "button", "push", "x", "z", "circle", "none"] = "goal"
     goal_placements: Rectangles | None = None
     goal_locations: Points = ()
-    goal_keepout: float = 0.4
-    goal_size: float = 0.3
+    goal_keepout: Distance = 0.4
+    goal_size: Size = 0.3
     box_placements: Rectangles | None = None
     box_locations: Points = ()
-    box_keepout: float = 0.2
-    box_size: float = 0.2  # half side
-    box_density: float = 0.001
-    box_null_dist: float = 2.0  # times box_size: closer than this, nearing the box pays nothing
+    box_keepout: Distance = 0.2
+    box_size: Size = 0.2  # half side
+    box_density: Density = 0.001
+    box_null_dist: Weight = 2.0  # times box_size: closer than this, nearing the box pays nothing
     # Reward
-    reward_distance: float = 1.0
-    reward_goal: float = 1.0
-    reward_box_dist: float = 1.0
-    reward_box_goal: float = 1.0
+    reward_distance: Real = 1.0
+    reward_goal: Real = 1.0
+    reward_box_dist: Real = 1.0
+    reward_box_goal: Real = 1.0
     reward_orientation: bool = False
-    reward_orientation_scale: float = 0.002
+    reward_orientation_scale: Real = 0.002
     reward_orientation_body: str = "robot"
-    reward_exception: float = -10.0
-    reward_x: float = 1.0
-    reward_z: float = 1.0
-    reward_circle: float = 0.1
-    reward_clip: float | None = 10.0  # of the dense part; null or 0 is no clip
+    reward_exception: Real = -10.0
+    reward_x: Real = 1.0
+    reward_z: Real = 1.0
+    reward_circle: Real = 0.1
+    reward_clip: Weight | None = 10.0  # of the dense part; null or 0 is no clip
     # Buttons
-    buttons_num: int = 0
+    buttons_num: Objects = 0
     buttons_placements: Rectangles | None = None
     buttons_locations: Points = ()
-    buttons_keepout: float = 0.3
-    buttons_size: float = 0.1
-    buttons_cost: float = 1.0
-    buttons_resampling_delay: int = 10  # steps
+    buttons_keepout: Distance = 0.3
+    buttons_size: Size = 0.1
+    buttons_cost: Weight = 1.0
+    buttons_resampling_delay: Annotated[int, Bounds(0, 2**24)] = 10  # steps
     # Circle
-    circle_radius: float = 1.5
+    circle_radius: Size = 1.5
     # Sensors
     sensors_obs: tuple[str, ...] = ("accelerometer", "velocimeter", "gyro", "magnetometer")
     sensors_hinge_joints: bool = True  # never read, as in the original: always observed
     sensors_ball_joints: bool = True  # never read, as in the original: always observed
     sensors_angle_components: bool = True  # sine and cosine, rotation matrices
     # Walls
-    walls_num: int = 0
+    walls_num: Objects = 0
     walls_placements: Rectangles | None = None
     walls_locations: Points = ()
-    walls_keepout: float = 0.0
-    walls_size: float = 0.5  # half side
+    walls_keepout: Distance = 0.0
+    walls_size: Size = 0.5  # half side
     # Constraints
     constrain_hazards: bool = False
     constrain_vases: bool = False
@@ -144,57 +163,59 @@ class SafetyGymConfig:
     constrain_gremlins: bool = False
     constrain_indicator: bool = True  # every cost, and their sum, is 1 if above 0
     # Hazards
-    hazards_num: int = 0
+    hazards_num: Objects = 0
     hazards_placements: Rectangles | None = None
     hazards_locations: Points = ()
-    hazards_keepout: float = 0.4
-    hazards_size: float = 0.3  # radius
-    hazards_cost: float = 1.0
+    hazards_keepout: Distance = 0.4
+    hazards_size: Size = 0.3  # radius
+    hazards_cost: Weight = 1.0
     # Vases
-    vases_num: int = 0
+    vases_num: Objects = 0
     vases_placements: Rectangles | None = None
     vases_locations: Points = ()
-    vases_keepout: float = 0.15
-    vases_size: float = 0.1  # half side
-    vases_density: float = 0.001
-    vases_sink: float = 4e-5
-    vases_contact_cost: float = 1.0
-    vases_displace_cost: float = 0.0
-    vases_displace_threshold: float = 1e-3
-    vases_velocity_cost: float = 1.0
-    vases_velocity_threshold: float = 1e-4
+    vases_keepout: Distance = 0.15
+    vases_size: Size = 0.1  # half side
+    vases_density: Density = 0.001
+    vases_sink: Distance = 4e-5
+    vases_contact_cost: Weight = 1.0
+    vases_displace_cost: Weight = 0.0
+    vases_displace_threshold: Weight = 1e-3
+    vases_velocity_cost: Weight = 1.0
+    vases_velocity_threshold: Weight = 1e-4
     # Pillars
-    pillars_num: int = 0
+    pillars_num: Objects = 0
     pillars_placements: Rectangles | None = None
     pillars_locations: Points = ()
-    pillars_keepout: float = 0.3
-    pillars_size: float = 0.2  # radius
-    pillars_height: float = 0.5  # half height
-    pillars_cost: float = 1.0
+    pillars_keepout: Distance = 0.3
+    pillars_size: Size = 0.2  # radius
+    pillars_height: Size = 0.5  # half height
+    pillars_cost: Weight = 1.0
     # Gremlins
-    gremlins_num: int = 0
+    gremlins_num: Objects = 0
     gremlins_placements: Rectangles | None = None
     gremlins_locations: Points = ()
-    gremlins_keepout: float = 0.5
-    gremlins_travel: float = 0.3  # radius of their circles
-    gremlins_size: float = 0.1  # half side
-    gremlins_density: float = 0.001
-    gremlins_contact_cost: float = 1.0
-    gremlins_dist_threshold: float = 0.2  # never read, as in the original
-    gremlins_dist_cost: float = 1.0  # never read, as in the original
+    gremlins_keepout: Distance = 0.5
+    gremlins_travel: Distance = 0.3  # radius of their circles
+    gremlins_size: Size = 0.1  # half side
+    gremlins_density: Density = 0.001
+    gremlins_contact_cost: Weight = 1.0
+    gremlins_dist_threshold: Weight = 0.2  # never read, as in the original
+    gremlins_dist_cost: Weight = 1.0  # never read, as in the original
     # Physics
-    frameskip_binom_n: int = 10  # physics steps in a step ~ Binomial(n, p)
-    frameskip_binom_p: float = 1.0
-    awake: int | None = None  # ours: vases, and gremlins, simulated at once; null: the engine's
-    contact_room: float = 1.0  # ours: of engine warp, times the room estimated for contacts
+    frameskip_binom_n: Annotated[int, Bounds(1, 1000)] = 10  # physics steps in a step ~ Binomial(n, p)
+    frameskip_binom_p: Share = 1.0
+    # ours: vases, and gremlins, simulated at once; null: the engine's
+    awake: Annotated[int, Bounds(1, 1000)] | None = None
+    # ours: of engine warp, times the room estimated for contacts
+    contact_room: Annotated[float, Bounds(0.01, 100)] = 1.0
     # Random numbers
-    _seed: int | None = None  # mixed into the key of every reset
+    _seed: Annotated[int, Bounds(0, 2**32 - 1)] | None = None  # mixed into the key of every reset
 
     def __post_init__(self) -> None:
-        check(self)
+        check_config(self)
 
 
-def read(values: dict[str, Any]) -> SafetyGymConfig:
+def config_from_plain(values: dict[str, Any]) -> SafetyGymConfig:
     """A config from plain values; an unknown name or a wrong type is a `ConfigError`."""
     return from_dict(SafetyGymConfig, values, "env.")
 
@@ -219,39 +240,17 @@ def check_rules(cfg: SafetyGymConfig) -> None:
             raise ConfigError(f"env.{name}={value} with env.rules=safety_gymnasium: {reason}")
 
 
-def check(cfg: SafetyGymConfig) -> None:
+def check_config(cfg: SafetyGymConfig) -> None:
     """Raise `ConfigError` for a config that no episode could be drawn from."""
+    check_values(cfg, "env.")
     if cfg.rules == "safety_gymnasium":
         check_rules(cfg)
     if cfg.observe_vision:
         raise ConfigError("env.observe_vision=true: vision is not available yet; use the lidars")
     if cfg.task not in TASKS:
         raise ConfigError(f"env.task={cfg.task!r}{nearest(cfg.task, TASKS)}")
-    for name in ("num_steps", "lidar_num_bins", "frameskip_binom_n"):
-        if getattr(cfg, name) < 1:
-            raise ConfigError(f"env.{name}={getattr(cfg, name)}: expected at least 1")
-    for kind in KINDS:
-        if getattr(cfg, f"{kind}_num") < 0:
-            raise ConfigError(f"env.{kind}_num={getattr(cfg, f'{kind}_num')}: expected 0 or more")
     if cfg.task == "button" and cfg.buttons_num < 1:
         raise ConfigError("env.buttons_num=0: the button task needs at least 1")
-    if not 0 <= cfg.frameskip_binom_p <= 1:
-        raise ConfigError(f"env.frameskip_binom_p={cfg.frameskip_binom_p}: expected 0 to 1")
-    if cfg.awake is not None and cfg.awake < 1:
-        raise ConfigError(f"env.awake={cfg.awake}: expected at least 1, or null")
-    if cfg.contact_room <= 0:
-        raise ConfigError(f"env.contact_room={cfg.contact_room}: expected above 0")
-    if cfg.action_noise < 0:
-        raise ConfigError(f"env.action_noise={cfg.action_noise}: expected 0 or more")
-    if cfg.lidar_max_dist is not None and cfg.lidar_max_dist <= 0:
-        raise ConfigError(f"env.lidar_max_dist={cfg.lidar_max_dist}: expected above 0, or null")
-    sizes = [
-        f.name for f in dataclasses.fields(cfg) if f.name.endswith(("_size", "_density", "_height"))
-    ]
-    for name in sizes:
-        value = getattr(cfg, name)
-        if isinstance(value, float) and value <= 0:
-            raise ConfigError(f"env.{name}={value}: expected above 0")
     rectangles = [("placements_extents", (cfg.placements_extents,))]
     rectangles += [
         (f"{kind}_placements", getattr(cfg, f"{kind}_placements") or ())

@@ -7,6 +7,7 @@ layout is drawn again, up to 10,000 times. Source: Safety Gym's Engine, `build_l
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -141,18 +142,32 @@ def clear(candidates: jax.Array, xy: jax.Array, apart: jax.Array) -> jax.Array:
     return x**2 + y**2 >= apart**2
 
 
+class Lane(NamedTuple):
+    """A search for a layout of n objects.
+
+    xy: float [n, 2], positions; those of the first `placed` objects, int32 [], count.
+    draws: int32 [], draws for the next object so far. number: int32 [], of the layout tried.
+    """
+
+    xy: jax.Array
+    placed: jax.Array
+    draws: jax.Array
+    number: jax.Array
+    key: jax.Array
+
+
 def sample_layout(place: Placement, key: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Positions of all objects [n, 2], and whether one of the 10,000 layouts was valid.
 
-    Of `place.lanes` lanes each tries every such layout, by turns, and waits for no other. The valid
-    layout of the lowest number is used, not the one found first, or those that need few draws would
-    be too many.
+    Layouts are numbered. Lane i tries those with the numbers i, i + lanes, i + 2 lanes and so on, and
+    waits for no other lane. The valid layout with the lowest number is used: the one found first would
+    favour layouts that need few draws.
     """
     n, lanes = len(place.names), place.lanes
     areas, weights, apart = (jnp.asarray(x) for x in (place.areas, place.weights, place.apart))
 
-    def place_next(lane: tuple) -> tuple:
-        xy, i, draws, number, key = lane  # objects before i are placed; draws for i so far
+    def place_next(lane: Lane) -> Lane:
+        xy, i, draws, number, key = lane
         key, draw_key = jax.random.split(key)
         candidates = draw(draw_key, areas[i], weights[i], DRAWS_AT_ONCE)
         free = jnp.all(clear(candidates, xy, apart[i]) | (jnp.arange(n) >= i), axis=1)
@@ -160,21 +175,31 @@ def sample_layout(place: Placement, key: jax.Array) -> tuple[jax.Array, jax.Arra
         failed = ~found & (i < n) & (draws >= DRAWS_PER_OBJECT)
         xy = jnp.where((jnp.arange(n) == i)[:, None], candidates[jnp.argmax(free)], xy)
         i, draws = jnp.where(failed, 0, i + found), jnp.where(found | failed, 0, draws)
-        return xy, i, draws, number + lanes * failed, key
+        return Lane(xy, i, draws, number + lanes * failed, key)
 
-    def searching(state: tuple) -> jax.Array:
-        _, i, _, number, _ = state
-        lowest = jnp.argmin(number)
-        return (i[lowest] < n) & (number[lowest] < LAYOUTS)
+    def searching(now: Lane) -> jax.Array:
+        lowest = jnp.argmin(now.number)
+        return (now.placed[lowest] < n) & (now.number[lowest] < LAYOUTS)
 
-    nothing = jnp.zeros(lanes, jnp.int32)
+    zeros = jnp.zeros(lanes, jnp.int32)
     numbers, keys = jnp.arange(lanes, dtype=jnp.int32), key[None]
     if lanes > 1:  # a lone lane keeps the key, whose layouts are those of earlier versions
         keys = jax.random.split(key, lanes)
-    start = (jnp.zeros((lanes, n, 2)), nothing, nothing, numbers, keys)
-    xy, i, _, number, _ = jax.lax.while_loop(searching, jax.vmap(place_next), start)
-    lowest = jnp.argmin(number)
-    return xy[lowest], i[lowest] == n
+    start = Lane(jnp.zeros((lanes, n, 2)), zeros, zeros, numbers, keys)
+    end = jax.lax.while_loop(searching, jax.vmap(place_next), start)
+    lowest = jnp.argmin(end.number)
+    return end.xy[lowest], end.placed[lowest] == n
+
+
+def has_room(place: Placement) -> bool:
+    """Whether the discs that stay free around the objects take no more than the whole area.
+
+    With a negative margin they may overlap.
+    """
+    used, keepouts = place.weights > 0, place.keepouts[:, None, None].astype(float)
+    low = (place.areas[..., :2] - keepouts)[used].min(0)
+    high = (place.areas[..., 2:] + keepouts)[used].max(0)
+    return place.margin < 0 or bool(np.pi * (keepouts**2).sum() <= np.prod(high - low))
 
 
 def feasible(place: Placement) -> bool:
@@ -201,6 +226,15 @@ def count_valid(place: Placement, rng: np.random.Generator) -> int:
     return placed.shape[2]
 
 
+class GoalSearch(NamedTuple):
+    """Position of the goal, float [2], whether it is found, bool [], and draws so far, int32 []."""
+
+    position: jax.Array
+    found: jax.Array
+    tries: jax.Array
+    key: jax.Array
+
+
 def sample_goal(
     place: Placement, key: jax.Array, xy: jax.Array, wanted: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
@@ -212,15 +246,14 @@ def sample_goal(
     apart = jnp.asarray(place.apart[goal])
     others = np.arange(len(place.names)) != goal
 
-    def batch(carry: tuple) -> tuple:
-        _, _, tries, key = carry
-        key, draw_key = jax.random.split(key)
+    def batch(now: GoalSearch) -> GoalSearch:
+        key, draw_key = jax.random.split(now.key)
         candidates = draw(
             draw_key, jnp.asarray(place.areas[goal]), jnp.asarray(place.weights[goal]), GOAL_BATCH
         )
         free = jnp.all(clear(candidates, xy, apart) | ~others, axis=1)
-        return candidates[jnp.argmax(free)], free.any(), tries + GOAL_BATCH, key
+        return GoalSearch(candidates[jnp.argmax(free)], free.any(), now.tries + GOAL_BATCH, key)
 
-    start = (xy[goal], ~wanted, jnp.int32(0), key)
-    position, found, _, _ = jax.lax.while_loop(lambda c: ~c[1] & (c[2] < GOAL_DRAWS), batch, start)
-    return position, found
+    start = GoalSearch(xy[goal], ~wanted, jnp.int32(0), key)
+    end = jax.lax.while_loop(lambda now: ~now.found & (now.tries < GOAL_DRAWS), batch, start)
+    return end.position, end.found

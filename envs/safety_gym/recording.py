@@ -17,7 +17,7 @@ from jaxsafe.config import ConfigError
 from jaxsafe.envs.engines import Physics, Readings
 from jaxsafe.envs.safety_gym import scene as scenes
 from jaxsafe.envs.safety_gym.arena import World
-from jaxsafe.envs.safety_gym.config import read
+from jaxsafe.envs.safety_gym.config import SafetyGymConfig, config_from_plain
 from jaxsafe.envs.safety_gym.task import Drive, SafetyGym, physics_of
 from jaxsafe.types import State
 
@@ -61,24 +61,28 @@ class Given(NamedTuple):
 
 
 class Replay(SafetyGym):
-    """The environment, with the next goal given instead of drawn."""
-
-    _given: tuple[Any, Any] = (np.zeros(2, np.float32), np.int32(0))  # goal [2], goal button
+    """The environment as it was recorded: the next goal is given instead of drawn, and the welds of
+    gremlins are those of MuJoCo 3.17."""
 
     def __init__(self, recording: Recording, engine: str = "auto", awake: int | None = None):
         self._given = jnp.zeros(2), jnp.int32(0)  # traced already when the shapes are found
-        config = read(recording.meta["config"] | {"awake": awake})
+        config = config_from_plain(recording.meta["config"] | {"awake": awake})
         super().__init__(config, engine, recording.name)
 
-    def after(self, world: World, given: Given, drive: Drive, moved: Physics, seen: Readings) -> State:
-        """The state after a step whose physics made `moved` and `seen`."""
+    def _build_scene(self, cfg: SafetyGymConfig, mjx: bool = False) -> scenes.Scene:
+        return scenes.with_soft_gremlins(super()._build_scene(cfg, mjx))
+
+    def after(
+        self, world: World, given: Given, drive: Drive, moved: Physics, readings: Readings
+    ) -> State:
+        """The state after a step whose physics made `moved` and `readings`."""
         self._given = given.goal, given.button
         zero = jnp.zeros(())
         obs = jnp.zeros(self.obs_size)  # `compare` refuses dicts
         costs = jnp.zeros(len(self.cost_names))
         info = {"goal_met": zero, "exception": zero, "overflow": zero}
         before = State(world, obs, zero, zero, costs, jnp.bool_(False), info)
-        return self.judge(before, drive, moved, seen)
+        return self.judge(before, drive, moved, readings)
 
     def _next_goal(self, world: World, key: jax.Array, wanted: jax.Array) -> tuple[World, jax.Array]:
         place, button = self._given
@@ -221,7 +225,7 @@ def compare(recording: Recording, engine: str = "auto", awake: int | None = None
         for slack in (-GRAZE, GRAZE):
             env.ray_slack = slack
             grazing |= np.abs(replay(env, recording, before).obs - after.obs) > GRAZE
-    return judge(recording, env, before, after, grazing)
+    return compare_states(recording, env, before, after, grazing)
 
 
 def replay(env: Replay, recording: Recording, before: World) -> State:
@@ -238,15 +242,17 @@ def replay(env: Replay, recording: Recording, before: World) -> State:
 
     @jax.jit
     @jax.vmap
-    def judge(world: World, given: Given, drive: Drive, moved: Physics, seen: Readings) -> State:
-        after = env.after(world, given, drive, moved, seen)
+    def state_after(
+        world: World, given: Given, drive: Drive, moved: Physics, readings: Readings
+    ) -> State:
+        after = env.after(world, given, drive, moved, readings)
         return after.replace(physics=after.physics.replace(key=world.key))
 
     run, _ = physics_of(env._engine)
 
     def step(world: World, action: jax.Array, given: Given) -> State:
         driven = drive(world, action)
-        return judge(world, given, driven, *run(world.physics, driven.ctrl, driven.substeps))
+        return state_after(world, given, driven, *run(world.physics, driven.ctrl, driven.substeps))
 
     inputs = (before, f32(recording["step.action"]), Given(goal, button))
     count = len(rows)
@@ -259,7 +265,7 @@ def replay(env: Replay, recording: Recording, before: World) -> State:
     return jax.tree.map(lambda *x: np.concatenate(x)[:count], *chunks)
 
 
-def judge(
+def compare_states(
     recording: Recording, env: SafetyGym, before: World, result: State, grazing: np.ndarray
 ) -> Comparison:
     """Set the states after each step beside the recorded ones; grazing lidar bins are left out."""

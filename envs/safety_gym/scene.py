@@ -6,6 +6,7 @@ one compiled model serves every layout. `drawn=True` adds light, cameras and col
 which draws the arrays over it.
 """
 
+import dataclasses
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,7 @@ from jaxsafe.config import ConfigError, nearest
 from jaxsafe.envs.engines import Room, Simulation
 from jaxsafe.envs.safety_gym.config import SafetyGymConfig
 
+TORQUESCALE = 10  # its place in the data of a weld
 ASSETS = Path(__file__).parent / "assets"
 OBJECT = {"condim": 6, "friction": (1.0, 0.005, 0.0001)}
 RGBA = {
@@ -115,13 +117,21 @@ class Scene:
 
 def robot_file(base: str) -> Path:
     """The MJCF file of a robot: point, car, doggo (also as the original's xmls/car.xml) or a path."""
-    name = base.removeprefix("xmls/").removesuffix(".xml")
-    if (ASSETS / f"{name}.xml").exists():
-        return ASSETS / f"{name}.xml"
+    if path := built_in(base):
+        return path
     if base.endswith(".xml") and Path(base).is_file():
         return Path(base)
     robots = [path.stem for path in ASSETS.glob("*.xml")]
-    raise ConfigError(f"env.robot_base={base!r}: no such robot{nearest(name, robots)}")
+    raise ConfigError(f"env.robot_base={base!r}: no such robot{nearest(name_of(base), robots)}")
+
+
+def name_of(base: str) -> str:
+    return base.removeprefix("xmls/").removesuffix(".xml")
+
+
+def built_in(base: str) -> Path | None:
+    """The MJCF file of one of our own robots; None of a path."""
+    return next((path for path in ASSETS.glob("*.xml") if path.stem == name_of(base)), None)
 
 
 def build(cfg: SafetyGymConfig, mjx: bool = False, drawn: bool = False) -> Scene:
@@ -145,7 +155,7 @@ def build(cfg: SafetyGymConfig, mjx: bool = False, drawn: bool = False) -> Scene
     if body is None or not any(site.name == "robot" for site in spec.sites):
         raise ConfigError(f"env.robot_base={cfg.robot_base!r}: it has no body and site named 'robot'")
     planar = robot.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE
-    check_names(cfg, robot)
+    check_robot(cfg, robot)
 
     world = spec.worldbody
     half = max(map(abs, cfg.placements_extents)) + 0.1 if cfg.floor_display_mode else 3.5
@@ -173,7 +183,7 @@ def build(cfg: SafetyGymConfig, mjx: bool = False, drawn: bool = False) -> Scene
     if cfg.task == "push":
         add_box(spec, cfg)
     for i in range(cfg.gremlins_num):
-        add_gremlin_guide(spec, i, cfg.gremlins_size if drawn else None)
+        add_gremlin_guide(spec, i, cfg.gremlins_size, drawn)
     for i in range(cfg.pillars_num):
         size = (cfg.pillars_size, cfg.pillars_height, 0)
         shape = mujoco.mjtGeom.mjGEOM_CAPSULE if mjx else mujoco.mjtGeom.mjGEOM_CYLINDER
@@ -219,7 +229,7 @@ def build(cfg: SafetyGymConfig, mjx: bool = False, drawn: bool = False) -> Scene
     )
 
 
-def check_names(cfg: SafetyGymConfig, robot: mujoco.MjModel) -> None:
+def check_robot(cfg: SafetyGymConfig, robot: mujoco.MjModel) -> None:
     sensors = [robot.sensor(i).name for i in range(robot.nsensor)]
     for name in cfg.sensors_obs:
         if name not in sensors:
@@ -275,13 +285,18 @@ def add_box(spec: mujoco.MjSpec, cfg: SafetyGymConfig) -> None:
         )
 
 
-def add_gremlin_guide(spec: mujoco.MjSpec, i: int, drawn_size: float | None) -> None:
-    """The mocap body that leads gremlin i along its circle, through a soft weld."""
+def add_gremlin_guide(spec: mujoco.MjSpec, i: int, size: float, drawn: bool = False) -> None:
+    """The mocap body that leads gremlin i, a cube of half side `size`, along its circle by a soft weld.
+
+    Safety Gym and Safety-Gymnasium ran on MuJoCo 2, which took a weld's rotational inertia for its
+    translational one. Since MuJoCo 3.0 the rotation is 1.5 / size^2 times as soft. The weld's
+    torquescale takes that back, so that a gremlin which is hit keeps its heading as in the original.
+    """
     body = spec.worldbody.add_body(name=f"gremlin{i}mocap", mocap=True)
-    if drawn_size is not None:
+    if drawn:
         body.add_geom(
             type=mujoco.mjtGeom.mjGEOM_BOX,
-            size=(drawn_size,) * 3,
+            size=(size,) * 3,
             contype=0,
             conaffinity=0,
             rgba=(*RGBA["gremlin"][:3], 0.1),
@@ -293,8 +308,17 @@ def add_gremlin_guide(spec: mujoco.MjSpec, i: int, drawn_size: float | None) -> 
         name1=f"gremlin{i}mocap",
         name2=f"gremlin{i}obj",
         solref=(0.02, 1.5),
-        data=[0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1, 1],
+        # anchor, position, quaternion, torquescale
+        data=[0, 0, 0, 0, 0, 0, 1, 0, 0, 0, math.sqrt(1.5) / size, 1],
     )
+
+
+def with_soft_gremlins(scene: Scene) -> Scene:
+    """`scene` with the welds of MuJoCo 3, on which recordings were made."""
+    spec = scene.spec.copy()
+    for weld in spec.equalities:
+        weld.data = [*weld.data[:TORQUESCALE], 1, *weld.data[TORQUESCALE + 1 :]]
+    return dataclasses.replace(scene, spec=spec, model=spec.compile())
 
 
 def add_fixed(

@@ -118,7 +118,7 @@ def roots(
     return (-b - root) / over(a), (-b + root) / over(a), square >= TINY - slack * a
 
 
-def first(*hits: tuple[jax.Array, jax.Array], slack: float) -> jax.Array:
+def nearest_hit(*hits: tuple[jax.Array, jax.Array], slack: float) -> jax.Array:
     """The smallest t >= 0 among (t, whether it counts)."""
     return jnp.stack([jnp.where(ok & (t >= -slack), jnp.maximum(t, 0), jnp.inf) for t, ok in hits]).min(
         0
@@ -129,12 +129,12 @@ def hit_plane(d: jax.Array, o: jax.Array, size: np.ndarray, slack: float) -> jax
     t = -o[2] / over(d[2])
     at = jnp.abs(o + t * d)
     inside = (at[0] <= size[0] + slack) & (at[1] <= size[1] + slack)
-    return first((t, inside & (d[2] < -TINY)), slack=slack)
+    return nearest_hit((t, inside & (d[2] < -TINY)), slack=slack)
 
 
 def hit_sphere(d: jax.Array, o: jax.Array, size: np.ndarray, slack: float) -> jax.Array:
     near, far, real = roots((d * d).sum(), (d * o).sum(), (o * o).sum() - size[0] ** 2, slack)
-    return first((near, real), (far, real), slack=slack)
+    return nearest_hit((near, real), (far, real), slack=slack)
 
 
 def hit_side(d: jax.Array, o: jax.Array, size: np.ndarray, slack: float) -> jax.Array:
@@ -142,7 +142,7 @@ def hit_side(d: jax.Array, o: jax.Array, size: np.ndarray, slack: float) -> jax.
     d2, o2 = d[:2], o[:2]
     near, far, real = roots((d2 * d2).sum(), (d2 * o2).sum(), (o2 * o2).sum() - size[0] ** 2, slack)
     within = [(t, real & (jnp.abs(o[2] + t * d[2]) <= size[1] + slack)) for t in (near, far)]
-    return first(*within, slack=slack)
+    return nearest_hit(*within, slack=slack)
 
 
 def hit_cylinder(d: jax.Array, o: jax.Array, size: np.ndarray, slack: float) -> jax.Array:
@@ -151,7 +151,7 @@ def hit_cylinder(d: jax.Array, o: jax.Array, size: np.ndarray, slack: float) -> 
         t = (z - o[2]) / over(d[2])
         radius = jnp.sqrt(jnp.square((o + t * d)[:2]).sum() + TINY)
         lids.append((t, (radius <= size[0] + slack) & (jnp.abs(d[2]) >= PARALLEL)))
-    return jnp.minimum(hit_side(d, o, size, slack), first(*lids, slack=slack))
+    return jnp.minimum(hit_side(d, o, size, slack), nearest_hit(*lids, slack=slack))
 
 
 def hit_capsule(d: jax.Array, o: jax.Array, size: np.ndarray, slack: float) -> jax.Array:
@@ -160,7 +160,7 @@ def hit_capsule(d: jax.Array, o: jax.Array, size: np.ndarray, slack: float) -> j
         end = o.at[2].add(-z)
         near, far, real = roots((d * d).sum(), (d * end).sum(), (end * end).sum() - size[0] ** 2, slack)
         caps += [(t, real & ((o[2] + t * d[2]) * np.sign(z) >= abs(z) - slack)) for t in (near, far)]
-    return jnp.minimum(hit_side(d, o, size, slack), first(*caps, slack=slack))
+    return jnp.minimum(hit_side(d, o, size, slack), nearest_hit(*caps, slack=slack))
 
 
 def hit_box(d: jax.Array, o: jax.Array, size: np.ndarray, slack: float) -> jax.Array:
@@ -172,7 +172,7 @@ def hit_box(d: jax.Array, o: jax.Array, size: np.ndarray, slack: float) -> jax.A
             at = jnp.abs(o + t * d)
             inside = (at[i] <= size[i] + slack) & (at[j] <= size[j] + slack)
             hits.append((t, inside & (jnp.abs(d[axis]) >= PARALLEL)))
-    return first(*hits, slack=slack)
+    return nearest_hit(*hits, slack=slack)
 
 
 HITS = {

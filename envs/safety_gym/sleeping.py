@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 
 from jaxsafe.config import ConfigError
-from jaxsafe.envs.engines import Engine, Physics, Readings, Run
+from jaxsafe.envs.engines import Engine, Physics, PhysicsCall, Readings
 from jaxsafe.envs.safety_gym import scene as scenes
 from jaxsafe.envs.safety_gym.config import SafetyGymConfig
 from jaxsafe.envs.safety_gym.scene import Scene
@@ -58,7 +58,7 @@ def with_sleepers(engine: Engine, small: Scene, scene: Scene, cfg: SafetyGymConf
     path = undisturbed(*shape, scene.model.opt.timestep)
     moving = min(MOVING, cfg.vases_velocity_threshold)
 
-    def wake(run: Run) -> Run:
+    def wake(run: PhysicsCall) -> PhysicsCall:
         def woken(physics: Physics, ctrl: jax.Array, substeps: jax.Array) -> tuple[Physics, Readings]:
             chosen = {kind: nearest(physics, scene, small, kind, moving) for kind in SLEEPERS}
             at = places(scene, chosen)
@@ -132,7 +132,7 @@ def nearest(
     return jnp.sort(jnp.argsort(distance)[: small.frees[kind]])
 
 
-class Path(NamedTuple):
+class GremlinPath(NamedTuple):
     """How a gremlin moves while nothing touches it, relative to its circle's centre and its guide's
     height: on a circle of `radius` (m), `lag` (rad) behind its guide, `height` (m) above it.
 
@@ -153,12 +153,12 @@ class Path(NamedTuple):
 
 
 @lru_cache
-def undisturbed(size: float, density: float, travel: float, timestep: float) -> Path:
+def undisturbed(size: float, density: float, travel: float, timestep: float) -> GremlinPath:
     """Where the weld to its guide takes a gremlin, from a simulation of one alone."""
     spec = mujoco.MjSpec()
     spec.option.timestep = timestep
     scenes.add_cube(spec, "gremlin0obj", "gremlin", size, density)
-    scenes.add_gremlin_guide(spec, 0, None)
+    scenes.add_gremlin_guide(spec, 0, size)
     model = spec.compile()
     data = mujoco.MjData(model)
     data.qpos[2] = size
@@ -169,11 +169,11 @@ def undisturbed(size: float, density: float, travel: float, timestep: float) -> 
         mujoco.mj_step(model, data)
     x, y, height = states[-1][:3]
     time = timestep * np.arange(len(states))
-    circle = Path(float(np.hypot(x, y)), float(time[-1] - np.arctan2(x, y)), float(height), time)
+    circle = GremlinPath(float(np.hypot(x, y)), float(time[-1] - np.arctan2(x, y)), float(height), time)
     return circle._replace(start=np.float32(np.array(states) - circle.at(time, np)))
 
 
-def rest(physics: Physics, scene: Scene, path: Path, substeps: jax.Array) -> Physics:
+def rest(physics: Physics, scene: Scene, path: GremlinPath, substeps: jax.Array) -> Physics:
     """`physics` with all vases at rest, and all gremlins where `substeps` take them if alone."""
     vases, gremlins = scene.qvel_slice("vases"), scene.qvel_slice("gremlins")
     qpos = physics.qpos

@@ -61,14 +61,14 @@ class SafetyGym:
     def __init__(self, cfg: SafetyGymConfig, engine: str = "auto", name: str = "custom"):
         self.name, self.config = name, cfg
         engine = engines.default_engine() if engine == "auto" else engine
-        self.scene = scenes.build(cfg)
+        self.scene = self._build_scene(cfg)
         self.place = layouts.placement(cfg)
         self.arena = Arena(cfg, self.scene, self.place)
         natural = ("geom_xpos", "geom_xmat") if cfg.lidar_type == "natural" else ()
         turned = ("xquat",) if cfg.reward_orientation else ()
         small = sleeping.small_config(cfg, sleeping.awake(cfg, engine))
         as_built = small == cfg and engine != "jax"
-        scene = self.scene if as_built else scenes.build(small, mjx=engine == "jax")
+        scene = self.scene if as_built else self._build_scene(small, mjx=engine == "jax")
         self._engine = engines.make_engine(engine, scene.simulation(cfg, natural + turned))
         if small != cfg:
             self._engine = sleeping.with_sleepers(self._engine, scene, self.scene, cfg)
@@ -89,6 +89,9 @@ class SafetyGym:
             name: parts[name].shape for name in observe.in_order(self.arena, parts)
         }
         self.obs_size = sum(int(np.prod(shape)) for shape in self.observation_spec.values())
+
+    def _build_scene(self, cfg: SafetyGymConfig, mjx: bool = False) -> scenes.Scene:
+        return scenes.build(cfg, mjx)
 
     # What learners ask -----------------------------------------------------------------------------
 

@@ -255,7 +255,8 @@ def run_episode(player: Player, key: jax.Array, length: int) -> State:
 
 
 def write_video(frames: Sequence[np.ndarray], path: str | Path, fps: float = FPS) -> None:
-    """Write an .mp4 (H.264), or a .gif of every third frame.
+    """Write an .mp4 (H.264), or a .gif of every third frame, to a path that is not there or is to be
+    written over.
 
     Raises:
         ConfigError: another ending.

@@ -50,7 +50,7 @@ class Ended(NamedTuple):
     cost: float
 
 
-class Session:
+class Playback:
     """Episodes one after another, with seeds that count up. Methods may be called from any thread.
 
     Args:
@@ -142,7 +142,7 @@ def pushed(held: set[str]) -> tuple[int, int]:
     return int(forward), int(turn)
 
 
-def figures(session: Session) -> dict[str, str]:
+def figures(session: Playback) -> dict[str, str]:
     """What an episode has come to so far, by name."""
     named = zip(session.env.cost_names, session.costs, strict=True)
     return {
@@ -166,7 +166,7 @@ def has_display() -> bool:
     return sys.platform != "darwin" and render.works("glfw")
 
 
-def open_window(session: Session) -> None:
+def open_window(session: Playback) -> None:
     """Play in MuJoCo's own viewer until its window is closed."""
     import mujoco.viewer
 
@@ -222,8 +222,6 @@ def check_page(port: int, open_browser: bool) -> None:
         raise ConfigError(
             f"the page for a browser needs the package {error.name}: pip install 'jaxsafe[watch]'"
         ) from error
-    if not 1 <= port <= 65535:
-        raise ConfigError(f"--port {port}: expected a number from 1 to 65535")
     if not is_free(port):
         free = next((p for p in range(port + 1, min(port + 100, 65536)) if is_free(p)), None)
         hint = f"; --port {free} is free" if free else ""
@@ -247,7 +245,7 @@ def is_free(port: int) -> bool:
     return True
 
 
-def serve_page(session: Session, title: str, port: int, open_browser: bool) -> None:
+def serve_page(session: Playback, title: str, port: int, open_browser: bool) -> None:
     """Play in a page on this machine's `port` until Ctrl-C.
 
     Raises:
@@ -345,7 +343,7 @@ def as_jpeg(frame: np.ndarray) -> bytes:
     return file.getvalue()
 
 
-def as_table(session: Session) -> str:
+def as_table(session: Playback) -> str:
     """The figures of the episode and of the last ones, as HTML."""
     rows = [f"<tr><td>{name}</td><td>{value}</td></tr>" for name, value in figures(session).items()]
     now = f"<table {STYLE}>{''.join(rows)}</table>"

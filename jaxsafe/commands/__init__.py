@@ -1,1 +1,1 @@
-"""The commands: a module each. scripts/ calls them."""
+"""The commands: a module each, called by `jaxsafe` and by scripts/."""

@@ -9,7 +9,9 @@ import jax
 from jaxsafe.config import ConfigError, one_line
 from jaxsafe.report.film import NoVideo
 from jaxsafe.run import arguments, checkpoint
+from jaxsafe.run.divergence import Diverged
 
+DIVERGED = 3  # the exit status of a run that learns no more
 BAD_DISK = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO)
 
 
@@ -21,6 +23,8 @@ def guarded(command: Callable[[], int]) -> int:
         return complain(one_line(error), 2)
     except (checkpoint.CheckpointError, NoVideo) as error:
         return complain(one_line(error), 1)
+    except Diverged as error:
+        return complain(one_line(error), DIVERGED)
     except KeyboardInterrupt:
         return complain("stopped; what was saved stays", 130)
     except OSError as error:
@@ -37,5 +41,7 @@ def guarded(command: Callable[[], int]) -> int:
 
 
 def complain(line: str, status: int) -> int:
-    print(f"error: {line}", file=sys.stderr)
+    """A file may have put more than letters into `line`, which would tell the terminal what to do."""
+    shown = "".join(letter if letter.isprintable() else "?" for letter in line)
+    print(f"error: {shown}", file=sys.stderr)
     return status

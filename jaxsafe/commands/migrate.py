@@ -1,4 +1,4 @@
-"""scripts/migrate.py: a config of OmniSafe, or of Safety Gym's Engine, as a command line."""
+"""The command migrate: configs of OmniSafe and Safety Gym, commands of AMBS and ALF, as ours."""
 
 import argparse
 import shlex
@@ -6,8 +6,11 @@ import sys
 from pathlib import Path
 
 from jaxsafe.commands.guard import guarded
-from jaxsafe.interop import migrate
+from jaxsafe.commands.jaxsafe import called
+from jaxsafe.interop import migrate, migrate_commands
 from jaxsafe.run.arguments import fail
+
+COMMANDS = {"ambs": migrate_commands.ambs, "alf": migrate_commands.alf}
 
 
 def main() -> int:
@@ -19,21 +22,23 @@ def command() -> int:
     about = migrate.__doc__ or ""
     parser = argparse.ArgumentParser(
         description=about.partition("\n")[0],
-        epilog=about.partition("\n\n")[2],
+        epilog=f"{about.partition(chr(10) * 2)[2]}\n{migrate_commands.__doc__}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.error = fail  # type: ignore[method-assign]
-    parser.add_argument("source", choices=("omnisafe", "safety_gym"))
-    parser.add_argument("config", type=Path, metavar="CONFIG")
+    parser.add_argument("source", choices=("omnisafe", "safety_gym", *COMMANDS))
+    parser.add_argument("config", metavar="CONFIG", help="a file; of ambs and alf the quoted command")
     parser.add_argument("--algo", default="", help="OmniSafe's name (default: the file's)")
     parser.add_argument("--env", default="", help="OmniSafe's name, or ours (default: the file's)")
     args = parser.parse_args()
-    tree = migrate.read(args.config)
-    if args.source == "omnisafe":
-        algo = args.algo or (args.config.stem if args.config.stem in migrate.algorithms() else "")
-        found = migrate.omnisafe(tree, algo, args.env)
+    path = Path(args.config)
+    if args.source in COMMANDS:
+        found = COMMANDS[args.source](args.config)
+    elif args.source == "omnisafe":
+        algo = args.algo or (path.stem if path.stem in migrate.algorithms() else "")
+        found = migrate.omnisafe(migrate.read_file(path), algo, args.env)
     else:
-        found = migrate.safety_gym(tree)
+        found = migrate.safety_gym(migrate.read_file(path))
     print(migrate.report(found.lines), file=sys.stderr, flush=True)
-    print(shlex.join(["python", "scripts/train.py", *found.argv]))
+    print(f"{called('train')} {shlex.join(found.argv)}")
     return 0

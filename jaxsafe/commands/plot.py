@@ -1,6 +1,6 @@
 """Runs and sweeps compared by any field of their configs, in tables and figures.
 
-    python scripts/plot.py RUNS... [--by FIELD ...] [--published CSV] [--out DIR]
+    jaxsafe plot RUNS... [--by FIELD ...] [--published CSV] [--out DIR]
 
     OUT/results.md, .tex    return and cost, a row a setting, a column a task; what else is known
     OUT/results.csv         every estimate, a row each
@@ -19,10 +19,10 @@ from pathlib import Path
 
 from jaxsafe.commands.guard import guarded
 from jaxsafe.config import ConfigError
+from jaxsafe.report.comparison import write
 from jaxsafe.report.group import group, ordered, telling
 from jaxsafe.report.published import read_published
 from jaxsafe.report.read import read
-from jaxsafe.report.write import write
 from jaxsafe.run.arguments import fail
 
 

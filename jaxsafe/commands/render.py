@@ -1,11 +1,13 @@
-"""scripts/render.py: film the policies of runs."""
+"""The command render: film the policies of runs."""
 
+import sys
 from pathlib import Path
 
 from jaxsafe.commands import viewing
 from jaxsafe.commands.guard import guarded
 from jaxsafe.config import ConfigError
 from jaxsafe.report.film import check_one_task, check_video, film, labels
+from jaxsafe.run.policies import CODE
 
 
 def main() -> int:
@@ -17,7 +19,7 @@ def command() -> int:
     parser = viewing.parser_of(
         "Film one episode of the policy of a run, or of several runs side by side in one layout.",
         "RUN",
-        "run folders; and env=MODULE:NAME or algo=MODULE:NAME, where that is code of yours",
+        f"run folders; and {', '.join(CODE)}, where that is yours",
     )
     parser.add_argument(
         "--out", type=Path, help="an .mp4 or .gif (default RUN/video.mp4; of several compared.mp4)"
@@ -32,6 +34,7 @@ def command() -> int:
     actors = what.actors(args.index)
     check_one_task(folders, actors)
     names = labels(folders, [actor.settings.algo_name for actor in actors]) if several else None
+    print(f"filming {len(actors)} x 1 episode of {actors[0].settings.env_name} ...", file=sys.stderr)
     film(actors, out, args.seed, names)
     print(out)
     return 0

@@ -1,7 +1,7 @@
-"""Train what a study lacks: python scripts/study.py NAME [--minutes 8]
+"""Train what a study lacks: jaxsafe study NAME [--minutes 8]
 
 docs/results/NAME/study.yaml lists runs in order of worth. Each that is not done is trained by
-scripts/train.py in RUNS/NAME/, and when it is done its figures and curves go into the study and onto
+`jaxsafe train` in RUNS/NAME/, and when it is done its figures and curves go into the study and onto
 its page. A run that is stopped, by Ctrl-C or after --minutes, continues the next time, as long as its
 folder in RUNS is there. Failed and diverged runs are kept and marked. Failed ones are tried again, as
 the last.
@@ -15,6 +15,7 @@ import argparse
 import contextlib
 import os
 import queue
+import shlex
 import signal
 import subprocess
 import sys
@@ -22,19 +23,20 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import jaxsafe
-from jaxsafe.commands.guard import guarded
-from jaxsafe.config import ConfigError, nearest
-from jaxsafe.report import condensed, studies
+from jaxsafe.commands.guard import DIVERGED, guarded
+from jaxsafe.config import Bounds, ConfigError, Devices, nearest
+from jaxsafe.report import studies, study_files
 from jaxsafe.report.read import read_one
 from jaxsafe.report.studies import Study
-from jaxsafe.run import run_folder
-from jaxsafe.run.arguments import fail
+from jaxsafe.run import files, run_folder
+from jaxsafe.run.arguments import fail, number
 from jaxsafe.run.settings import load
 
 ROOT = Path(jaxsafe.__file__).parent.parent
+Minutes = Annotated[float, Bounds(0, 1e6, inf="until all is done")]
 STOPPED = (130, -signal.SIGINT)
 
 
@@ -46,16 +48,20 @@ class Place(NamedTuple):
     late: Callable[[], bool]  # whether to stop now
 
 
+def in_folder(options: list[str], folder: Path) -> list[str]:
+    """The arguments of scripts/train.py that begin the run in `folder`, or continue it."""
+    return [*options, f"run_dir={folder}", "resume=true"]
+
+
 def train(options: list[str], place: Place) -> int:
-    """Run scripts/train.py with its output in a log beside the run folder. Returns its exit status."""
+    """Run `jaxsafe train` with its output in a log beside the run folder. Returns its exit status."""
     place.folder.parent.mkdir(parents=True, exist_ok=True)
-    words = [sys.executable, str(ROOT / "scripts" / "train.py"), *options]
-    words += [f"run_dir={place.folder}", "resume=true"]
+    command = [sys.executable, "-m", "jaxsafe", "train", *in_folder(options, place.folder)]
     own = {} if place.gpu is None else {"CUDA_VISIBLE_DEVICES": place.gpu}
     own |= {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}  # several share a GPU
-    with log_of(place.folder).open("a") as log:
+    with files.appending(log_of(place.folder)) as log:
         process = subprocess.Popen(
-            words,
+            command,
             stdout=log,
             stderr=subprocess.STDOUT,
             env=os.environ | own,
@@ -77,7 +83,7 @@ def states(study: Study) -> dict[str, str]:
     """done, diverged, failed or '' of each run: the worst of its seeds."""
     order = ("done", "diverged", "failed")
     found = dict.fromkeys(study.runs, "")
-    for row in condensed.read(study.folder).rows:
+    for row in study_files.read(study.folder).rows:
         if row["run"] in found and row["state"] in order:
             found[row["run"]] = max(found[row["run"]] or "done", row["state"], key=order.index)
     return found
@@ -87,10 +93,10 @@ def left(study: Study, only: list[str], runs: Path) -> list[str]:
     """What is still to train: those begun, then by worth, and last those that failed."""
     known = states(study)
     found = [run for run in study.runs if known[run] in ("", "failed")]
-    found = [run for run in found if not only or condensed.name_of(run) in only]
+    found = [run for run in found if not only or study_files.name_of(run) in only]
 
     def turn(run: str) -> tuple[bool, bool]:
-        return known[run] == "failed", not (runs / condensed.name_of(run)).exists()
+        return known[run] == "failed", not (runs / study_files.name_of(run)).exists()
 
     return sorted(found, key=turn)
 
@@ -98,19 +104,19 @@ def left(study: Study, only: list[str], runs: Path) -> list[str]:
 def listing(study: Study, runs: Path) -> str:
     lines = []
     for run, state in states(study).items():
-        folder = runs / condensed.name_of(run)
-        if not state and (progress := run_folder.progress(folder)):
+        folder = runs / study_files.name_of(run)
+        if not state and (progress := run_folder.newest_progress(folder)):
             steps, updates = progress.steps, progress.updates
             state = f"begun, at {steps:,} steps" if steps else f"begun, at {updates:,} updates"
-        lines.append(f"{condensed.name_of(run)}: {state or 'to do'}")
+        lines.append(f"{study_files.name_of(run)}: {state or 'to do'}")
     return "\n".join(lines)
 
 
-def find(name: str) -> Path:
+def find_study(name: str) -> Path:
     """A folder with a study.yaml, or the name of one in docs/results."""
     home = ROOT / "docs" / "results"
     for folder in (Path(name).expanduser(), home / name):
-        if (folder / "study.yaml").is_file():
+        if files.there(folder / "study.yaml"):
             return folder
     known = sorted(path.parent.name for path in home.glob("*/study.yaml"))
     raise ConfigError(f"no study {name}{nearest(name, known)}; a new one begins with its study.yaml")
@@ -147,7 +153,7 @@ def work(study: Study, args: argparse.Namespace, train: Callable[[list[str], Pla
         return stop.is_set() or time.monotonic() >= end
 
     def one(run: str, gpu: str | None) -> None:
-        name, begun = condensed.name_of(run), time.monotonic()
+        name, begun = study_files.name_of(run), time.monotonic()
         if late():
             unfinished.append(name)
             return
@@ -159,11 +165,16 @@ def work(study: Study, args: argparse.Namespace, train: Callable[[list[str], Pla
             print(f"{name}: stopped, {minutes}", flush=True)
             return
         with one_at_a_time:
-            began = (folder / "metrics.csv").exists()
-            for trained in read_one(folder) if began else []:
-                studies.add(study, run, trained, studies.origin_of(folder), failed=status != 0)
-        failed.extend([name] * (status != 0))
-        result = f"failed, see {log_of(folder)}" if status else "done"
+            began = files.there(folder / "metrics.csv")
+            trained = read_one(folder) if began else []
+            if len(trained) > 1:
+                raise ConfigError(f"{run}: expected one setting a run, not {len(trained)} side by side")
+            failure = {0: "", DIVERGED: "diverged"}.get(status, "failed")
+            for setting in trained:
+                studies.add(study, run, setting, studies.origin_of(folder), failure)
+        failed.extend([name] * (status not in (0, DIVERGED)))
+        result = {0: "done", DIVERGED: "diverged"}.get(status, "failed")
+        result += f", see {log_of(folder)}" if status else ""
         print(f"{name}: {result}, {minutes}", flush=True)
 
     def worker(gpu: str | None) -> None:
@@ -173,8 +184,8 @@ def work(study: Study, args: argparse.Namespace, train: Callable[[list[str], Pla
                 try:
                     one(run, gpu)
                 except Exception as error:  # the other runs go on
-                    failed.append(condensed.name_of(run))
-                    print(f"{condensed.name_of(run)}: {error!r}", flush=True)
+                    failed.append(study_files.name_of(run))
+                    print(f"{study_files.name_of(run)}: {error!r}", flush=True)
 
     print(f"{len(asked)} of {len(study.runs)} runs to do", flush=True)
     gpus = args.gpus.split(",") if args.gpus else [None]
@@ -184,14 +195,14 @@ def work(study: Study, args: argparse.Namespace, train: Callable[[list[str], Pla
             thread.start()
         for thread in threads:
             thread.join()
-    if len(unfinished) + len(failed) < len(asked) and condensed.there(study.folder):
+    if len(unfinished) + len(failed) < len(asked) and study_files.there(study.folder):
         studies.write_page(study)
     print(f"left to do: {', '.join(unfinished + failed) or 'nothing'}")
     return 1 if failed else 130 if unfinished else 0
 
 
 def main(train: Callable[[list[str], Place], int] = train) -> int:
-    """scripts/study.py. `train` is what trains one run."""
+    """The command study. `train` is what trains one run."""
 
     def study_command() -> int:
         parser = argparse.ArgumentParser(
@@ -200,20 +211,29 @@ def main(train: Callable[[list[str], Place], int] = train) -> int:
         parser.error = fail  # type: ignore[method-assign]
         parser.add_argument("study", metavar="NAME", help="in docs/results, or a folder")
         parser.add_argument("--list", action="store_true", help="say what is done, and train nothing")
+        parser.add_argument(
+            "--commands", action="store_true", help="print what is left, to run elsewhere"
+        )
         parser.add_argument("--page", action="store_true", help="draw the page, and train nothing")
-        parser.add_argument("--minutes", type=float, default=float("inf"), help="then stop")
+        parser.add_argument("--minutes", type=number(Minutes), default=float("inf"), help="then stop")
         parser.add_argument("--only", nargs="+", default=[], metavar="RUN", help="as --list names it")
         parser.add_argument("--gpus", help="their indices, with commas between")
-        parser.add_argument("--at-once", type=int, default=1, help="runs on each GPU")
+        parser.add_argument("--at-once", type=number(Devices), default=1, help="runs on each GPU")
         parser.add_argument("--runs", type=Path, default=Path("runs") / "studies", metavar="DIR")
         args = parser.parse_args()
-        study = studies.read(find(args.study))
-        names = [condensed.name_of(run) for run in study.runs]
+        study = studies.read(find_study(args.study))
+        names = [study_files.name_of(run) for run in study.runs]
         for name in args.only:
             if name not in names:
                 raise ConfigError(f"--only {name}{nearest(name, names)}")
+        runs = args.runs / study.folder.name
         if args.list:
-            print(listing(study, args.runs / study.folder.name))
+            print(listing(study, runs))
+            return 0
+        if args.commands:
+            for run in left(study, args.only, runs):
+                options = in_folder(study.command(run), runs / study_files.name_of(run))
+                print(shlex.join(["python", "scripts/train.py", *options]))
             return 0
         if args.page:
             studies.write_page(study)

@@ -1,4 +1,4 @@
-"""scripts/sweep.py: train a grid of settings, and summarise it."""
+"""The command sweep: train a grid of settings, and summarise it."""
 
 import argparse
 import shlex
@@ -6,14 +6,15 @@ import sys
 from pathlib import Path
 
 from jaxsafe.commands.guard import guarded
+from jaxsafe.commands.jaxsafe import called
 from jaxsafe.report.finish import finish
 from jaxsafe.report.sweep_summary import summarise
-from jaxsafe.run import sweep
+from jaxsafe.run import files, sweep
 from jaxsafe.run.arguments import fail, read_values
-from jaxsafe.run.progress import Report
+from jaxsafe.run.progress import Reporter
 
 EPILOG = """\
-Options are those of train.py (python scripts/train.py --help), and
+Options are those of training (jaxsafe train --help), and
 
   max_parallel=N   members (settings x seeds) trained at once; default: what the memory holds
   run_dir=FOLDER   the sweep's folder; default: runs/sweep-<env>-<algo>-<a hash of the settings>
@@ -28,7 +29,7 @@ def main() -> int:
 
 def command() -> int:
     parser = argparse.ArgumentParser(
-        description="Train a grid: python scripts/sweep.py algo=ppo_lag algo.cost_limit=5,10,25",
+        description="Train a grid: jaxsafe sweep algo=ppo_lag algo.cost_limit=5,10,25",
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -41,7 +42,9 @@ def command() -> int:
         print(summarise(args.summary), end="")
         return 0
     asked = sweep.plan(given.options, given.several)
-    again = f"python scripts/sweep.py {shlex.join(sys.argv[1:])}"
-    status = sweep.train(asked, again, Report(), sweep.After(finish, summarise))
-    print(summarise(asked.folder) + f"sweep folder: {asked.folder}")
-    return status
+    resume_command = f"{called('sweep')} {shlex.join(sys.argv[1:])}"
+    try:
+        return sweep.train(asked, resume_command, Reporter(), sweep.After(finish, summarise))
+    finally:
+        if files.there(asked.folder / "sweep.yaml"):
+            print(summarise(asked.folder) + f"sweep folder: {asked.folder}", flush=True)

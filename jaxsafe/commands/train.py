@@ -1,4 +1,4 @@
-"""scripts/train.py: train a policy, then evaluate and film it."""
+"""The command train: train a policy, then evaluate and film it."""
 
 import shlex
 import sys
@@ -8,16 +8,17 @@ from typing import Any
 from rich.console import Console
 
 from jaxsafe.commands.guard import guarded
+from jaxsafe.commands.jaxsafe import called
 from jaxsafe.report.finish import finish
 from jaxsafe.run import distributed, session
 from jaxsafe.run.arguments import each_job
-from jaxsafe.run.progress import Report
+from jaxsafe.run.progress import Reporter
 from jaxsafe.run.session import Session
-from jaxsafe.run.settings import Settings, settle
+from jaxsafe.run.settings import Settings, settings_from_config, yours
 
 
 def main() -> int:
-    """Exit status: 2 for bad input, 1 for a failed disk, 130 if stopped."""
+    """Exit status: 2 for bad input, 1 for a failed disk, 3 if it diverged, 130 if stopped."""
 
     def command() -> int:
         each_job(sys.argv[1:], job)
@@ -30,29 +31,28 @@ def job(config: dict[str, Any], number: int | None) -> None:
     """One run; `number` is its own in a --multirun."""
     status = guarded(lambda: train(config, number))  # here already: of a job that raises, Hydra prints
     if status:  # the overrides
-        distributed.give_up(status)
+        distributed.exit_all_if_joined(status)
         raise SystemExit(status)
 
 
 def train(config: dict[str, Any], number: int | None) -> int:
-    settings = settle(config)
+    settings = settings_from_config(config)
     options = settings.train
     at = None
     if number is None:
-        at = distributed.position(
+        at = distributed.position_from_options(
             options.coordinator, options.num_processes, options.process_index, options.devices
         )
     with distributed.joined(at):
-        report = Report(Console(quiet=True) if at and at.index else None)
+        report = Reporter(Console(quiet=True) if at and at.index else None)
         folder = session.agree_on_folder(settings, number, report.line)
         env, program = session.prepare(settings)
-        again = command_again(settings, folder)
-        again += f" in each of the {at.count} processes" if at else ""
-        return session.run(Session(settings, folder, env, program, again), report, finish)
+        command = resume_command(settings, folder)
+        command += f" in each of the {at.count} processes" if at else ""
+        return session.run(Session(settings, folder, env, program, command), report, finish)
 
 
-def command_again(settings: Settings, folder: Path) -> str:
-    """The command that continues a run; it names the code of the user's that is to be imported."""
-    names = {"env": settings.env_name, "algo": settings.algo_name}
-    code = [f" {kind}={name}" for kind, name in names.items() if ":" in name]
-    return f"python scripts/train.py resume={shlex.quote(str(folder))}{''.join(code)}"
+def resume_command(settings: Settings, folder: Path) -> str:
+    """The command that continues a run. It names the user's code and files, or they are not read."""
+    words = [f"resume={folder}", *(f"{name}={value}" for name, value in yours(settings).items())]
+    return f"{called('train')} {shlex.join(words)}"

@@ -1,18 +1,16 @@
-"""What scripts/render.py and scripts/watch.py share: their arguments, and the policies named there."""
+"""What the commands render and watch share: their arguments, and the policies named there."""
 
 import argparse
 from pathlib import Path
 from typing import NamedTuple
 
-from jaxsafe.config import ConfigError
-from jaxsafe.run.arguments import fail
+from jaxsafe.config import ConfigError, Index, Seed
+from jaxsafe.run.arguments import fail, number
 from jaxsafe.run.devices import use_compilation_cache
-from jaxsafe.run.policies import Actor, open_run
-
-MAX_SEED = 2**31 - 1
+from jaxsafe.run.policies import CODE, ROBOT, Actor, open_run
 
 
-class What(NamedTuple):
+class Targets(NamedTuple):
     """What there is to look at."""
 
     folders: list[Path]  # of runs
@@ -28,25 +26,23 @@ def parser_of(description: str, what: str, more: str) -> argparse.ArgumentParser
     parser = argparse.ArgumentParser(description=description)
     parser.error = fail  # type: ignore[method-assign]
     parser.add_argument("what", nargs="+", metavar=what, help=more)
-    parser.add_argument("--index", type=int, default=0, help="which of a run's policies (default 0)")
-    parser.add_argument("--seed", type=int, default=1, help="of the (first) episode (default 1)")
+    parser.add_argument("--index", type=number(Index), default=0, help="which of a run's policies (0)")
+    parser.add_argument("--seed", type=number(Seed), default=1, help="of the (first) episode (1)")
     return parser
 
 
-def parse(parser: argparse.ArgumentParser) -> tuple[argparse.Namespace, What]:
+def parse(parser: argparse.ArgumentParser) -> tuple[argparse.Namespace, Targets]:
     args = parser.parse_args()
     use_compilation_cache()
-    if not 0 <= args.seed <= MAX_SEED:
-        raise ConfigError(f"--seed {args.seed}: expected 0 to {MAX_SEED}")
     options = [text for text in args.what if is_option(text)]
     folders = [Path(text).expanduser() for text in args.what if text not in options]
     for text in options if folders else ():
-        if not text.startswith(("env=", "algo=")):
+        if not text.startswith(("env=", "algo=", f"{ROBOT}=")):
             raise ConfigError(
-                f"{text}: with a run, expected env=MODULE:NAME alone, or algo=MODULE:NAME, if its "
-                "environment or algorithm is yours"
+                f"{text}: with a run, expected {' or '.join(CODE)}, if its environment, algorithm or "
+                "robot is yours"
             )
-    return args, What(folders, options)
+    return args, Targets(folders, options)
 
 
 def is_option(text: str) -> bool:

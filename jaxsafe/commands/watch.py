@@ -1,13 +1,14 @@
-"""scripts/watch.py: watch a policy as it acts, or drive a robot."""
+"""The command watch: watch a policy as it acts, or drive a robot."""
 
 import contextlib
 
 from jaxsafe.commands import viewing
 from jaxsafe.commands.guard import guarded
-from jaxsafe.config import ConfigError, one_line
+from jaxsafe.commands.jaxsafe import called
+from jaxsafe.config import ConfigError, Port, one_line
 from jaxsafe.envs.view import watch
 from jaxsafe.report.film import NoVideo
-from jaxsafe.run.arguments import compose
+from jaxsafe.run.arguments import compose, number
 from jaxsafe.run.settings import make_env
 
 
@@ -23,12 +24,12 @@ def command() -> int:
         "a run folder; or a task to drive, and options of it: env=car_goal1 env.vases_num=5",
     )
     parser.add_argument("--page", action="store_true", help="a page, though there is a display")
-    parser.add_argument("--port", type=int, default=8080, help="of the page (default 8080)")
+    parser.add_argument("--port", type=number(Port), default=8080, help="of the page (default 8080)")
     parser.add_argument("--open", action="store_true", help="open the page in a browser here")
     args, what = viewing.parse(parser)
     if len(what.folders) > 1:
         raise ConfigError(
-            f"{what.folders[1]}: expected one run, or env=NAME; side by side: python scripts/render.py"
+            f"{what.folders[1]}: expected one run, or env=NAME; side by side: {called('render')}"
         )
     page = args.page or args.open or not watch.has_display()
     if page:
@@ -45,7 +46,7 @@ def command() -> int:
     print(f"{title}: compiling a step ...", flush=True)
     try:
         with contextlib.suppress(KeyboardInterrupt):  # the page's server may have taken it
-            session = watch.Session(env, player, args.seed)  # type: ignore[arg-type]
+            session = watch.Playback(env, player, args.seed)  # type: ignore[arg-type]
             if page:
                 watch.serve_page(session, title, args.port, args.open)
             else:

@@ -1,6 +1,7 @@
-"""Our environments for Gymnasium: importing this module registers each as 'jaxsafe/<name>'.
+"""Our environments for Gymnasium: importing this module registers each under two ids.
 
     gymnasium.make("jaxsafe.interop.gymnasium:jaxsafe/point_goal1")
+    gymnasium.make("jaxsafe.interop.gymnasium:jaxsafe/PointGoal1-v0")
     gymnasium.make_vec("jaxsafe.interop.gymnasium:jaxsafe/point_goal1", num_envs=8)
 
 The cost of a step is `info["cost"]`, that of each constraint `info["cost_<name>"]`. `SixTuple` and
@@ -10,6 +11,7 @@ program; for speed take `make_vec`, and for more speed stay in JAX.
 
 import dataclasses
 import functools
+import os
 from typing import Any
 
 import jax
@@ -23,14 +25,32 @@ from jaxsafe.types import Env, State
 
 try:
     import gymnasium
+    from gymnasium.envs.registration import EnvSpec
 except ModuleNotFoundError as error:
     raise ConfigError("Gymnasium is not installed: pip install 'jaxsafe[gymnasium]'") from error
 
 Info = dict[str, Any]
 Array = np.ndarray
+PROCESS = os.getpid()  # a forked one inherits this number, with JAX's threads gone
 
 
-class GymEnv(gymnasium.Env):
+class Specified:
+    """Has `spec`, which Gymnasium sets, and adds the time limit, which is ours, to it."""
+
+    env: Env
+    _spec: EnvSpec | None = None
+
+    @property
+    def spec(self) -> Any:
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: Any) -> None:
+        limit = self.env.episode_length
+        self._spec = spec and dataclasses.replace(spec, max_episode_steps=limit)
+
+
+class GymEnv(Specified, gymnasium.Env):
     """One environment.
 
     Observation: float32 [obs_size], unbounded. Action: float32 [action_size] in [-1, 1]. The time limit
@@ -71,7 +91,7 @@ class GymEnv(gymnasium.Env):
         return self._draw.frame(jax.device_get(self._state)) if self._draw else None
 
 
-class GymVectorEnv(gymnasium.vector.VectorEnv):
+class GymVectorEnv(Specified, gymnasium.vector.VectorEnv):
     """N environments in one program.
 
     An episode that ends begins anew in the same step (`AutoresetMode.SAME_STEP`), with a layout of
@@ -128,18 +148,34 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
 
 
 class SixTuple(gymnasium.Wrapper):
-    """Safety-Gymnasium's step: obs, reward, cost, terminated, truncated, info."""
+    """Safety-Gymnasium's step: obs, reward, cost, terminated, truncated, info.
+
+    With `autoreset` an episode that ends begins anew in the same step, and `info` has the last
+    observation and info of the old one as `final_observation` and `final_info`.
+    """
+
+    def __init__(self, env: gymnasium.Env, autoreset: bool = False):
+        super().__init__(env)
+        self.autoreset = autoreset
 
     def step(self, action: Any) -> Any:
         obs, reward, terminated, truncated, info = self.env.step(action)
-        return obs, reward, info["cost"], terminated, truncated, info
+        cost = info["cost"]
+        if self.autoreset and (terminated or truncated):
+            last = {"final_observation": obs, "final_info": info}
+            obs, info = self.env.reset()
+            info = info | last
+        return obs, reward, cost, terminated, truncated, info
 
 
 class SixTupleVector(gymnasium.vector.VectorWrapper):
-    """The same for a `VectorEnv`."""
+    """The same for a `VectorEnv`: `final_observation` is `final_obs` by Safety-Gymnasium's name."""
 
     def step(self, actions: Any) -> Any:
         obs, rewards, terminated, truncated, info = self.env.step(actions)
+        if "final_obs" in info:
+            final = {"final_observation": info["final_obs"], "_final_observation": info["_final_obs"]}
+            info = info | final
         return obs, rewards, info["cost"], terminated, truncated, info
 
 
@@ -147,6 +183,11 @@ class SixTupleVector(gymnasium.vector.VectorWrapper):
 
 
 def built(env: Env | str, options: dict[str, Any]) -> Env:
+    if os.getpid() != PROCESS:
+        raise ConfigError(
+            "JAX does not work in a forked process: give AsyncVectorEnv(..., context='spawn') or, "
+            "faster, take GymVectorEnv"
+        )
     if isinstance(env, str):
         return envs.make(env, **options)
     if options:
@@ -198,10 +239,11 @@ def advance(
     return restart(env, rollout, state.terminated | truncated, key), state, state.terminated, truncated
 
 
-for _name in envs.ALIASES.values():
-    gymnasium.register(
-        f"jaxsafe/{_name}",
-        entry_point="jaxsafe.interop.gymnasium:GymEnv",
-        vector_entry_point="jaxsafe.interop.gymnasium:GymVectorEnv",
-        kwargs={"env": _name},
-    )
+for _alias, _name in envs.ALIASES.items():
+    for _id in (_name, _alias.removeprefix("Safexp-")):
+        gymnasium.register(
+            f"jaxsafe/{_id}",
+            entry_point="jaxsafe.interop.gymnasium:GymEnv",
+            vector_entry_point="jaxsafe.interop.gymnasium:GymVectorEnv",
+            kwargs={"env": _name},
+        )

@@ -1,7 +1,7 @@
 """From a config of OmniSafe, or of Safety Gym's Engine, to the command line that does the same here.
 
-    python scripts/migrate.py omnisafe CONFIG.json|.yaml [--algo PPOLag] [--env SafetyPointGoal1-v0]
-    python scripts/migrate.py safety_gym CONFIG.json|.yaml
+    jaxsafe migrate omnisafe CONFIG.json|.yaml [--algo PPOLag] [--env SafetyPointGoal1-v0]
+    jaxsafe migrate safety_gym CONFIG.json|.yaml
 
 The command goes to stdout, what became of every key to stderr. Of OmniSafe it takes the config.json
 of a run, a file of its configs/on-policy, or a part of either; what a file leaves out has OmniSafe's
@@ -21,10 +21,10 @@ from typing import Any, NamedTuple
 import yaml
 
 from jaxsafe import algos, envs
-from jaxsafe.config import ConfigError, convert, from_dict, nearest, one_line
+from jaxsafe.config import Amount, ConfigError, convert, from_dict, nearest, one_line
 from jaxsafe.envs.safety_gym import suite
+from jaxsafe.envs.safety_gym.config import config_from_plain as read_config
 from jaxsafe.envs.safety_gym.config import defaults
-from jaxsafe.envs.safety_gym.config import read as read_config
 from jaxsafe.run.settings import algo_options, as_text
 
 MISSING = {  # OmniSafe's others
@@ -65,16 +65,13 @@ class Facts(NamedTuple):
         }
 
     def whole(self, key: str, default: int) -> int:
-        value = convert(self.values.get(key, default), int, key)
-        if value < 1:
-            raise ConfigError(f"{key}={value}: expected at least 1")
-        return value
+        return convert(self.values.get(key, default), Amount, key)
 
 
-Turn = Callable[[Any, Facts], dict[str, Any] | None]
+Translate = Callable[[Any, Facts], dict[str, Any] | None]
 
 
-class Key(NamedTuple):
+class Rule(NamedTuple):
     """What becomes of a key of OmniSafe.
 
     ours: the options, separated by spaces; '' if there is none. note: how, or why not.
@@ -85,24 +82,24 @@ class Key(NamedTuple):
 
     ours: str = ""
     note: str = ""
-    turn: Turn | None = None
+    turn: Translate | None = None
     same: tuple[Any, ...] | None = ()
 
 
-def batch(names: str) -> Turn:
+def batch(names: str) -> Translate:
     return lambda value, facts: {k: v for k, v in facts.batch().items() if k in names.split()}
 
 
-def unless_on(option: str, off: float) -> Turn:
+def unless_on(option: str, off: float) -> Translate:
     """For OmniSafe's switches: on, another key says how much."""
     return lambda on, facts: {} if on else {option: off}
 
 
-def one_of(option: str, names: dict[str, str]) -> Turn:
+def one_of(option: str, names: dict[str, str]) -> Translate:
     return lambda value, facts: {option: names[value]} if value in names else None
 
 
-def without_trust_region(turn: Turn) -> Turn:
+def without_trust_region(turn: Translate) -> Translate:
     return lambda value, facts: {} if facts.trust_region else turn(value, facts)
 
 
@@ -120,57 +117,57 @@ def budget(value: Any, facts: Facts) -> dict[str, Any]:
 
 DEFAULTS = "preset=published compat=omnisafe"  # OmniSafe's settings, and its conventions
 NETWORK = "one option for policy and critics"
-OMNISAFE: dict[str, Key] = {  # later keys win
-    "algo": Key("algo", "see the names"),
-    "env_id": Key("env env.rules", "see the names"),
-    "exp_name": Key("", "run_dir names a run's folder", same=None),
-    "exp_increment_cfgs": Key("", "a copy of what was changed, for OmniSafe's records", same=None),
-    "seed": Key("seed", "num_seeds=8 trains 8 at once"),
-    "train_cfgs.device": Key(
+OMNISAFE: dict[str, Rule] = {  # later keys win
+    "algo": Rule("algo", "see the names"),
+    "env_id": Rule("env env.rules", "see the names"),
+    "exp_name": Rule("", "run_dir names a run's folder", same=None),
+    "exp_increment_cfgs": Rule("", "a copy of what was changed, for OmniSafe's records", same=None),
+    "seed": Rule("seed", "num_seeds=8 trains 8 at once"),
+    "train_cfgs.device": Rule(
         "", "JAX takes a GPU if there is one; JAX_PLATFORMS=cpu forbids", same=None
     ),
-    "train_cfgs.torch_threads": Key("", "XLA takes the cores there are", same=None),
-    "train_cfgs.vector_env_nums": Key("", "num_envs follows from steps_per_epoch", same=None),
-    "train_cfgs.parallel": Key("", "devices=N splits one program over N devices", same=(1,)),
-    "train_cfgs.total_steps": Key("total_steps"),
-    "train_cfgs.epochs": Key("", "total_steps / steps_per_epoch", same=None),
-    "algo_cfgs.steps_per_epoch": Key(
+    "train_cfgs.torch_threads": Rule("", "XLA takes the cores there are", same=None),
+    "train_cfgs.vector_env_nums": Rule("", "num_envs follows from steps_per_epoch", same=None),
+    "train_cfgs.parallel": Rule("", "devices=N splits one program over N devices", same=(1,)),
+    "train_cfgs.total_steps": Rule("total_steps"),
+    "train_cfgs.epochs": Rule("", "total_steps / steps_per_epoch", same=None),
+    "algo_cfgs.steps_per_epoch": Rule(
         "num_envs algo.horizon algo.minibatches algo.cost_window",
         "whole episodes of 1,000 steps, side by side",
         batch("num_envs algo.horizon algo.minibatches algo.cost_window"),
     ),
-    "algo_cfgs.batch_size": Key(
+    "algo_cfgs.batch_size": Rule(
         "algo.minibatches",
         "steps_per_epoch / batch_size, made a divisor of the batch",
         batch("algo.minibatches"),
     ),
-    "algo_cfgs.update_iters": Key(
+    "algo_cfgs.update_iters": Rule(
         "algo.epochs algo.critic_epochs", "with trust regions of the critics alone", passes
     ),
-    "algo_cfgs.target_kl": Key("algo.target_kl", "of trust regions per action, as there"),
-    "algo_cfgs.kl_early_stop": Key(
+    "algo_cfgs.target_kl": Rule("algo.target_kl", "of trust regions per action, as there"),
+    "algo_cfgs.kl_early_stop": Rule(
         "algo.target_kl",
         "false is inf; trust regions never stop early",
         without_trust_region(unless_on("algo.target_kl", math.inf)),
     ),
-    "algo_cfgs.entropy_coef": Key("algo.entropy_coef"),
-    "algo_cfgs.obs_normalize": Key("algo.obs_normalize"),
-    "algo_cfgs.reward_normalize": Key("algo.reward_normalize"),
-    "algo_cfgs.cost_normalize": Key("algo.cost_normalize"),
-    "algo_cfgs.max_grad_norm": Key("algo.max_grad_norm"),
-    "algo_cfgs.use_max_grad_norm": Key(
+    "algo_cfgs.entropy_coef": Rule("algo.entropy_coef"),
+    "algo_cfgs.obs_normalize": Rule("algo.obs_normalize"),
+    "algo_cfgs.reward_normalize": Rule("algo.reward_normalize"),
+    "algo_cfgs.cost_normalize": Rule("algo.cost_normalize"),
+    "algo_cfgs.max_grad_norm": Rule("algo.max_grad_norm"),
+    "algo_cfgs.use_max_grad_norm": Rule(
         "algo.max_grad_norm", "false is inf", unless_on("algo.max_grad_norm", math.inf)
     ),
-    "algo_cfgs.critic_norm_coef": Key("algo.critic_norm_coef"),
-    "algo_cfgs.use_critic_norm": Key(
+    "algo_cfgs.critic_norm_coef": Rule("algo.critic_norm_coef"),
+    "algo_cfgs.use_critic_norm": Rule(
         "algo.critic_norm_coef", "false is 0", unless_on("algo.critic_norm_coef", 0.0)
     ),
-    "algo_cfgs.gamma": Key("algo.discount algo.cost_discount", "OmniSafe has one for both"),
-    "algo_cfgs.cost_gamma": Key("", "OmniSafe does not read it", same=None),
-    "algo_cfgs.lam": Key("algo.gae_lambda"),
-    "algo_cfgs.lam_c": Key("algo.cost_gae_lambda"),
-    "algo_cfgs.clip": Key("algo.clip"),
-    "algo_cfgs.adv_estimation_method": Key(
+    "algo_cfgs.gamma": Rule("algo.discount algo.cost_discount", "OmniSafe has one for both"),
+    "algo_cfgs.cost_gamma": Rule("", "OmniSafe does not read it", same=None),
+    "algo_cfgs.lam": Rule("algo.gae_lambda"),
+    "algo_cfgs.lam_c": Rule("algo.cost_gae_lambda"),
+    "algo_cfgs.clip": Rule("algo.clip"),
+    "algo_cfgs.adv_estimation_method": Rule(
         "algo.estimator",
         "gae, plain and vtrace; gae-rtg is gae_rtg",
         one_of(
@@ -178,82 +175,84 @@ OMNISAFE: dict[str, Key] = {  # later keys win
             {"gae": "gae", "gae-rtg": "gae_rtg", "plain": "plain", "vtrace": "vtrace"},
         ),
     ),
-    "algo_cfgs.standardized_rew_adv": Key("", "reward advantages always are", same=(True,)),
-    "algo_cfgs.standardized_cost_adv": Key("", "cost advantages are always centred", same=(True,)),
-    "algo_cfgs.penalty_coef": Key(
+    "algo_cfgs.standardized_rew_adv": Rule("", "reward advantages always are", same=(True,)),
+    "algo_cfgs.standardized_cost_adv": Rule("", "cost advantages are always centred", same=(True,)),
+    "algo_cfgs.penalty_coef": Rule(
         "", "algo=ppo_penalty has a fixed price, on advantages instead of rewards", same=(0,)
     ),
-    "algo_cfgs.use_cost": Key("", "the algorithm decides", same=None),
-    "algo_cfgs.cg_damping": Key("algo.damping"),
-    "algo_cfgs.cg_iters": Key("algo.cg_iterations"),
-    "algo_cfgs.fvp_sample_freq": Key("", "the Fisher matrix is of all samples", same=(1,)),
-    "algo_cfgs.fvp_obs": Key("", "the Fisher matrix is of the batch", same=None),
-    "algo_cfgs.cost_limit": Key("algo.cost_limit"),
-    "algo_cfgs.distance": Key("algo.tolerance"),
-    "algo_cfgs.focops_lam": Key("algo.temperature"),
-    "algo_cfgs.focops_eta": Key("algo.near_kl"),
-    "algo_cfgs.kappa": Key("algo.kappa algo.barrier", "kappa of P3O, barrier of IPO"),
-    "algo_cfgs.penalty_max": Key("algo.price_max"),
-    "algo_cfgs.saute_gamma": Key("algo.saute_discount"),
-    "algo_cfgs.unsafe_reward": Key("algo.unsafe_reward"),
-    "algo_cfgs.max_ep_len": Key("", "a budget is for env.num_steps", same=(EPISODE,)),
-    "algo_cfgs.upper_budget": Key("algo.cost_limit"),
-    "algo_cfgs.safety_budget": Key(
+    "algo_cfgs.use_cost": Rule("", "the algorithm decides", same=None),
+    "algo_cfgs.cg_damping": Rule("algo.damping"),
+    "algo_cfgs.cg_iters": Rule("algo.cg_iterations"),
+    "algo_cfgs.fvp_sample_freq": Rule("", "the Fisher matrix is of all samples", same=(1,)),
+    "algo_cfgs.fvp_obs": Rule("", "the Fisher matrix is of the batch", same=None),
+    "algo_cfgs.cost_limit": Rule("algo.cost_limit"),
+    "algo_cfgs.distance": Rule("algo.tolerance"),
+    "algo_cfgs.focops_lam": Rule("algo.temperature"),
+    "algo_cfgs.focops_eta": Rule("algo.near_kl"),
+    "algo_cfgs.kappa": Rule("algo.kappa algo.barrier", "kappa of P3O, barrier of IPO"),
+    "algo_cfgs.penalty_max": Rule("algo.price_max"),
+    "algo_cfgs.saute_gamma": Rule("algo.saute_discount"),
+    "algo_cfgs.unsafe_reward": Rule("algo.unsafe_reward"),
+    "algo_cfgs.max_ep_len": Rule("", "a budget is for env.num_steps", same=(EPISODE,)),
+    "algo_cfgs.upper_budget": Rule("algo.cost_limit"),
+    "algo_cfgs.safety_budget": Rule(
         "algo.cost_limit algo.budget_init", "of Simmer a share of upper_budget", budget
     ),
-    "control_cfgs.kp": Key("algo.simmer_kp"),
-    "control_cfgs.ki": Key("algo.simmer_ki"),
-    "control_cfgs.kd": Key("algo.simmer_kaw", "it acts against wind-up"),
-    "control_cfgs.polyak": Key("algo.simmer_smoothing"),
-    "logger_cfgs.use_wandb": Key("", "metrics.csv and TensorBoard files", same=(False,)),
-    "logger_cfgs.wandb_project": Key("", "metrics.csv and TensorBoard files", same=None),
-    "logger_cfgs.use_tensorboard": Key("", "always written", same=(True,)),
-    "logger_cfgs.save_model_freq": Key("", "a run is saved each minute, whole, for resume", same=None),
-    "logger_cfgs.log_dir": Key("", "run_dir names a run's folder; default runs/ENV-ALGO/", same=None),
-    "logger_cfgs.window_lens": Key(
+    "control_cfgs.kp": Rule("algo.simmer_kp"),
+    "control_cfgs.ki": Rule("algo.simmer_ki"),
+    "control_cfgs.kd": Rule("algo.simmer_kaw", "it acts against wind-up"),
+    "control_cfgs.polyak": Rule("algo.simmer_smoothing"),
+    "logger_cfgs.use_wandb": Rule("", "metrics.csv and TensorBoard files", same=(False,)),
+    "logger_cfgs.wandb_project": Rule("", "metrics.csv and TensorBoard files", same=None),
+    "logger_cfgs.use_tensorboard": Rule("", "always written", same=(True,)),
+    "logger_cfgs.save_model_freq": Rule("", "a run is saved each minute, whole, for resume", same=None),
+    "logger_cfgs.log_dir": Rule("", "run_dir names a run's folder; default runs/ENV-ALGO/", same=None),
+    "logger_cfgs.window_lens": Rule(
         "algo.cost_window", "in episodes there, in iterations here", batch("algo.cost_window")
     ),
-    "model_cfgs.weight_initialization_mode": Key(
+    "model_cfgs.weight_initialization_mode": Rule(
         "algo.init",
         "kaiming_uniform is torch",
         one_of("algo.init", {"kaiming_uniform": "torch", "orthogonal": "orthogonal"}),
     ),
-    "model_cfgs.actor_type": Key("", "a Gaussian with a learnt deviation", same=("gaussian_learning",)),
-    "model_cfgs.linear_lr_decay": Key(
+    "model_cfgs.actor_type": Rule(
+        "", "a Gaussian with a learnt deviation", same=("gaussian_learning",)
+    ),
+    "model_cfgs.linear_lr_decay": Rule(
         "algo.lr_decay",
         "trust regions have no rate",
         without_trust_region(lambda on, facts: {"algo.lr_decay": on}),
     ),
-    "model_cfgs.exploration_noise_anneal": Key("", "the deviation is learnt", same=(False,)),
-    "model_cfgs.std_range": Key("", "only read with exploration_noise_anneal", same=None),
-    "model_cfgs.critic.hidden_sizes": Key("algo.hidden", NETWORK),
-    "model_cfgs.actor.hidden_sizes": Key("algo.hidden", NETWORK),
-    "model_cfgs.critic.activation": Key(
+    "model_cfgs.exploration_noise_anneal": Rule("", "the deviation is learnt", same=(False,)),
+    "model_cfgs.std_range": Rule("", "only read with exploration_noise_anneal", same=None),
+    "model_cfgs.critic.hidden_sizes": Rule("algo.hidden", NETWORK),
+    "model_cfgs.actor.hidden_sizes": Rule("algo.hidden", NETWORK),
+    "model_cfgs.critic.activation": Rule(
         "algo.activation", NETWORK, one_of("algo.activation", {"tanh": "tanh", "relu": "relu"})
     ),
-    "model_cfgs.actor.activation": Key(
+    "model_cfgs.actor.activation": Rule(
         "algo.activation", NETWORK, one_of("algo.activation", {"tanh": "tanh", "relu": "relu"})
     ),
-    "model_cfgs.actor.lr": Key(
+    "model_cfgs.actor.lr": Rule(
         "algo.lr",
         "trust regions have none",
         without_trust_region(lambda lr, facts: {"algo.lr": lr}),
     ),
-    "model_cfgs.critic.lr": Key("algo.critic_lr"),
-    "lagrange_cfgs.cost_limit": Key("algo.cost_limit"),
-    "lagrange_cfgs.lagrangian_multiplier_init": Key("algo.lam_init"),
-    "lagrange_cfgs.lambda_lr": Key("algo.dual_lr"),
-    "lagrange_cfgs.lambda_optimizer": Key("", "always Adam", same=("Adam",)),
-    "lagrange_cfgs.lagrangian_upper_bound": Key("algo.lam_max"),
-    "lagrange_cfgs.pid_kp": Key("algo.pid_kp"),
-    "lagrange_cfgs.pid_ki": Key("algo.pid_ki"),
-    "lagrange_cfgs.pid_kd": Key("algo.pid_kd"),
-    "lagrange_cfgs.pid_delta_d_ema_alpha": Key("algo.pid_smoothing", "one for both"),
-    "lagrange_cfgs.pid_delta_p_ema_alpha": Key("algo.pid_smoothing", "one for both"),
-    "lagrange_cfgs.pid_d_delay": Key("algo.pid_delay"),
-    "lagrange_cfgs.sum_norm": Key("", "always (A_r - lam A_c) / (1 + lam)", same=(True,)),
-    "lagrange_cfgs.diff_norm": Key("", "always (A_r - lam A_c) / (1 + lam)", same=(False,)),
-    "lagrange_cfgs.penalty_max": Key("", "OmniSafe does not read it with sum_norm", same=None),
+    "model_cfgs.critic.lr": Rule("algo.critic_lr"),
+    "lagrange_cfgs.cost_limit": Rule("algo.cost_limit"),
+    "lagrange_cfgs.lagrangian_multiplier_init": Rule("algo.lam_init"),
+    "lagrange_cfgs.lambda_lr": Rule("algo.dual_lr"),
+    "lagrange_cfgs.lambda_optimizer": Rule("", "always Adam", same=("Adam",)),
+    "lagrange_cfgs.lagrangian_upper_bound": Rule("algo.lam_max"),
+    "lagrange_cfgs.pid_kp": Rule("algo.pid_kp"),
+    "lagrange_cfgs.pid_ki": Rule("algo.pid_ki"),
+    "lagrange_cfgs.pid_kd": Rule("algo.pid_kd"),
+    "lagrange_cfgs.pid_delta_d_ema_alpha": Rule("algo.pid_smoothing", "one for both"),
+    "lagrange_cfgs.pid_delta_p_ema_alpha": Rule("algo.pid_smoothing", "one for both"),
+    "lagrange_cfgs.pid_d_delay": Rule("algo.pid_delay"),
+    "lagrange_cfgs.sum_norm": Rule("", "always (A_r - lam A_c) / (1 + lam)", same=(True,)),
+    "lagrange_cfgs.diff_norm": Rule("", "always (A_r - lam A_c) / (1 + lam)", same=(False,)),
+    "lagrange_cfgs.penalty_max": Rule("", "OmniSafe does not read it with sum_norm", same=None),
 }
 
 OURS_ALONE = ("rules", "awake", "contact_room")  # options that Engine does not have
@@ -316,16 +315,16 @@ def omnisafe(config: dict[str, Any], algo: str = "", env: str = "") -> Migrated:
         if not fits:
             lines.append(Line(key, value, f"{name} has no {' or '.join(turned)}", lost=True))
             continue
-        replaced = [written(k, found[k]) for k, v in fits.items() if found.get(k, v) != v]
+        replaced = [as_option(k, found[k]) for k, v in fits.items() if found.get(k, v) != v]
         found |= fits
-        text = " ".join(written(k, v) for k, v in fits.items())
+        text = " ".join(as_option(k, v) for k, v in fits.items())
         lines.append(Line(key, value, text + "".join(f" in place of {r}" for r in replaced)))
     checked = from_dict(
         row.config, {k[5:]: v for k, v in found.items() if k.startswith("algo.")}, "algo."
     )
     for key, value in found.items():
         found[key] = getattr(checked, key[5:]) if key.startswith("algo.") else convert(value, int, key)
-    changed = [written(k, v) for k, v in found.items() if v != start[k]]
+    changed = [as_option(k, v) for k, v in found.items() if v != start[k]]
     return Migrated([*target, f"algo={name}", *DEFAULTS.split(), *changed], lines)
 
 
@@ -389,8 +388,8 @@ def safety_gym(config: dict[str, Any]) -> Migrated:
         return "task" in found, "robot_base" in found, len(found)
 
     name = min(suite.suite(), key=distance)
-    argv = [f"env={name}", *(written(f"env.{k}", v) for k, v in differences(name).items())]
-    lines += [Line(k, config[k], written(f"env.{k}", options[k])) for k in config]
+    argv = [f"env={name}", *(as_option(f"env.{k}", v) for k, v in differences(name).items())]
+    lines += [Line(k, config[k], as_option(f"env.{k}", options[k])) for k in config]
     return Migrated(argv, lines)
 
 
@@ -405,12 +404,12 @@ def flatten(tree: Any, head: str = "") -> dict[str, Any]:
     return found
 
 
-def written(key: str, value: Any) -> str:
+def as_option(key: str, value: Any) -> str:
     """An option as train.py reads it."""
     return f"{key}={as_text(value)}"
 
 
-def read(path: Path) -> dict[str, Any]:
+def read_file(path: Path) -> dict[str, Any]:
     """A .json or .yaml file. Executes nothing from it."""
     try:
         text = path.read_text()

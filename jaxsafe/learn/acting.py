@@ -1,18 +1,17 @@
 """Playing a policy: what training, evaluation, films, the live view and adapters have in common."""
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import flax.struct
 import jax
-import jax.numpy as jnp
 
+from jaxsafe.learn.batch import select_rows
 from jaxsafe.types import Env, Policy, PyTree, State
 
 
 @flax.struct.dataclass
 class Learned:
-    """What acts: `config`, `params`, `dual` and `normaliser` of a train state."""
+    """The policy's parameters: `config`, `params`, `dual` and `normaliser` of a train state."""
 
     config: Any
     params: dict[str, PyTree]
@@ -21,7 +20,7 @@ class Learned:
 
 
 def learned_of(ts: Any) -> Learned:
-    """What acts, of a train state that has its fields."""
+    """The policy's parameters, of a train state that has these fields."""
     return Learned(ts.config, ts.params, ts.dual, ts.normaliser)
 
 
@@ -44,22 +43,11 @@ class Player(NamedTuple):
         Args:
             key: to sample with; None is the mean action.
         """
-        seen = state if self.policy.privileged else state.obs
-        action, carry, _ = self.policy.act(self.params, carry, seen, key)
+        obs = state if self.policy.privileged else state.obs
+        action, carry, _ = self.policy.act(self.params, carry, obs, key)
         return action, carry
 
 
-def reflex(act: Callable[[jax.Array], jax.Array], task: Env) -> Player:
-    """A player that remembers nothing, from a function: obs [O] -> action [A]."""
-    policy = Policy(lambda params: (), lambda params, carry, obs, key: (act(obs), (), {}))
-    return Player(policy, (), task)
-
-
-def begun_anew(policy: Policy, params: PyTree, carry: PyTree, first: jax.Array) -> PyTree:
-    """`carry` [N, ...] with that of a new episode where `first` [N] holds."""
-    new = policy.init(params)
-
-    def pick(old: jax.Array, start: jax.Array) -> jax.Array:
-        return jnp.where(first.reshape(first.shape + (1,) * (old.ndim - 1)), start, old)
-
-    return jax.tree.map(pick, carry, new)
+def reset_carry(policy: Policy, params: PyTree, carry: PyTree, first: jax.Array) -> PyTree:
+    """`carry` [N, ...], with that of a new episode where `first` [N] holds."""
+    return select_rows(first, policy.init(params), carry)

@@ -7,16 +7,16 @@ networks see, what the learner is paid and where its episodes end may differ.
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from jaxsafe.config import config
+from jaxsafe.config import Bounds, Iterations, Real, Share, Weight, config
 from jaxsafe.learn.conventions import Convention
 from jaxsafe.learn.rollout import Episode, Trajectory, never
 from jaxsafe.learn.treatments import Treatment
-from jaxsafe.types import Env, PyTree, State
+from jaxsafe.types import Count, Env, PyTree, State
 
 MIN_BUDGET = 1e-6  # cost per episode, so that a limit of 0 divides nothing by zero; OmniSafe
 
@@ -37,7 +37,7 @@ class Augmentation(NamedTuple):
     last_obs: Callable[[Trajectory, Any], jax.Array]
 
 
-nothing = Augmentation(
+no_augmentation = Augmentation(
     wrap=lambda env, cfg, dual: env,
     renew=lambda resets, cfg, dual: resets,
     stop=lambda episode, cfg: never(episode),
@@ -102,15 +102,15 @@ class SauteConfig:
     CONVENTIONS: ClassVar = (
         Convention(
             {"full_at_end": True},
-            "the value at a time limit is of a full budget, the next episode's",
-            "of what the episode left",
+            "at a time limit, the value is that of a full budget, which is the next episode's",
+            "the value is that of the budget that the episode left",
         ),
     )
 
     # gamma_n, the discount of the budget, as OmniSafe's on Goal and Circle. On Button it has 0.999.
-    saute_discount: float = 0.9999
+    saute_discount: Annotated[float, Bounds(0.01, 1)] = 0.9999
     # n, the reward of a step that ends without budget, as OmniSafe's on Goal. On Button it has -1.
-    unsafe_reward: float = -0.2
+    unsafe_reward: Real = -0.2
     # Whether the value at a time limit is that of a full budget, z = 1. OmniSafe's is.
     full_at_end: bool = False
 
@@ -132,7 +132,7 @@ def last_budget(traj: Trajectory, cfg: Any) -> jax.Array:
 
 # Sootla et al. (2022), "Saute RL: Almost Surely Safe Reinforcement Learning Using State
 # Augmentation", arXiv:2202.06558, section 3; the scale of the budget is from their code
-saute = nothing._replace(
+saute = no_augmentation._replace(
     wrap=lambda env, cfg, dual: Budget(env, 1.0, full_budget(env, cfg), cfg.saute_discount),
     reward=safe_reward,
     last_obs=last_budget,
@@ -161,24 +161,24 @@ class SimmerConfig(SauteConfig):
     CONVENTIONS: ClassVar = (
         Convention(
             {"simmer_adds": True, "simmer_full": True, **OMNISAFE_SIMMER},
-            "the controller's u is added to the last budget, with small gains, and episodes (but the "
-            "first of 20) start with z = 1, the share of it",
-            "u is added to the scheduled budget, with larger ones, and z is a share of the whole one",
+            "the controller's u is added to the last budget, with small gains; z is the share of that "
+            "budget which is left, and all but the first of 20 episodes start with z = 1",
+            "u is added to the scheduled budget, with larger gains; z is a share of the whole budget",
         ),
     )
 
     # The budget d at the start, as a share of cost_limit. The authors' pendulum has 0.57.
-    budget_init: float = 0.5
+    budget_init: Share = 0.5
     # Iterations until d is cost_limit. The authors' d arrives in the last sixth of training.
-    budget_ramp: float = 200.0
+    budget_ramp: Annotated[float, Bounds(1, 1e9)] = 200.0
     # The most that u changes the budget, as a share of cost_limit. The authors' pendulum has 0.14.
-    budget_reach: float = 0.15
-    simmer_kp: float = 0.1  # K_p, the gain of the smoothed error.
-    simmer_ki: float = 0.01  # K_i, the gain of the sum of errors. The authors have 0.005 to 0.04.
+    budget_reach: Share = 0.15
+    simmer_kp: Weight = 0.1  # K_p, the gain of the smoothed error.
+    simmer_ki: Weight = 0.01  # K_i, the gain of the sum of errors. The authors have 0.005 to 0.04.
     # K_aw, the gain of what clipping took from the last u. The authors have 0 to 0.04.
-    simmer_kaw: float = 0.01
-    simmer_smoothing: float = 0.9  # Share of the past in the error. The authors have 0 to 0.999.
-    simmer_window: int = 100  # Errors in the sum, as in the authors' code.
+    simmer_kaw: Weight = 0.01
+    simmer_smoothing: Share = 0.9  # Share of the past in the error. The authors have 0 to 0.999.
+    simmer_window: Iterations = 100  # Errors in the sum, as in the authors' code.
     simmer_adds: bool = False  # Whether u is added to the last B, not to d. OmniSafe's is.
     # Whether z is the share of B that is left, and starts at 1. OmniSafe's does.
     simmer_full: bool = False
@@ -190,10 +190,9 @@ class Schedule(NamedTuple):
     budget: jax.Array  # float [], B, what a new episode may cost
     errors: jax.Array  # float [simmer_window], smoothed d - J_c, oldest first
     clipped: jax.Array  # float [], what clipping added to the last u
-    iteration: jax.Array  # int32 [], updates so far
 
 
-def reference(iteration: jax.Array | int, cfg: Any) -> jax.Array:
+def reference(iteration: Count, cfg: Any) -> jax.Array:
     """d, the budget that is aimed at: a line from budget_init cost_limit to cost_limit."""
     done = jnp.clip(iteration / jnp.maximum(cfg.budget_ramp, 1.0), 0.0, 1.0)
     return cfg.cost_limit * (cfg.budget_init + (1 - cfg.budget_init) * done)
@@ -201,12 +200,12 @@ def reference(iteration: jax.Array | int, cfg: Any) -> jax.Array:
 
 def init_schedule(cfg: Any) -> Schedule:
     budget = jnp.maximum(reference(0, cfg), MIN_BUDGET)
-    return Schedule(budget, jnp.zeros(cfg.simmer_window), jnp.zeros(()), jnp.int32(0))
+    return Schedule(budget, jnp.zeros(cfg.simmer_window), jnp.zeros(()))
 
 
-def control_budget(dual: Schedule, episode_cost: jax.Array, cfg: Any) -> Schedule:
+def control_budget(dual: Schedule, episode_cost: jax.Array, cfg: Any, iteration: Count) -> Schedule:
     """B = d + u, u = K_p e + K_i sum e + K_aw (u' - u'_raw), from the error e = d - J_c, smoothed."""
-    d = dual.budget if cfg.simmer_adds else reference(dual.iteration + 1, cfg)
+    d = dual.budget if cfg.simmer_adds else reference(iteration + 1, cfg)
     past = cfg.simmer_smoothing
     error = past * dual.errors[-1] + (1 - past) * (d - episode_cost)
     errors = jnp.append(dual.errors[1:], error)
@@ -215,7 +214,7 @@ def control_budget(dual: Schedule, episode_cost: jax.Array, cfg: Any) -> Schedul
     budget = jnp.clip(
         d + jnp.clip(raw, -reach, reach), MIN_BUDGET, jnp.maximum(cfg.cost_limit, MIN_BUDGET)
     )
-    return Schedule(budget, errors, budget - d - raw, dual.iteration + 1)
+    return Schedule(budget, errors, budget - d - raw)
 
 
 # Sootla et al. (2022), "Effects of Safety State Augmentation on Safe Exploration",
@@ -256,13 +255,13 @@ class EarlyConfig:
     CONVENTIONS: ClassVar = (
         Convention(
             {"keep_cost": True},
-            "the cost that ends an episode is counted on from the last one, if time ended that",
-            "each episode's own",
+            "the count of cost that ends an episode is not set back by a time limit",
+            "each episode counts its own cost",
         ),
     )
 
-    termination_reward: float = 0.0  # r_e, the reward of the step that breaks the limit.
-    # Whether the count of cost goes on after an episode that time ends. OmniSafe's does.
+    termination_reward: Real = 0.0  # r_e, the reward of the step that breaks the limit.
+    # Whether the count of cost goes on into the next episode after a time limit. OmniSafe's does.
     keep_cost: bool = False
 
 
@@ -272,7 +271,7 @@ def broken(episode: Episode, cfg: Any) -> jax.Array:
 
 
 # Sun et al. (2021), "Safe Exploration by Solving Early Terminated MDP", arXiv:2107.04200
-early = nothing._replace(
+early = no_augmentation._replace(
     stop=broken,
     reward=lambda traj, cfg: jnp.where(broken(traj.episode, cfg), cfg.termination_reward, traj.reward),
 )

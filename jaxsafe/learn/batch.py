@@ -44,6 +44,13 @@ def select(condition: jax.Array, new: PyTree, old: PyTree) -> PyTree:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
 
 
+def select_rows(mask: jax.Array, new: PyTree, old: PyTree) -> PyTree:
+    """`new` where `mask` [N] holds, else `old` [N, ...]; leaves of `new` may broadcast."""
+    return jax.tree.map(
+        lambda a, b: jnp.where(mask.reshape(mask.shape + (1,) * (b.ndim - 1)), a, b), new, old
+    )
+
+
 def all_finite(tree: PyTree) -> jax.Array:
     return jnp.all(jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(tree)]))
 

@@ -1,7 +1,8 @@
 """What is constrained: `cost` under cost_limit or, with cost_limits, named costs, each under its own.
 
 What belongs to the constraint (a limit, a multiplier, J_c) is then float [K] instead of float [], and
-what belongs to it at each step (A_c, the critic's targets) has a last axis K, in the order of `named`.
+what belongs to it at each step (A_c, the critic's targets) has a last axis K, in the order of
+`constrained_costs`.
 """
 
 import dataclasses
@@ -11,7 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxsafe.config import ConfigError, config, nearest
+from jaxsafe.config import ConfigError, Weight, config, nearest
 from jaxsafe.learn.rollout import Trajectory
 from jaxsafe.types import Env, Metrics
 
@@ -23,14 +24,14 @@ class LimitsConfig:
     """For algorithms that take several constraints."""
 
     # Limits of named costs, per episode, in place of `cost_limit`. null: only `cost_limit`.
-    cost_limits: dict[str, float] | None = None
+    cost_limits: dict[str, Weight] | None = None
 
 
-def unnamed(cfg: Any) -> Names:
+def total_cost_alone(cfg: Any) -> Names:
     return ()
 
 
-def named(cfg: Any) -> Names:
+def constrained_costs(cfg: Any) -> Names:
     """The costs under limits of their own, in the order of the alphabet; () for `cost` under one."""
     if cfg.cost_limits is None:
         return ()
@@ -43,27 +44,27 @@ def limit(cfg: Any, names: Names) -> jax.Array:
     return jnp.stack([cfg.cost_limits[name] for name in names]) if names else cfg.cost_limit
 
 
-def own_limits(cfg: Any) -> dict[str, float]:
+def limits_by_name(cfg: Any) -> dict[str, float]:
     """The limits by name, of the config of any algorithm; none where there is but cost_limit."""
     return dict(sorted((dataclasses.asdict(cfg).get("cost_limits") or {}).items()))
 
 
 def limits_of(cfg: Any) -> dict[str, float]:
     """Every limit in force, by name; '' is the name of `cost`."""
-    return own_limits(cfg) or {"": float(cfg.cost_limit)}
+    return limits_by_name(cfg) or {"": float(cfg.cost_limit)}
 
 
-def written(name: str) -> str:
+def cost_title(name: str) -> str:
     """What tables call a cost; '' is the name of `cost`."""
     return f"cost {name}" if name else "cost"
 
 
-def in_words(limits: dict[str, float]) -> str:
+def limits_in_words(limits: dict[str, float]) -> str:
     """'25', or 'hazards 10, vases_contact 5'; '-' of none."""
     return ", ".join(f"{name} {most:.9g}".lstrip() for name, most in limits.items()) or "-"
 
 
-def check_names(names: Iterable[str], env: Env) -> None:
+def check_cost_names(names: Iterable[str], env: Env) -> None:
     for name in names:
         if name not in env.cost_names:
             hint = nearest(name, env.cost_names) if env.cost_names else "; the environment has none"
@@ -80,7 +81,7 @@ def each(fn: Callable, names: Names) -> Callable:
     return jax.vmap(fn, in_axes=-1, out_axes=-1) if names else fn
 
 
-def spread(metrics: Metrics, names: Sequence[str]) -> Metrics:
+def metrics_by_constraint(metrics: Metrics, names: Sequence[str]) -> Metrics:
     """`metrics` with an entry for each constraint in place of those of [K]: train/lam_hazards, ..."""
     out = {}
     for metric, x in metrics.items():

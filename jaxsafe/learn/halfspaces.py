@@ -5,6 +5,9 @@
 Vectors stay where they are: all that is asked for are cosines, gram_ij = e_i.e_j [K, K] and, with a
 unit vector e_g to go along, rho_i = e_g.e_i [K]. There are 2^K sets, each with one K x K system. The
 one that breaks the optimality conditions least is taken, so rounding cannot leave none.
+
+Where two half-spaces are nearly opposed, within about 0.05 rad, `RIDGE` changes the solution itself:
+it then weighs both violations instead of touching both planes.
 """
 
 import itertools
@@ -18,7 +21,7 @@ FAR = 1e6  # a |kappa| from which on all is the same
 HIGHEST = jax.lax.Precision.HIGHEST
 
 
-def on_each_set(gram: jax.Array, v: jax.Array) -> jax.Array:
+def solve_on_every_subset(gram: jax.Array, v: jax.Array) -> jax.Array:
     """The solution of gram x = v within each set of indices, 0 outside: float [2^K, K]."""
     active = np.array(list(itertools.product((False, True), repeat=len(v))))  # [2^K, K]
     within = jnp.where(active[:, :, None] & active[:, None, :], gram, 0.0)
@@ -28,9 +31,16 @@ def on_each_set(gram: jax.Array, v: jax.Array) -> jax.Array:
     return (x + product(inverse, v - product(within, x)))[..., 0]  # which takes the ridge out again
 
 
-def least(broken: jax.Array) -> jax.Array:
+def argmin_finite(broken: jax.Array) -> jax.Array:
     """The index of the smallest entry; one that is not finite is larger than all."""
     return jnp.argmin(jnp.where(jnp.isfinite(broken), broken, jnp.inf))
+
+
+def cosines(gram: jax.Array) -> jax.Array:
+    """Cosines of K vectors, from their inner products [K, K]. A zero vector has cosine 0 with every
+    other one."""
+    size = jnp.sqrt(jnp.maximum(jnp.diag(gram), 1e-20))
+    return jnp.fill_diagonal(gram / size / size[:, None], 1.0, inplace=False)
 
 
 def dot(a: jax.Array, b: jax.Array) -> jax.Array:
@@ -47,9 +57,9 @@ def nearest_point(gram: jax.Array, kappa: jax.Array) -> jax.Array:
     Where they have no point in common, y is the one with the least squared distances to all.
     """
     kappa = jnp.clip(kappa, -FAR, FAR)
-    beta = on_each_set(gram, kappa)
+    beta = solve_on_every_subset(gram, kappa)
     beyond = kappa - dot(beta, gram)  # e_i.y + kappa_i
-    return jnp.maximum(0.0, beta[least(jnp.maximum(beyond, -beta).max(-1))])
+    return jnp.maximum(0.0, beta[argmin_finite(jnp.maximum(beyond, -beta).max(-1))])
 
 
 def furthest_point(
@@ -71,8 +81,9 @@ def furthest_point(
             `nearest_point` as far as |y| <= 1 allows, and alpha is 0.
     """
     kappa = jnp.clip(kappa, -FAR, FAR)
-    by_kappa, by_rho = on_each_set(gram, kappa), on_each_set(gram, rho)
-    apart = jnp.maximum(1 - dot(by_rho, rho), 1e-4)  # the floors as for one constraint, in `cpo.dual`
+    by_kappa, by_rho = solve_on_every_subset(gram, kappa), solve_on_every_subset(gram, rho)
+    # the floors are those of one constraint, in `cpo.multipliers`
+    apart = jnp.maximum(1 - dot(by_rho, rho), 1e-4)
     left = jnp.maximum(1 - dot(by_kappa, kappa), 0.0)
     alpha = jnp.maximum(jnp.sqrt(left / apart), 1e-6)  # [2^K]
     beta = by_kappa + alpha[:, None] * by_rho
@@ -80,7 +91,7 @@ def furthest_point(
     beyond = (alpha[:, None] * rho - inside + kappa).max(-1)
     outside = alpha**2 - 2 * alpha * dot(beta, rho) + (beta * inside).sum(-1) - 1
     negative = (-beta).max(-1) / jnp.maximum(alpha, 1.0)
-    best = least(jnp.maximum(jnp.maximum(beyond, outside), jnp.maximum(negative, 0.0)))
+    best = argmin_finite(jnp.maximum(jnp.maximum(beyond, outside), jnp.maximum(negative, 0.0)))
 
     back = nearest_point(gram, kappa)
     inside = dot(gram, back)

@@ -6,41 +6,40 @@ from typing import Any, NamedTuple
 import jax
 
 from jaxsafe.learn.acting import Learned
-from jaxsafe.learn.normalise import normalise
+from jaxsafe.learn.normalise import network_inputs
 from jaxsafe.learn.replay import Transitions
+from jaxsafe.learn.steps import Trainable
 from jaxsafe.types import Metrics, Policy, PyTree
 
 
-class Fit(NamedTuple):
-    """What gradient steps move."""
+class GradientStep(NamedTuple):
+    """What a gradient step knows of the moment in which it is taken.
 
-    params: dict[str, PyTree]
-    opt_state: dict[str, PyTree]
+    number: int32 [], gradient steps of the run that were due before this one.
+    remaining: float [], the share of training that is left: 1 at first, 0 at the end.
+    key: a random key, for this step on this device.
+    """
 
-
-class Turn(NamedTuple):
-    """Of one gradient step: how many were due before it, int32 []; what share of training is left,
-    float []; a key, this device's own."""
-
-    count: jax.Array
-    left: jax.Array
+    number: jax.Array
+    remaining: jax.Array
     key: jax.Array
 
 
 class Learner(NamedTuple):
     """What a method adds to the loop. Observations are normalised before they come here.
 
-    init(key, obs_size, action_size, cfg) -> Fit.
+    init(key, obs_size, action_size, cfg) -> Trainable.
     act(params, obs [..., O], key, cfg) -> action [..., A], the mean one where key is None.
-    explore(params, obs [N, O], key, cfg) -> action [N, A], how training acts.
-    step(fit, batch, turn, cfg, axis_name) -> (Fit, metrics), one gradient step. The weights of `batch`
-        sum to 1 over a device's share, on average over devices: a mean is `pmean((weight * x).sum())`.
+    step(nets, batch, at, cfg, axis_name) -> (Trainable, metrics), one gradient step. The weights of
+        `batch` sum to 1 over a device's share, on average over devices: a mean is
+        `pmean((weight * x).sum())`.
+    explore(params, obs [N, O], key, cfg) -> action [N, A], how training acts; None: as `act`.
     """
 
-    init: Callable[[jax.Array, int, int, Any], Fit]
+    init: Callable[[jax.Array, int, int, Any], Trainable]
     act: Callable[[PyTree, jax.Array, jax.Array | None, Any], jax.Array]
-    explore: Callable[[PyTree, jax.Array, jax.Array, Any], jax.Array]
-    step: Callable[[Fit, Transitions, Turn, Any, str | None], tuple[Fit, Metrics]]
+    step: Callable[[Trainable, Transitions, GradientStep, Any, str | None], tuple[Trainable, Metrics]]
+    explore: Callable[[PyTree, jax.Array, jax.Array, Any], jax.Array] | None = None
 
 
 def policy_by(learner: Learner) -> Policy:
@@ -49,12 +48,7 @@ def policy_by(learner: Learner) -> Policy:
     def act(
         learned: Learned, carry: PyTree, obs: jax.Array, key: jax.Array | None
     ) -> tuple[jax.Array, PyTree, dict[str, Any]]:
-        now = seen(learned.normaliser, obs, learned.config)
-        return learner.act(learned.params, now, key, learned.config), carry, {}
+        inputs = network_inputs(learned.normaliser, obs)
+        return learner.act(learned.params, inputs, key, learned.config), carry, {}
 
     return Policy(init=lambda learned: (), act=act)
-
-
-def seen(normaliser: PyTree, obs: jax.Array, cfg: Any) -> jax.Array:
-    """`obs` [..., O] as the networks see it."""
-    return normalise(normaliser, obs) if cfg.obs_normalize else obs

@@ -7,8 +7,11 @@ import jax
 import jax.numpy as jnp
 
 from jaxsafe.learn.batch import batch_mean, centre, masked_mean, psum
-from jaxsafe.learn.rollout import Episode
+from jaxsafe.learn.rollout import Bad, Episode
 from jaxsafe.types import Env, Metrics
+
+# columns of metrics.csv: worlds with a step that was not finite, and of what
+BAD = ("train/bad_worlds", "train/bad_obs", "train/bad_reward", "train/bad_cost")
 
 
 class Ends(Protocol):
@@ -37,3 +40,12 @@ def episode_metrics(env: Env, ends: Ends, axis_name: str | None) -> Metrics:
         **{f"train/cost_{name}": over(episode.costs[..., k]) for k, name in enumerate(env.cost_names)},
         **{f"train/{name}": over(x) for name, x in episode.info.items()},
     }
+
+
+def world_metrics(bad: Bad, axis_name: str | None) -> Metrics:
+    """How many worlds had a step that was not finite, and of what; `bad` is [T, N]."""
+
+    def worlds(where: jax.Array) -> jax.Array:
+        return psum(where.any(0).sum(), axis_name)
+
+    return dict(zip(BAD, map(worlds, (bad.any, *bad)), strict=True))

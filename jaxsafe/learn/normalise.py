@@ -21,9 +21,9 @@ CLIP = 5.0  # standard deviations
 
 @flax.struct.dataclass
 class Normaliser:
-    count: jax.Array  # float []
-    mean: jax.Array  # float [O]
-    var: jax.Array  # float [O]
+    count: jax.Array  # float [], samples so far
+    mean: jax.Array  # float [size], of whatever is normalised
+    var: jax.Array  # float [size]
 
 
 def init_normaliser(size: int) -> Normaliser:
@@ -31,11 +31,18 @@ def init_normaliser(size: int) -> Normaliser:
     return Normaliser(jnp.zeros(()), jnp.zeros(size), jnp.ones(size))
 
 
-def merge(stats: Normaliser, x: jax.Array, axis_name: str | None = None) -> Normaliser:
-    """`stats` with the samples `x` [..., O] of all devices added."""
+def merge(
+    stats: Normaliser,
+    x: jax.Array,
+    axis_name: str | None = None,
+    share: jax.Array | float = 1.0,
+) -> Normaliser:
+    """`stats` with the samples `x` [..., O] of all devices added. One in `share` of them counts, and
+    the others are 0."""
     x = x.reshape(-1, x.shape[-1])
-    mean = batch_mean(x, axis_name, axis=0)
+    mean = batch_mean(x, axis_name, axis=0) * share
     var = batch_mean((x - mean) ** 2, axis_name, axis=0)
+    var = (var - (1 - 1 / share) * mean**2) * share
     n = psum(jnp.float32(x.shape[0]), axis_name)
     w = n / (stats.count + n)
     d = mean - stats.mean
@@ -46,3 +53,16 @@ def merge(stats: Normaliser, x: jax.Array, axis_name: str | None = None) -> Norm
 def normalise(stats: Normaliser, x: jax.Array) -> jax.Array:
     std = jnp.maximum(jnp.sqrt(stats.var), MIN_STD)
     return jnp.clip((x - stats.mean) / std, -CLIP, CLIP)
+
+
+def network_inputs(normaliser: Normaliser | tuple[()], obs: jax.Array) -> jax.Array:
+    """`obs` [..., O] as the networks take it: normalised, if there is a normaliser.
+
+    What an augmentation appended to the environment's observation is left as it is.
+    """
+    if isinstance(normaliser, tuple):
+        return obs
+    size = normaliser.mean.shape[-1]
+    if obs.shape[-1] == size:
+        return normalise(normaliser, obs)
+    return jnp.concatenate([normalise(normaliser, obs[..., :size]), obs[..., size:]], -1)

@@ -11,24 +11,47 @@ over devices: each device then holds `cfg.num_envs` of its own, and the same par
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable
-from typing import Any, Literal, NamedTuple
+from collections.abc import Iterable
+from typing import Annotated, Any, Literal, NamedTuple
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 import optax
 
-from jaxsafe.config import ConfigError, config
+from jaxsafe.config import (
+    Amount,
+    Bounds,
+    ConfigError,
+    EndOfDecay,
+    Iterations,
+    Norm,
+    Rate,
+    Share,
+    Units,
+    Weight,
+    check_values,
+    config,
+)
 from jaxsafe.learn.acting import learned_of
-from jaxsafe.learn.batch import all_finite, device_key, masked_mean, pmean, psum, select
-from jaxsafe.learn.learner import Fit, Learner, Turn, policy_by, seen
-from jaxsafe.learn.metrics import episode_metrics
-from jaxsafe.learn.normalise import init_normaliser, merge
-from jaxsafe.learn.replay import Row, Transitions, draw, empty_ring, held, ring_rows, transitions, write
+from jaxsafe.learn.batch import all_finite, device_key, masked_mean, psum, select
+from jaxsafe.learn.learner import GradientStep, Learner, policy_by
+from jaxsafe.learn.metrics import episode_metrics, world_metrics
+from jaxsafe.learn.next_step_rollout import Stepping, arrival_record, collect_records, started
+from jaxsafe.learn.normalise import init_normaliser, merge, network_inputs
+from jaxsafe.learn.replay import (
+    Record,
+    draw,
+    empty_ring,
+    held,
+    ring_rows,
+    transitions,
+    usable,
+    write,
+)
 from jaxsafe.learn.returns import mean_length
-from jaxsafe.learn.rollout import Episode, RolloutState, init_rollout, restart, sums
-from jaxsafe.learn.steps import remaining
+from jaxsafe.learn.rollout import check_steps, init_rollout
+from jaxsafe.learn.steps import Trainable, remaining
 from jaxsafe.types import Algorithm, Clocks, Env, Metrics, PyTree, Shared
 
 
@@ -37,21 +60,23 @@ class OffPolicyConfig:
     """What the off-policy algorithms share."""
 
     # Environments side by side, of all devices together. OmniSafe has 1.
-    num_envs: int = 1024
-    horizon: int = 16  # Steps of each environment in an update.
+    num_envs: Amount = 1024
+    horizon: Amount = 16  # Steps of each environment in an update.
     # Steps of each environment between two rounds of gradient steps.
-    learn_every: int = 1
+    learn_every: Amount = 1
     stagger: bool = True  # Whether the first episodes start at different ages, so that ends spread out.
     # The iteration at which whatever decays reaches 0. inf: the last one of `total_steps`.
-    total_iterations: float = float("inf")
+    total_iterations: EndOfDecay = float("inf")
     # Transitions kept, rounded to whole updates. As in OmniSafe.
-    replay_size: int = 1_000_000
-    replay_ratio: int = 16  # Transitions replayed for each environment step. OmniSafe has 256.
-    batch_size: int = 4096  # Transitions of a gradient step, of all devices together. OmniSafe has 256.
+    replay_size: Annotated[int, Bounds(1, 2**31 - 1)] = 1_000_000
+    replay_ratio: Amount = 16  # Transitions replayed for each environment step. OmniSafe has 256.
+    # Transitions of a gradient step, of all devices together. OmniSafe has 256.
+    batch_size: Amount = 4096
     # Environment steps with random actions and without learning, as in OmniSafe.
-    learning_starts: int = 10_000
-    n_step: int = 1  # Rewards summed before the critics' value. OmniSafe has 1.
-    hidden: tuple[int, ...] = (256, 256)  # Units of the hidden layers of each network, as in OmniSafe.
+    learning_starts: Annotated[int, Bounds(0, 2**31 - 1)] = 10_000
+    n_step: Iterations = 1  # Rewards summed before the critics' value. OmniSafe has 1.
+    # Units of the hidden layers of each network, as in OmniSafe.
+    hidden: tuple[Units, ...] = (256, 256)
     activation: Literal["relu", "tanh"] = "relu"  # Of the hidden layers, as in OmniSafe.
     # The first weights. torch: uniform as in PyTorch, OmniSafe's choice. orthogonal: with gains.
     init: Literal["torch", "orthogonal"] = "torch"
@@ -59,52 +84,29 @@ class OffPolicyConfig:
     layer_norm: bool = True
     # Whether observations are normalised by a running mean and variance. OmniSafe does not.
     obs_normalize: bool = True
-    discount: float = 0.99  # The discount of rewards, as in OmniSafe.
-    cost_discount: float = 0.99  # The discount of costs, as in OmniSafe.
+    discount: Share = 0.99  # The discount of rewards, as in OmniSafe.
+    cost_discount: Share = 0.99  # The discount of costs, as in OmniSafe.
     # The undiscounted cost that an episode may have. Unconstrained algorithms only draw it in plots.
-    cost_limit: float = 25.0
+    cost_limit: Weight = 25.0
     # The share of the critics that their targets take on at each step. OmniSafe has 0.005.
-    tau: float = 0.05
-    lr: float = 3e-4  # The policy's learning rate, by Adam, as in OmniSafe.
-    critic_lr: float = 3e-4  # The critics' learning rate, by Adam, as in OmniSafe.
+    tau: Share = 0.05
+    lr: Rate = 3e-4  # The policy's learning rate, by Adam, as in OmniSafe.
+    critic_lr: Rate = 3e-4  # The critics' learning rate, by Adam, as in OmniSafe.
     # Whether both learning rates fall linearly to 0 at `total_iterations`. OmniSafe keeps them.
     lr_decay: bool = False
-    max_grad_norm: float = 40.0  # The largest norm of each network's gradient, as in OmniSafe.
-
-
-@flax.struct.dataclass
-class Walk:
-    """N environments that reset on the next step: where they arrived, and how; bool [N]."""
-
-    rollout: RolloutState
-    first: jax.Array
-    terminated: jax.Array
-    truncated: jax.Array
-
-
-class Steps(NamedTuple):
-    """What T steps of N environments came to, [T, N]. A reset is no step: `real` is false.
-
-    ended marks complete episodes that end with the step; episode and length are their sums.
-    """
-
-    real: jax.Array
-    reward: jax.Array
-    cost: jax.Array
-    ended: jax.Array
-    episode: Episode
-    length: jax.Array
+    max_grad_norm: Norm = 40.0  # The largest norm of each network's gradient, as in OmniSafe.
 
 
 @flax.struct.dataclass
 class TrainState:
     """All that an update needs besides `Shared`.
 
-    config: the algorithm's, with its floats as arrays.
+    config: the algorithm's, with its floats as arrays; `num_envs` is this device's share.
     params, opt_state: the learner's.
     dual: (), the state of a treatment of the constraint.
     normaliser: Normaliser, or () without `obs_normalize`.
-    walk: this device's environments. replay: their ring, [R, N, ...].
+    stepping: this device's environments.
+    replay: their ring, [R, N, ...].
     episode_length: float [], running mean length of an episode, in steps.
     """
 
@@ -113,41 +115,41 @@ class TrainState:
     opt_state: dict[str, PyTree]
     dual: PyTree
     normaliser: PyTree
-    walk: Walk
-    replay: Row
+    stepping: Stepping
+    replay: Record
     episode_length: jax.Array
     key: jax.Array
 
 
-class Cycle(NamedTuple):
+class RoundCarry(NamedTuple):
     """What passes from one round to the next."""
 
-    fit: Fit
+    nets: Trainable
     normaliser: PyTree
-    walk: Walk
-    replay: Row
+    stepping: Stepping
+    replay: Record
 
 
 def off_policy(env: Env, learner: Learner, axis_name: str | None = None) -> Algorithm:
     """The algorithm that `learner` makes of the loop."""
+    explore = learner.explore or learner.act
 
     def init(key: jax.Array, cfg: Any, shared: Shared) -> TrainState:
         sizes = sizes_of(cfg, axis_name)
         cfg = jax.tree.map(jnp.float32, cfg)
-        params_key, walk_key, key = jax.random.split(key, 3)
-        fit = learner.init(params_key, env.obs_size, env.action_size, cfg)
-        rollout = init_rollout(env, device_key(walk_key, axis_name), cfg.num_envs, cfg.stagger)
-        no = jnp.zeros(cfg.num_envs, bool)
-        walk = Walk(rollout, first=~no, terminated=no, truncated=no)
+        params_key, stepping_key, key = jax.random.split(key, 3)
+        nets = learner.init(params_key, env.obs_size, env.action_size, cfg)
+        rollout = init_rollout(env, device_key(stepping_key, axis_name), cfg.num_envs, cfg.stagger)
+        stepping = started(rollout)
         actions = jnp.zeros((cfg.num_envs, env.action_size))
         return TrainState(
             config=cfg,
-            params=fit.params,
-            opt_state=fit.opt_state,
+            params=nets.params,
+            opt_state=nets.opt_state,
             dual=(),
             normaliser=init_normaliser(env.obs_size) if cfg.obs_normalize else (),
-            walk=walk,
-            replay=empty_ring(arrival(walk, actions), sizes.rows),
+            stepping=stepping,
+            replay=empty_ring(arrival_record(stepping, actions), sizes.rows),
             episode_length=jnp.float32(env.episode_length),
             key=key,
         )
@@ -156,72 +158,74 @@ def off_policy(env: Env, learner: Learner, axis_name: str | None = None) -> Algo
         cfg, iteration = ts.config, jnp.asarray(shared.iteration)
         sizes = sizes_of(cfg, axis_name)
 
-        def learn(fit: Fit, normaliser: PyTree, replay: Row, number: jax.Array, key: jax.Array):
+        def learn(
+            nets: Trainable, normaliser: PyTree, replay: Record, number: jax.Array, key: jax.Array
+        ):
             """The gradient steps of round `number`."""
-            written = (number + 1) * cfg.learn_every
-            span = held(sizes.rows, cfg.horizon, written, iteration, shared.since)
+            rows_written = (number + 1) * cfg.learn_every
+            span = held(sizes.rows, cfg.horizon, rows_written, iteration, shared.since)
             before = (iteration * sizes.rounds + number) * sizes.updates
 
-            def step(fit: Fit, x: tuple[jax.Array, jax.Array]) -> tuple[Fit, Metrics]:
+            def step(nets: Trainable, x: tuple[jax.Array, jax.Array]) -> tuple[Trainable, Metrics]:
                 count, key = x
                 draw_key, step_key = jax.random.split(device_key(key, axis_name))
                 index = draw(draw_key, replay, span, sizes.batch)
                 discounts = {"discount": cfg.discount, "cost_discount": cfg.cost_discount}
                 found = transitions(replay, span, index, n_step=cfg.n_step, **discounts)
                 batch, dropped = usable(found, axis_name)
-                obs, next_obs = (seen(normaliser, x, cfg) for x in (batch.obs, batch.next_obs))
+                obs, next_obs = (network_inputs(normaliser, x) for x in (batch.obs, batch.next_obs))
                 batch = batch._replace(obs=obs, next_obs=next_obs)
-                turn = Turn(count, remaining(iteration, cfg), step_key)
-                new, metrics = learner.step(fit, batch, turn, cfg, axis_name)
+                at = GradientStep(count, remaining(iteration, cfg), step_key)
+                new, metrics = learner.step(nets, batch, at, cfg, axis_name)
                 finite = psum(~jnp.isfinite(optax.tree.norm(new)), axis_name) == 0
                 lost = {"train/nonfinite": dropped + ~finite}
-                return select(finite, new, fit), jax.tree.map(jnp.float32, metrics | lost)
+                return select(finite, new, nets), jax.tree.map(jnp.float32, metrics | lost)
 
             turns = before + jnp.arange(sizes.updates), jax.random.split(key, sizes.updates)
-            return jax.lax.scan(step, fit, turns)
+            return jax.lax.scan(step, nets, turns)
 
-        def one_round(cycle: Cycle, x: tuple[jax.Array, jax.Array]):
+        def one_round(now: RoundCarry, x: tuple[jax.Array, jax.Array]):
             number, key = x
-            walk_key, learn_key = jax.random.split(key)
-            written = number * cfg.learn_every
-            begun = iteration * cfg.horizon + written < sizes.warm_up  # in rows of this run
+            stepping_key, learn_key = jax.random.split(key)
+            rows_written = number * cfg.learn_every
+            warming_up = iteration * cfg.horizon + rows_written < sizes.warm_up  # in rows of this run
 
             def act(obs: jax.Array, key: jax.Array) -> jax.Array:
                 explore_key, random_key = jax.random.split(key)
-                now = seen(cycle.normaliser, obs, cfg)
-                chosen = learner.explore(cycle.fit.params, now, explore_key, cfg)
+                inputs = network_inputs(now.normaliser, obs)
+                chosen = explore(now.nets.params, inputs, explore_key, cfg)
                 uniform = jax.random.uniform(random_key, chosen.shape, minval=-1.0, maxval=1.0)
-                return jnp.where(begun, uniform, chosen)
+                return jnp.where(warming_up, uniform, chosen)
 
-            keys = jax.random.split(device_key(walk_key, axis_name), cfg.learn_every)
-            walk, (rows, steps) = walked(env, act, cycle.walk, keys)
-            span = held(sizes.rows, cfg.horizon, written, iteration, shared.since)
-            replay = write(cycle.replay, rows, span)
-            normaliser, skipped = cycle.normaliser, jnp.bool_(False)
+            keys = jax.random.split(device_key(stepping_key, axis_name), cfg.learn_every)
+            stepping, (rows, steps) = collect_records(env, act, now.stepping, keys)
+            span = held(sizes.rows, cfg.horizon, rows_written, iteration, shared.since)
+            replay = write(now.replay, rows, span)
+            normaliser, skipped = now.normaliser, jnp.bool_(False)
             if cfg.obs_normalize:
                 merged = merge(normaliser, rows.obs, axis_name)
                 finite = all_finite(merged)
                 normaliser, skipped = select(finite, merged, normaliser), ~finite
 
-            filled = (iteration - shared.since) * cfg.horizon + written + cfg.learn_every
+            filled = (iteration - shared.since) * cfg.horizon + rows_written + cfg.learn_every
             ready = filled >= jnp.maximum(sizes.warm_up, 2)
-            given = cycle.fit, normaliser, replay, number, learn_key
+            given = now.nets, normaliser, replay, number, learn_key
             like = jax.eval_shape(learn, *given)[1]
-            nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
-            fit, metrics = jax.lax.cond(ready, learn, lambda fit, *_: (fit, nothing), *given)
-            return Cycle(fit, normaliser, walk, replay), (steps, metrics, ready, skipped)
+            zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
+            nets, metrics = jax.lax.cond(ready, learn, lambda nets, *_: (nets, zeros), *given)
+            return RoundCarry(nets, normaliser, stepping, replay), (steps, metrics, ready, skipped)
 
         key, rounds_key = jax.random.split(ts.key)
-        cycle = Cycle(Fit(ts.params, ts.opt_state), ts.normaliser, ts.walk, ts.replay)
+        now = RoundCarry(Trainable(ts.params, ts.opt_state), ts.normaliser, ts.stepping, ts.replay)
         rounds = jnp.arange(sizes.rounds), jax.random.split(rounds_key, sizes.rounds)
-        cycle, (steps, metrics, ready, skipped) = jax.lax.scan(one_round, cycle, rounds)
+        now, (steps, metrics, ready, skipped) = jax.lax.scan(one_round, now, rounds)
 
         steps = jax.tree.map(lambda x: x.reshape(cfg.horizon, *x.shape[2:]), steps)
         length = mean_length(ts.episode_length, steps.ended, steps.length, axis_name)
         length = jnp.where(jnp.isfinite(length), length, ts.episode_length)
         nonfinite = metrics.pop("train/nonfinite").sum() + skipped.sum()
         metrics = {k: masked_mean(x.mean(1), ready, None) for k, x in metrics.items()}
-        metrics |= episode_metrics(env, steps, axis_name)
+        metrics |= episode_metrics(env, steps, axis_name) | world_metrics(steps.bad, axis_name)
         rate_r, rate_c = (masked_mean(x, steps.real, axis_name) for x in (steps.reward, steps.cost))
         metrics |= {
             "train/cost_rate": rate_c,  # per environment step
@@ -231,11 +235,11 @@ def off_policy(env: Env, learner: Learner, axis_name: str | None = None) -> Algo
         }
         ts = dataclasses.replace(
             ts,
-            params=cycle.fit.params,
-            opt_state=cycle.fit.opt_state,
-            normaliser=cycle.normaliser,
-            walk=cycle.walk,
-            replay=cycle.replay,
+            params=now.nets.params,
+            opt_state=now.nets.opt_state,
+            normaliser=now.normaliser,
+            stepping=now.stepping,
+            replay=now.replay,
             episode_length=length,
             key=key,
         )
@@ -246,76 +250,6 @@ def off_policy(env: Env, learner: Learner, axis_name: str | None = None) -> Algo
         return Clocks(cfg.num_envs * cfg.horizon, sizes.rounds * sizes.updates)
 
     return Algorithm(init, update, policy_by(learner), learned_of, lambda learned: env, clocks)
-
-
-# ---- environments that reset on the next step --------------------------------------------------
-
-
-def arrival(walk: Walk, action: jax.Array) -> Row:
-    """The rows [N, ...] of where the environments are, with the actions that they take there."""
-    state = walk.rollout.state
-    return Row(
-        obs=state.obs,
-        action=action,
-        reward=state.reward,
-        cost=state.cost,
-        costs=state.costs,
-        first=walk.first,
-        terminated=walk.terminated,
-        truncated=walk.truncated,
-    )
-
-
-def walked(
-    env: Env, act: Callable[[jax.Array, jax.Array], jax.Array], walk: Walk, keys: jax.Array
-) -> tuple[Walk, tuple[Row, Steps]]:
-    """One step of every environment for each of `keys` [T], or a reset where its episode has ended.
-
-    Args:
-        act: (obs [N, O], key) -> action [N, A].
-    Returns:
-        The walk, and the rows and steps, [T, N, ...].
-    """
-
-    def step(walk: Walk, key: jax.Array) -> tuple[Walk, tuple[Row, Steps]]:
-        act_key, reset_key = jax.random.split(key)
-        row = arrival(walk, act(walk.rollout.state.obs, act_key))
-        state = jax.vmap(env.step)(walk.rollout.state, row.action)
-        rollout = dataclasses.replace(
-            walk.rollout,
-            state=state,
-            steps=walk.rollout.steps + 1,
-            episode=jax.tree.map(jnp.add, walk.rollout.episode, sums(state)),
-        )
-        rollout = restart(env, rollout, row.last, reset_key)
-        terminated = rollout.state.terminated
-        truncated = (rollout.steps >= env.episode_length) & ~terminated
-        steps = Steps(
-            real=~row.last,
-            reward=rollout.state.reward,
-            cost=rollout.state.cost,
-            ended=(terminated | truncated) & rollout.complete,
-            episode=rollout.episode,
-            length=rollout.steps,
-        )
-        return Walk(rollout, row.last, terminated, truncated), (row, steps)
-
-    return jax.lax.scan(step, walk, keys)
-
-
-def usable(found: Transitions, axis_name: str | None) -> tuple[Transitions, jax.Array]:
-    """`found` with weights whose sum is 1, and 0 for transitions that are not finite, which are
-    replaced by zeros; and how many of those there are, over all devices."""
-    floats = [x for x in jax.tree.leaves(found) if jnp.issubdtype(x.dtype, jnp.floating)]
-    finite = jnp.isfinite(sum(x.sum(tuple(range(1, x.ndim))) for x in floats))
-
-    def keep(x: jax.Array) -> jax.Array:
-        return jnp.where(finite.reshape(-1, *(1,) * (x.ndim - 1)), x, jnp.zeros_like(x))
-
-    kept = jax.tree.map(keep, found)
-    total = pmean(kept.weight.sum(), axis_name)
-    dropped = psum((~finite & (found.weight > 0)).sum(), axis_name)
-    return kept._replace(weight=kept.weight / jnp.maximum(total, 1e-6)), dropped
 
 
 # ---- sizes -------------------------------------------------------------------------------------
@@ -336,14 +270,10 @@ def sizes_of(cfg: Any, axis_name: str | None) -> Sizes:
     """Sizes, for `cfg.num_envs` environments on each device.
 
     Raises:
-        ConfigError: sizes that do not fit each other.
+        ConfigError: sizes out of their bounds, or that do not fit each other.
     """
-    at_least_1 = ("num_envs", "horizon", "learn_every", "replay_size", "replay_ratio", "batch_size")
-    for name in (*at_least_1, "n_step"):
-        if getattr(cfg, name) < 1:
-            raise ConfigError(f"{name}={getattr(cfg, name)}: expected at least 1")
-    if cfg.learning_starts < 0:
-        raise ConfigError(f"learning_starts={cfg.learning_starts}: expected at least 0")
+    check_values(cfg)
+    check_steps(cfg.num_envs, cfg.horizon)
     devices = 1 if axis_name is None else jax.lax.axis_size(axis_name)
     num_envs = cfg.num_envs * devices
     if cfg.horizon % cfg.learn_every:

@@ -9,16 +9,28 @@ folded with the device's index where devices must differ.
 import dataclasses
 import operator
 from collections.abc import Callable
-from functools import partial
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 
-from jaxsafe.config import ConfigError, config
-from jaxsafe.learn.acting import Learned, begun_anew, learned_of
-from jaxsafe.learn.augment import Augmentation, nothing
+from jaxsafe.config import (
+    Amount,
+    Bounds,
+    ConfigError,
+    EndOfDecay,
+    Iterations,
+    Norm,
+    Rate,
+    Share,
+    Units,
+    Weight,
+    check_values,
+    config,
+)
+from jaxsafe.learn.acting import Learned, learned_of, reset_carry
+from jaxsafe.learn.augment import Augmentation, no_augmentation
 from jaxsafe.learn.batch import (
     all_finite,
     batch_mean,
@@ -28,22 +40,30 @@ from jaxsafe.learn.batch import (
     select,
     standardise,
 )
-from jaxsafe.learn.constraints import Names, check_names, each, limit, signal, spread, unnamed
+from jaxsafe.learn.constraints import (
+    Names,
+    check_cost_names,
+    each,
+    limit,
+    metrics_by_constraint,
+    signal,
+    total_cost_alone,
+)
 from jaxsafe.learn.conventions import Convention
-from jaxsafe.learn.metrics import episode_metrics, explained_variance
-from jaxsafe.learn.normalise import init_normaliser, merge, normalise
+from jaxsafe.learn.metrics import episode_metrics, explained_variance, world_metrics
+from jaxsafe.learn.normalise import init_normaliser, merge, network_inputs, normalise
 from jaxsafe.learn.returns import Estimator, Window, advantages, empty_window, mean_length, window_mean
-from jaxsafe.learn.rollout import RolloutState, Trajectory, collect, init_rollout
-from jaxsafe.learn.steps import Context, Pair, Step, adam, fit_critic, stops_critics
+from jaxsafe.learn.rollout import Bad, RolloutState, Trajectory, check_steps, collect, init_rollout
+from jaxsafe.learn.steps import Context, Pair, PolicyStep, Trainable, adam, fit_critic, stops_critics
 from jaxsafe.learn.surrogates import Surrogate, with_entropy
 from jaxsafe.learn.treatments import Treatment
 from jaxsafe.nn.gaussian import Gaussian, entropy, log_prob, sample
 from jaxsafe.nn.networks import (
+    apply_to_rollout,
     init_params,
     init_recurrent,
     policy,
-    read,
-    remember,
+    recurrent_step,
     share_trunk,
     stack,
     stack_critics,
@@ -55,35 +75,37 @@ from jaxsafe.types import Algorithm, Clocks, Env, Metrics, Policy, PyTree, Share
 class OnPolicyConfig:
     """What the on-policy algorithms share."""
 
+    POLICY_STEPS: ClassVar = 1  # steps of the policy in an iteration
+
     CONVENTIONS: ClassVar = (
         Convention(
             {"cost_window": 5},
-            "J_c is the mean of the last 100 episodes, those of 5 iterations (of 50 in release 0.5.0 "
-            "and in the published figures)",
-            "of the last iteration",
+            "J_c is the mean cost of the last 100 episodes, those of 5 iterations (of the last 50 in "
+            "release 0.5.0 and in the published figures)",
+            "J_c is the mean cost of the last iteration",
         ),
     )
 
     # Environments side by side, of all devices together. With `horizon` a batch has 20,480 steps, near
     # OmniSafe's 20,000.
-    num_envs: int = 512
+    num_envs: Amount = 512
     # Steps of each environment in an iteration. Shorter ones learn less from a step.
-    horizon: int = 40
+    horizon: Amount = 40
     stagger: bool = True  # Whether the first episodes start at different ages, so that ends spread out.
     # The iteration at which whatever decays reaches 0. inf: the last one of `total_steps`.
-    total_iterations: float = float("inf")
-    hidden: tuple[int, ...] = (64, 64)  # Units of the hidden layers of each network, as in OmniSafe.
+    total_iterations: EndOfDecay = float("inf")
+    hidden: tuple[Units, ...] = (64, 64)  # Units of the hidden layers of each network, as in OmniSafe.
     # separate: a network each for policy and critics, as in OmniSafe. shared: one network for all.
     # gru: one network for all, with a memory.
     trunk: Literal["separate", "shared", "gru"] = "separate"
     # Weight of each critic's squared error in the loss of a shared trunk, as in Stable-Baselines3.
     # Separate networks do not use it.
-    value_coef: float = 0.5
+    value_coef: Weight = 0.5
     activation: Literal["tanh", "relu"] = "tanh"  # Of the hidden layers, as in OmniSafe.
     # How weights are drawn. torch is PyTorch's default (Kaiming, uniform), which OmniSafe has.
     init: Literal["orthogonal", "torch"] = "orthogonal"
     # Log of the actions' standard deviation at the start, as in safety-starter-agents.
-    init_log_std: float = -0.5
+    init_log_std: Annotated[float, Bounds(-20, 10)] = -0.5
     # free: the standard deviation is a parameter, as in OmniSafe. state: the network computes it.
     std: Literal["free", "state"] = "free"
     # Whether observations are scaled by their running mean and variance, as in OmniSafe.
@@ -93,32 +115,32 @@ class OnPolicyConfig:
     # The same for costs. Limits and metrics keep the costs as they are.
     cost_normalize: bool = False
     # Weight of the policy's entropy, which is added to what the policy maximises.
-    entropy_coef: float = 0.0
+    entropy_coef: Weight = 0.0
     entropy_decay: bool = False  # Whether entropy_coef falls on a line to 0 at `total_iterations`.
     estimator: Estimator = "gae"  # Of advantages and of the critics' targets, as in OmniSafe.
     # Discount of rewards, as in OmniSafe. It only affects the critic and the advantages.
-    discount: float = 0.99
-    gae_lambda: float = 0.95  # Decay of the reward advantages (lambda of GAE), as in OmniSafe.
+    discount: Share = 0.99
+    gae_lambda: Share = 0.95  # Decay of the reward advantages (lambda of GAE), as in OmniSafe.
     # Discount of costs. It only affects the critic and the advantages: the limit is on undiscounted
     # cost. OmniSafe names this setting and uses `discount` instead.
-    cost_discount: float = 0.99
-    cost_gae_lambda: float = 0.95  # Decay of the cost advantages, as in OmniSafe.
+    cost_discount: Share = 0.99
+    cost_gae_lambda: Share = 0.95  # Decay of the cost advantages, as in OmniSafe.
     # Cost that an episode may have, undiscounted, as in OmniSafe. Unconstrained algorithms only draw
     # it in plots.
-    cost_limit: float = 25.0
+    cost_limit: Weight = 25.0
     # J_c is the mean cost over this many iterations. OmniSafe has the last 100 episodes, which are 5
     # of its iterations.
-    cost_window: int = 1
-    minibatches: int = 8  # Parts that a batch is split into for each pass, of policy and critics.
+    cost_window: Iterations = 1
+    minibatches: Amount = 8  # Parts that a batch is split into for each pass, of policy and critics.
     # Adam's step of the critics, as in safety-starter-agents. A shared trunk does not use it.
-    critic_lr: float = 1e-3
+    critic_lr: Rate = 1e-3
     # Passes of each critic over a batch. With 8 minibatches they are the 80 steps of
     # safety-starter-agents. A shared trunk does not use it.
-    critic_epochs: int = 10
+    critic_epochs: Iterations = 10
     # Weight of the sum of squared parameters in a critic's loss, as in OmniSafe. A shared trunk does
     # not use it.
-    critic_norm_coef: float = 1e-3
-    max_grad_norm: float = 40.0  # Longer gradients of a network are cut to this norm, as in OmniSafe.
+    critic_norm_coef: Weight = 1e-3
+    max_grad_norm: Norm = 40.0  # Longer gradients of a network are cut to this norm, as in OmniSafe.
 
 
 # The settings that all on-policy algorithms of OmniSafe share (@15603dd, configs/on-policy) and that
@@ -136,16 +158,16 @@ OMNISAFE: dict[str, Any] = {
 class TrainState:
     """All that an update needs besides `Shared`. Environment steps: iteration * num_envs * horizon.
 
-    config: the algorithm's, with its floats as arrays.
+    config: the algorithm's, with its floats as arrays; `num_envs` is this device's share.
     params: {'actor', 'critic_r', 'critic_c'}; of several constraints critic_c is stacked, [K, ...].
         With one network for all {'actor'}, see nn.networks.
-    opt_state: {'actor': the step's own, 'critics': Adam's for all critics, stacked, or ()}.
+    opt_state: {'actor': the step's, 'critics': Adam's for all critics, stacked, or ()}.
     dual: the treatment's state.
     normaliser: Normaliser, or () without `obs_normalize`.
     signals: Normaliser of [reward, costs ...], or () without `reward_normalize` and `cost_normalize`.
     rollout: this device's environments.
     episode_length: float [], running mean length of an episode, in steps.
-    past_costs: J_c of the last `cost_window` iterations, float [W] or [W, K].
+    past_costs: Window of J_c of the last `cost_window` iterations, [W] or [W, K].
     """
 
     config: Any
@@ -171,7 +193,7 @@ class Batch:
     adv_c and ret_c are [B, K].
     """
 
-    obs: jax.Array
+    obs: PyTree
     action: jax.Array
     log_prob: jax.Array
     old: Gaussian
@@ -181,19 +203,47 @@ class Batch:
     ret_c: jax.Array
 
 
+class Improved(NamedTuple):
+    """The policy's parameters after an iteration, with their optimiser, the dual and metrics."""
+
+    actor: PyTree
+    opt_state: PyTree
+    dual: PyTree
+    metrics: Metrics
+
+
+class Method(NamedTuple):
+    """What a method adds to the loop.
+
+    check(cfg) raises ConfigError for settings that it cannot serve.
+    init_step(actor, cfg) -> the optimiser's state of the policy.
+    init_dual(cfg) -> dual, what is remembered of the constraint.
+    improve(ts, batch, context) -> Improved.
+    constrained_costs(cfg) -> names of the costs that have a limit each; () for `cost` alone.
+    augmentation: what the learner sees and is paid beside the task.
+    """
+
+    check: Callable[[Any], None]
+    init_step: Callable[[PyTree, Any], PyTree]
+    init_dual: Callable[[Any], PyTree]
+    improve: Callable[["TrainState", "Batch", Context], Improved]
+    constrained_costs: Callable[[Any], Names] = total_cost_alone
+    augmentation: Augmentation = no_augmentation
+
+
 def on_policy(
     env: Env,
     treatment: Treatment,
     surrogate: Surrogate,
-    step: Step,
+    step: PolicyStep,
     axis_name: str | None = None,
-    augmentation: Augmentation = nothing,
+    augmentation: Augmentation = no_augmentation,
 ) -> Algorithm:
     """Algorithms with one objective: the surrogate of the advantage that the treatment mixes."""
 
-    def improve(ts: TrainState, batch: Batch, context: Context):
+    def improve(ts: TrainState, batch: Batch, context: Context) -> Improved:
         cfg = context.cfg
-        dual = treatment.update(ts.dual, context.cost, cfg)
+        dual = treatment.update(ts.dual, context.episode_cost, cfg, context.iteration)
 
         def objective(actor: PyTree, batch: Batch) -> tuple[jax.Array, Metrics]:
             advantage = treatment.advantage(dual, batch.adv_r, batch.adv_c)
@@ -203,27 +253,28 @@ def on_policy(
         actor, opt_state, metrics = step.update(
             ts.params["actor"], ts.opt_state["actor"], objective, batch, context
         )
-        return actor, opt_state, dual, metrics | treatment.metrics(dual)
+        return Improved(actor, opt_state, dual, metrics | treatment.metrics(dual))
 
-    return loop(env, step.init, treatment.init, improve, axis_name, augmentation, treatment.named)
+    costs = treatment.constrained_costs
+    method = Method(step.check, step.init, treatment.init, improve, costs, augmentation)
+    return on_policy_loop(env, method, axis_name)
 
 
 def on_policy_pair(
     env: Env,
     surrogate: Surrogate,
-    step: Step,
+    step: PolicyStep,
     axis_name: str | None = None,
     surrogate_c: Surrogate | None = None,
-    named: Callable[[Any], Names] = unnamed,
+    constrained_costs: Callable[[Any], Names] = total_cost_alone,
 ) -> Algorithm:
-    """Algorithms whose step weighs reward against cost itself, so that it takes a `Pair` of objectives:
-    `surrogate` of the reward's advantage, and `surrogate_c` (or the same) of the cost's.
+    """Algorithms whose step weighs reward against cost itself.
 
-    The cost's objective is in cost per step, the unit of `context.excess / context.length`. For K costs
-    `named(cfg)` it is [K].
+    It takes a `Pair` of objectives: `surrogate` of the reward's advantage, and `surrogate_c` (or the
+    same) of the cost's. The cost's is in cost per step, float [], or [K] for K constrained costs.
     """
 
-    def improve(ts: TrainState, batch: Batch, context: Context):
+    def improve(ts: TrainState, batch: Batch, context: Context) -> Improved:
         cfg = context.cfg
 
         def objective_r(actor: PyTree, batch: Batch) -> tuple[jax.Array, Metrics]:
@@ -236,70 +287,56 @@ def on_policy_pair(
             def of_one(adv_c: jax.Array) -> tuple[jax.Array, Metrics]:
                 return (surrogate_c or surrogate)(dist, batch, adv_c, cfg)
 
-            return each(of_one, named(cfg))(batch.adv_c)
+            return each(of_one, constrained_costs(cfg))(batch.adv_c)
 
+        objectives = Pair(objective_r, objective_c)
         actor, opt_state, metrics = step.update(
-            ts.params["actor"],
-            ts.opt_state["actor"],
-            Pair(objective_r, objective_c),
-            batch,
-            context,
+            ts.params["actor"], ts.opt_state["actor"], objectives, batch, context
         )
-        return actor, opt_state, (), metrics
+        return Improved(actor, opt_state, (), metrics)
 
-    def init_dual(cfg: Any) -> tuple[()]:
+    def check(cfg: Any) -> None:
+        step.check(cfg)
         if cfg.cost_normalize:
             raise ConfigError(
                 "cost_normalize=True: expected False for an algorithm that adds what it estimates of "
                 "the cost to the violation, which is in units of cost"
             )
-        return ()
 
-    return loop(env, step.init, init_dual, improve, axis_name, named=named)
+    method = Method(check, step.init, lambda cfg: (), improve, constrained_costs)
+    return on_policy_loop(env, method, axis_name)
 
 
-def loop(
-    env: Env,
-    init_step: Callable[[PyTree, Any], PyTree],
-    init_dual: Callable[[Any], PyTree],
-    improve: Callable[..., tuple[PyTree, PyTree, PyTree, Metrics]],
-    axis_name: str | None,
-    augmentation: Augmentation = nothing,
-    named: Callable[[Any], Names] = unnamed,
-) -> Algorithm:
-    """The loop around `improve(ts, batch, context)` -> (actor, opt_state, dual, metrics)."""
+def on_policy_loop(env: Env, method: Method, axis_name: str | None) -> Algorithm:
+    """The algorithm that `method` makes of the loop."""
+    constrained_costs, augmentation = method.constrained_costs, method.augmentation
 
     def init(key: jax.Array, cfg: Any, shared: Shared) -> TrainState:
-        check(cfg)
+        check_sizes(cfg)
+        method.check(cfg)
         cfg = jax.tree.map(jnp.float32, cfg)
         params_key, rollout_key, key = jax.random.split(key, 3)
-        dual = init_dual(cfg)
+        dual = method.init_dual(cfg)
         wrapped = augmentation.wrap(env, cfg, dual)
         sizes = wrapped.obs_size, wrapped.action_size
-        params = init_params(params_key, *sizes, cfg)
-        if names := named(cfg):
-            check_names(names, env)
-            keys = jax.random.split(params_key, len(names))
-            critics = jax.vmap(lambda key: init_params(key, *sizes, cfg)["critic_c"])(keys)
-            params |= {"critic_c": critics}
-        opt_critics = jax.vmap(adam(cfg.critic_lr, cfg).init)(stack_critics(params))
-        if cfg.trunk == "shared":
-            params, opt_critics = share_trunk(params, cfg), ()
-        if cfg.trunk == "gru":
-            critics = 1 + (len(names) or 1)
-            params, opt_critics = init_recurrent(params_key, *sizes, critics, cfg), ()
+        names = constrained_costs(cfg)
+        check_cost_names(names, env)
+        nets = init_nets(params_key, *sizes, names, cfg)
         rollout = init_rollout(wrapped, device_key(rollout_key, axis_name), cfg.num_envs, cfg.stagger)
         carry = jnp.zeros((cfg.num_envs, cfg.hidden[-1])) if cfg.trunk == "gru" else ()
         return TrainState(
             config=cfg,
-            params=params,
-            opt_state={"actor": init_step(params["actor"], cfg), "critics": opt_critics},
+            params=nets.params,
+            opt_state={
+                "actor": method.init_step(nets.params["actor"], cfg),
+                "critics": nets.opt_state,
+            },
             dual=dual,
             normaliser=init_normaliser(env.obs_size) if cfg.obs_normalize else (),
-            signals=init_signals(cfg, len(named(cfg)) or 1),
+            signals=init_signals(cfg, len(names) or 1),
             rollout=dataclasses.replace(rollout, carry=carry),
             episode_length=jnp.float32(env.episode_length),
-            past_costs=empty_window(cfg.cost_window, jnp.shape(limit(cfg, named(cfg)))),
+            past_costs=empty_window(cfg.cost_window, jnp.shape(limit(cfg, names))),
             key=key,
         )
 
@@ -310,13 +347,13 @@ def loop(
         cfg = ts.config
         key, rollout_key, step_key, critic_key = jax.random.split(ts.key, 4)
 
-        acting = learned_of(ts)
+        learned = learned_of(ts)
 
         def behave(
             carry: PyTree, obs: jax.Array, first: jax.Array, key: jax.Array
         ) -> tuple[jax.Array, jax.Array, PyTree]:
-            carry = begun_anew(remembering, acting, carry, first)
-            dist, carry = decide(acting, carry, obs)
+            carry = reset_carry(acting, learned, carry, first)
+            dist, carry = decide(learned, carry, obs)
             action = sample(dist, key)
             return action, log_prob(dist, action), carry
 
@@ -329,20 +366,20 @@ def loop(
             cfg.horizon,
             lambda episode: augmentation.stop(episode, cfg),
         )
-        names = named(cfg)
+        names = constrained_costs(cfg)
         charged = signal(env, traj, names)
-        reward, cost, signals = scaled_signals(ts, augmentation.reward(traj, cfg), charged, axis_name)
-        last_obs = augmentation.last_obs(traj, cfg)
-        carry = ts.rollout.carry
-        batch, explained = estimate(ts, traj, carry, last_obs, reward, cost, names, axis_name)
+        share = weights(traj.bad, axis_name).max()  # of a good step; bad ones earn and cost 0 here
+        signals = scaled_signals(ts, augmentation.reward(traj, cfg), charged, axis_name, share)
+        augmented = dataclasses.replace(traj, next_obs=augmentation.last_obs(traj, cfg))
+        batch, explained = estimate(ts, augmented, signals, names, axis_name)
         length = mean_length(ts.episode_length, traj.ended, traj.length, axis_name)
-        cost_rate = batch_mean(traj.cost, axis_name)
-        episode_cost = batch_mean(charged, axis_name, (0, 1)) * length
+        cost_rate = batch_mean(traj.cost, axis_name) * share
+        episode_cost = batch_mean(charged, axis_name, (0, 1)) * share * length
         recent, past_costs = window_mean(ts.past_costs, episode_cost)
 
-        excess = recent - limit(cfg, names)
-        context = Context(shared.iteration, cfg, step_key, axis_name, recent, excess, length)
-        actor, opt_actor, dual, metrics = improve(ts, batch, context)
+        violation = recent - limit(cfg, names)
+        context = Context(shared.iteration, cfg, step_key, axis_name, recent, violation, length)
+        actor, opt_actor, dual, metrics = method.improve(ts, batch, context)
         critics, opt_critics, skipped = {}, (), 0
         if cfg.trunk == "separate":
             passes = metrics["train/passes"] if stops_critics(cfg) else cfg.critic_epochs
@@ -350,22 +387,25 @@ def loop(
                 ts, batch, passes, critic_key, axis_name
             )
             metrics |= fitted
-        seen = traj.obs[..., : env.obs_size]
-        normaliser = merge(ts.normaliser, seen, axis_name) if cfg.obs_normalize else ()
+        raw_obs = traj.obs[..., : env.obs_size]
+        normaliser = merge(ts.normaliser, raw_obs, axis_name) if cfg.obs_normalize else ()
         # parameters are guarded step by step; what is not a step of a gradient is guarded here
-        finite = psum(~all_finite((batch, normaliser, signals)), axis_name) == 0
-        dual, normaliser, signals, length, past_costs = select(
+        finite = (
+            psum(~all_finite((batch, normaliser, signals.normaliser, episode_cost)), axis_name) == 0
+        )
+        dual, normaliser, signal_stats, length, past_costs = select(
             finite,
-            (dual, normaliser, signals, length, past_costs),
+            (dual, normaliser, signals.normaliser, length, past_costs),
             (ts.dual, ts.normaliser, ts.signals, ts.episode_length, ts.past_costs),
         )
-        # J_c of each named cost; of the cost itself it is among the next
+        # of several constraints, J_c of each; that of the total cost is among the next metrics
         metrics |= explained | ({"train/cost_estimate": episode_cost} if names else {})
-        metrics = spread(metrics, names) | episode_metrics(env, traj, axis_name)
+        metrics = metrics_by_constraint(metrics, names) | episode_metrics(env, traj, axis_name)
+        metrics |= world_metrics(traj.bad, axis_name)
         metrics |= {
             "train/cost_rate": cost_rate,  # per environment step
             "train/cost_estimate": cost_rate * length,  # J_c of this iteration
-            "train/return_estimate": batch_mean(traj.reward, axis_name) * length,  # likewise
+            "train/return_estimate": batch_mean(traj.reward, axis_name) * share * length,  # likewise
             "train/entropy": batch_mean(entropy(policy(actor, batch.obs, cfg)), axis_name),
             "train/nonfinite": metrics["train/nonfinite"] + skipped + ~finite,
         }
@@ -375,7 +415,7 @@ def loop(
             opt_state={"actor": opt_actor, "critics": opt_critics},
             dual=dual,
             normaliser=normaliser,
-            signals=signals,
+            signals=signal_stats,
             rollout=rollout,
             episode_length=length,
             past_costs=past_costs,
@@ -389,27 +429,44 @@ def loop(
         dist, carry = decide(learned, carry, obs)
         return (dist.mean if key is None else sample(dist, key)), carry, {}
 
-    remembering = Policy(init=nothing_yet, act=act)
-    return Algorithm(init, update, remembering, learned_of, task, clocks)
+    def clocks(cfg: Any) -> Clocks:
+        """Gradient steps are those that teach values: of critics, or of the trunk they share."""
+        check_sizes(cfg)
+        method.check(cfg)
+        passes = cfg.critic_epochs if cfg.trunk == "separate" else cfg.epochs * cfg.POLICY_STEPS
+        return Clocks(cfg.num_envs * cfg.horizon, passes * cfg.minibatches)
+
+    acting = Policy(init=initial_carry, act=act)
+    return Algorithm(init, update, acting, learned_of, task, clocks)
+
+
+def init_nets(key: jax.Array, obs_size: int, action_size: int, names: Names, cfg: Any) -> Trainable:
+    """All networks, and the critics' optimiser: () where they share the policy's trunk."""
+    sizes = obs_size, action_size
+    if cfg.trunk == "gru":
+        return Trainable(init_recurrent(key, *sizes, 1 + (len(names) or 1), cfg), ())
+    params = init_params(key, *sizes, cfg)
+    if names:
+        keys = jax.random.split(jax.random.fold_in(key, 1), len(names))
+        params |= {"critic_c": jax.vmap(lambda key: init_params(key, *sizes, cfg)["critic_c"])(keys)}
+    if cfg.trunk == "shared":
+        return Trainable(share_trunk(params, cfg), ())
+    return Trainable(params, jax.vmap(adam(cfg.critic_lr, cfg).init)(stack_critics(params)))
 
 
 def decide(learned: Learned, carry: PyTree, obs: jax.Array) -> tuple[Gaussian, PyTree]:
     """The action distribution for `obs` [..., O] as the environment gives it, and the next carry."""
     actor, cfg = learned.params["actor"], learned.config
+    inputs = network_inputs(learned.normaliser, obs)
     if cfg.trunk == "gru":
-        carry, dist, _ = remember(actor, carry, see(learned, obs), cfg)
+        carry, dist, _ = recurrent_step(actor, carry, inputs, cfg)
         return dist, carry
-    return policy(actor, see(learned, obs), cfg), carry
+    return policy(actor, inputs, cfg), carry
 
 
-def nothing_yet(learned: Learned) -> PyTree:
-    """The carry at the start of an episode."""
+def initial_carry(learned: Learned) -> PyTree:
+    """What the policy remembers at the start of an episode."""
     return jnp.zeros(learned.config.hidden[-1]) if learned.config.trunk == "gru" else ()
-
-
-def clocks(cfg: Any) -> Clocks:
-    check(cfg)
-    return Clocks(cfg.num_envs * cfg.horizon, cfg.critic_epochs * cfg.minibatches)
 
 
 def fit_critics(
@@ -417,60 +474,68 @@ def fit_critics(
 ) -> tuple[dict[str, PyTree], PyTree, jax.Array, Metrics]:
     """All critics fitted to their targets at once: {'critic_r', 'critic_c'}, opt_state, the number of
     steps skipped, and metrics."""
-    fit = partial(fit_critic, obs=batch.obs, passes=passes, key=key, cfg=ts.config, axis_name=axis_name)
-    critics, opt_state, errors, skipped = jax.vmap(lambda c, o, y: fit(c, o, target=y))(
-        stack_critics(ts.params), ts.opt_state["critics"], stack(batch.ret_r, batch.ret_c.T)
-    )
+
+    def fit(critic: Trainable, target: jax.Array) -> tuple[Trainable, jax.Array, jax.Array]:
+        return fit_critic(critic, (batch.obs, target), passes, key, ts.config, axis_name)
+
+    critics = Trainable(stack_critics(ts.params), ts.opt_state["critics"])
+    critics, errors, skipped = jax.vmap(fit)(critics, stack(batch.ret_r, batch.ret_c.T))
     params = {
-        "critic_r": jax.tree.map(operator.itemgetter(0), critics),
-        "critic_c": jax.tree.map(lambda x, c: x[1:].reshape(c.shape), critics, ts.params["critic_c"]),
+        "critic_r": jax.tree.map(operator.itemgetter(0), critics.params),
+        "critic_c": jax.tree.map(
+            lambda x, c: x[1:].reshape(c.shape), critics.params, ts.params["critic_c"]
+        ),
     }
     metrics = {
         "train/value_loss_r": errors[0],
         "train/value_loss_c": errors[1:].reshape(batch.ret_c.shape[1:]),
     }
-    return params, opt_state, skipped.sum(), metrics
-
-
-def see(ts: TrainState | Learned, obs: jax.Array) -> jax.Array:
-    """`obs` [..., O] as the networks see it: what an augmentation appended is left as it is."""
-    if not ts.config.obs_normalize:
-        return obs
-    size = ts.normaliser.mean.shape[-1]
-    return jnp.concatenate([normalise(ts.normaliser, obs[..., :size]), obs[..., size:]], -1)
+    return params, critics.opt_state, skipped.sum(), metrics
 
 
 def init_signals(cfg: Any, costs: int) -> PyTree:
     return init_normaliser(1 + costs) if cfg.reward_normalize or cfg.cost_normalize else ()
 
 
-def scaled_signals(
-    ts: TrainState, reward: jax.Array, cost: jax.Array, axis_name: str | None
-) -> tuple[jax.Array, jax.Array, PyTree]:
-    """Reward [T, N] and cost, [T, N] or [T, N, K], as the learner sees them, and `ts.signals` with
-    them added.
+class Signals(NamedTuple):
+    """Reward [T, N] and cost, [T, N] or [T, N, K], as the learner sees them, and the statistics by
+    which they are scaled."""
 
-    Unlike observations, on which the policy has acted already, a batch is normalised by statistics
-    that include it, as in OmniSafe, so that the critics' first targets have the scale of all others.
+    reward: jax.Array
+    cost: jax.Array
+    normaliser: PyTree
+
+
+def scaled_signals(
+    ts: TrainState,
+    reward: jax.Array,
+    cost: jax.Array,
+    axis_name: str | None,
+    share: jax.Array | float = 1.0,
+) -> Signals:
+    """Reward and cost scaled as the config asks, by statistics that include one in `share` of them.
+
+    Observations are normalised by what was known when the policy acted on them. Rewards and costs are
+    normalised with their own batch, as in OmniSafe, so that the critics' first targets have the scale
+    of all others.
     """
     cfg = ts.config
     if not (cfg.reward_normalize or cfg.cost_normalize):
-        return reward, cost, ()
+        return Signals(reward, cost, ())
     all_of_them = jnp.concatenate([reward[..., None], cost.reshape(*reward.shape, -1)], -1)
-    signals = merge(ts.signals, all_of_them, axis_name)
-    scaled = normalise(signals, all_of_them)
-    return (
+    normaliser = merge(ts.signals, all_of_them, axis_name, share)
+    scaled = normalise(normaliser, all_of_them)
+    return Signals(
         scaled[..., 0] if cfg.reward_normalize else reward,
         scaled[..., 1:].reshape(cost.shape) if cfg.cost_normalize else cost,
-        signals,
+        normaliser,
     )
 
 
-def check(cfg: Any) -> None:
-    """Refuse sizes that do not fit each other."""
-    for name in ("num_envs", "horizon", "minibatches", "cost_window"):
-        if getattr(cfg, name) < 1:
-            raise ConfigError(f"{name}={getattr(cfg, name)}: expected at least 1")
+def check_sizes(cfg: Any) -> None:
+    """Refuse sizes out of their bounds, and those that do not fit each other."""
+    check_values(cfg)
+    check_steps(cfg.num_envs, cfg.horizon)
     # a network with a memory learns from whole sequences, one of each environment
     rows = "num_envs" if cfg.trunk == "gru" else "num_envs * horizon"
     size = cfg.num_envs * (1 if cfg.trunk == "gru" else cfg.horizon)
@@ -483,65 +548,81 @@ def check(cfg: Any) -> None:
         )
 
 
+class Estimate(NamedTuple):
+    """Of one signal, float [T, N]: advantages, the critic's targets, and their errors."""
+
+    advantage: jax.Array
+    target: jax.Array
+    error: jax.Array
+
+
 def estimate(
-    ts: TrainState,
-    traj: Trajectory,
-    carry: PyTree,
-    next_obs: jax.Array,
-    reward: jax.Array,
-    cost: jax.Array,
-    names: Names,
-    axis_name: str | None,
+    ts: TrainState, traj: Trajectory, signals: Signals, names: Names, axis_name: str | None
 ) -> tuple[Batch, Metrics]:
-    """Advantages and targets of `reward` [T, N] and of `cost` [T, N] or, for several `names`,
-    [T, N, K], under the parameters that acted.
+    """The batch: advantages and targets of reward and cost, under the parameters that acted.
+
+    A bad step says nothing: its advantages are 0, and its targets are what the critics say already.
 
     Args:
-        carry: what the policy remembered before the rollout.
-        next_obs: float [T, N, O], whose value each step leads to.
+        ts: the train state before the rollout.
+        traj: the rollout; `next_obs` is what each step's value bootstraps from.
+        names: the costs that have a limit each, on the last axis of `signals.cost`.
+
+    A bad step says nothing: its advantages are 0, and its targets are what the critics say already.
     """
-    cfg = ts.config
-    obs, next_obs = see(ts, traj.obs), see(ts, next_obs)
-    seen, old, v, next_v = read(ts.params, obs, next_obs, traj.first, carry, cfg)
-    ratio = jnp.exp(log_prob(old, traj.action) - traj.log_prob)  # 1: the policy is still the same
-    v_c, next_v_c = (x[..., 1:].reshape(cost.shape) for x in (v, next_v))
+    cfg, bad, weight = ts.config, traj.bad.any, weights(traj.bad, axis_name)
+    obs, next_obs = (network_inputs(ts.normaliser, x) for x in (traj.obs, traj.next_obs))
+    found = apply_to_rollout(ts.params, obs, next_obs, traj.first, ts.rollout.carry, cfg)
+    ratio = jnp.exp(log_prob(found.dist, traj.action) - traj.log_prob)  # 1: the policy has not moved
+    shape = signals.cost.shape
+    v_c, next_v_c = (x[..., 1:].reshape(shape) for x in (found.value, found.next_value))
 
-    def both(v: jax.Array, next_v: jax.Array, signal: jax.Array, discount: Any, decay: Any):
-        ends = traj.terminated, traj.done
-        adv, error = advantages(
-            cfg.estimator, signal, v, next_v, *ends, ratio, discount=discount, decay=decay
+    def of_signal(x: jax.Array, v: jax.Array, next_v: jax.Array, discount: Any, decay: Any) -> Estimate:
+        ends = traj.terminated | bad, traj.done
+        x = jnp.where(bad, v, x)  # whose difference to v is 0
+        advantage, error = advantages(
+            cfg.estimator, x, v, next_v, *ends, ratio, discount=discount, decay=decay
         )
-        return adv, error, error + v
+        return Estimate(advantage, error + v, error)
 
-    adv_r, error_r, ret_r = both(v[..., 0], next_v[..., 0], reward, cfg.discount, cfg.gae_lambda)
-    of_cost = jax.vmap(both, (-1, -1, -1, None, None), -1) if names else both
-    adv_c, error_c, ret_c = of_cost(v_c, next_v_c, cost, cfg.cost_discount, cfg.cost_gae_lambda)
-    # rows of a minibatch: single steps or, with a memory, whole sequences of an environment
-    rows = sequences if cfg.trunk == "gru" else steps
+    v_r, next_v_r = found.value[..., 0], found.next_value[..., 0]
+    of_reward = of_signal(signals.reward, v_r, next_v_r, cfg.discount, cfg.gae_lambda)
+    of_costs = jax.vmap(of_signal, (-1, -1, -1, None, None), -1) if names else of_signal
+    of_cost = of_costs(signals.cost, v_c, next_v_c, cfg.cost_discount, cfg.cost_gae_lambda)
+    # a minibatch has single steps or, for a policy with a memory, whole sequences of an environment
+    lay_out = by_env if cfg.trunk == "gru" else by_step
     batch = Batch(
-        obs=seen if cfg.trunk == "gru" else steps(seen),
-        action=rows(traj.action),
-        log_prob=rows(traj.log_prob),
-        old=jax.tree.map(rows, old),
-        adv_r=rows(standardise(adv_r, axis_name)),
-        adv_c=rows(each(lambda x: centre(x, axis_name), names)(adv_c)),
-        ret_r=rows(ret_r),
-        ret_c=rows(ret_c),
+        obs=found.inputs if cfg.trunk == "gru" else by_step(found.inputs),
+        action=lay_out(traj.action),
+        log_prob=lay_out(traj.log_prob),
+        old=jax.tree.map(lay_out, found.dist),
+        adv_r=lay_out(standardise(of_reward.advantage, axis_name) * weight),
+        adv_c=lay_out(each(lambda x: centre(x, axis_name) * weight, names)(of_cost.advantage)),
+        ret_r=lay_out(of_reward.target),
+        ret_c=lay_out(of_cost.target),
     )
+
+    def explained(error: jax.Array, target: jax.Array) -> jax.Array:
+        return explained_variance(error, target, axis_name)
+
     metrics = {
-        "train/explained_variance_r": explained_variance(error_r, ret_r, axis_name),
-        "train/explained_variance_c": each(
-            lambda error, target: explained_variance(error, target, axis_name), names
-        )(error_c, ret_c),
+        "train/explained_variance_r": explained(of_reward.error, of_reward.target),
+        "train/explained_variance_c": each(explained, names)(of_cost.error, of_cost.target),
     }
     return batch, metrics
 
 
-def steps(x: jax.Array) -> jax.Array:
+def weights(bad: Bad, axis_name: str | None) -> jax.Array:
+    """What a step counts, [T, N]: 0 where it is bad, and 1 on average. NaN where all are bad."""
+    good, size = psum(((~bad.any).sum(), jnp.float32(bad.obs.size)), axis_name)
+    return jnp.where(good > 0, jnp.where(bad.any, 0.0, size / jnp.maximum(good, 1)), jnp.nan)
+
+
+def by_step(x: jax.Array) -> jax.Array:
     """[T * N, ...] of [T, N, ...]."""
     return x.reshape(-1, *x.shape[2:])
 
 
-def sequences(x: jax.Array) -> jax.Array:
+def by_env(x: jax.Array) -> jax.Array:
     """[N, T, ...] of [T, N, ...]."""
     return jnp.swapaxes(x, 0, 1)

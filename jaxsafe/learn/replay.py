@@ -22,11 +22,12 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
+from jaxsafe.learn.batch import pmean, psum, select_rows
 from jaxsafe.types import Count, PyTree
 
 
 @flax.struct.dataclass
-class Row:
+class Record:
     """The arrival at `obs` and the action taken from it; every field is [..., N, ...].
 
     obs: pytree, in its own dtypes. action: float [..., A], ignored where the episode has ended.
@@ -83,7 +84,7 @@ class Transitions(NamedTuple):
 
 
 # (ring, span, index) -> the observations there, pytree [B, ...]
-Look = Callable[[Row, Span, Index], PyTree]
+Look = Callable[[Record, Span, Index], PyTree]
 
 
 def ring_rows(transitions: int, num_envs: int, block: int) -> int:
@@ -91,7 +92,7 @@ def ring_rows(transitions: int, num_envs: int, block: int) -> int:
     return max(1, round(transitions / (num_envs * block))) * block
 
 
-def empty_ring(row: Row, rows: int) -> Row:
+def empty_ring(row: Record, rows: int) -> Record:
     """A ring for rows like `row` [N, ...], arrays or their shapes."""
     return jax.tree.map(lambda x: jnp.zeros((rows, *x.shape), x.dtype), row)
 
@@ -111,7 +112,7 @@ def held(rows: int, block: int, written: Count, iteration: Count, since: Count) 
     return Span((end - count) % rows, count)
 
 
-def write(ring: Row, new: Row, span: Span) -> Row:
+def write(ring: Record, new: Record, span: Span) -> Record:
     """`ring` with the rows `new` [T, N, ...] after those of `span`; T divides the rows of the ring."""
     end = (span.oldest + span.count) % ring.reward.shape[0]
 
@@ -131,7 +132,7 @@ def take(leaves: PyTree, span: Span, index: Index) -> PyTree:
     return jax.tree.map(entries, leaves)
 
 
-def draw(key: jax.Array, ring: Row, span: Span, batch: int, ahead: int = 1) -> Index:
+def draw(key: jax.Array, ring: Record, span: Span, batch: int, ahead: int = 1) -> Index:
     """`batch` rows, uniformly and with replacement, of those with `ahead` rows after them."""
     position_key, env_key = jax.random.split(key)
     choices = jnp.maximum(span.count - ahead, 1)
@@ -141,7 +142,7 @@ def draw(key: jax.Array, ring: Row, span: Span, batch: int, ahead: int = 1) -> I
     )
 
 
-def one_frame(ring: Row, span: Span, index: Index) -> PyTree:
+def one_frame(ring: Record, span: Span, index: Index) -> PyTree:
     return take(ring.obs, span, index)
 
 
@@ -151,7 +152,7 @@ def frames(count: int) -> Look:
     Before an episode's first observation, or before the oldest row, the earliest one is repeated.
     """
 
-    def look(ring: Row, span: Span, index: Index) -> PyTree:
+    def look(ring: Record, span: Span, index: Index) -> PyTree:
         back = jnp.arange(count)[:, None]  # [count, 1]
         earlier = jnp.maximum(index.position - back, 0)
         begins = take(ring.first, span, Index(earlier, index.env)) | (earlier == 0)
@@ -165,7 +166,7 @@ def frames(count: int) -> Look:
 
 
 def transitions(
-    ring: Row,
+    ring: Record,
     span: Span,
     index: Index,
     *,
@@ -214,7 +215,7 @@ def transitions(
     )
 
 
-def sequences(ring: Row, span: Span, index: Index, length: int) -> Row:
+def sequences(ring: Record, span: Span, index: Index, length: int) -> Record:
     """Rows [length, B, ...] from `index` on, for models with a memory.
 
     A sequence may contain ends: it goes on with the next episode, whose row is `first`. The one that
@@ -225,3 +226,16 @@ def sequences(ring: Row, span: Span, index: Index, length: int) -> Row:
     position = (index.position + jnp.arange(length)[:, None]) % span.count
     rows = take(ring, span, Index(position, jnp.broadcast_to(index.env, position.shape)))
     return rows.replace(first=rows.first | (position == 0))
+
+
+def usable(found: Transitions, axis_name: str | None) -> tuple[Transitions, jax.Array]:
+    """`found` without transitions that are not finite, and how many were dropped, over all devices.
+
+    Those are replaced by zeros and weigh 0; the weights of the others sum to 1.
+    """
+    floats = [x for x in jax.tree.leaves(found) if jnp.issubdtype(x.dtype, jnp.floating)]
+    finite = jnp.isfinite(sum(x.sum(tuple(range(1, x.ndim))) for x in floats))
+    kept = select_rows(finite, found, jax.tree.map(jnp.zeros_like, found))
+    total = pmean(kept.weight.sum(), axis_name)
+    dropped = psum((~finite & (found.weight > 0)).sum(), axis_name)
+    return kept._replace(weight=kept.weight / jnp.maximum(total, 1e-6)), dropped

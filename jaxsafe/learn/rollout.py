@@ -3,6 +3,8 @@
 An environment that is done takes the next unused entry of a pool of N fresh resets, so that every
 episode has a layout of its own and a step never pays for a reset. The pool is drawn anew when it
 holds fewer entries than there are environments done.
+
+A world whose step is not finite is bad. The step does not count, and the world is reset.
 """
 
 import dataclasses
@@ -14,16 +16,29 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsafe.config import ConfigError
+from jaxsafe.learn.batch import select_rows
 from jaxsafe.types import Env, PyTree, State
 
+MOST_STEPS = 2**31 - 1  # environment steps of an update, which int32 counts
 # (carry [N, ...], obs [N, O], first [N], key) -> action [N, A], log_prob [N], carry
 Behaviour = Callable[[PyTree, jax.Array, jax.Array, jax.Array], tuple[jax.Array, jax.Array, PyTree]]
 
 
+def check_steps(num_envs: int, horizon: int) -> None:
+    if num_envs * horizon > MOST_STEPS:
+        raise ConfigError(
+            f"num_envs={num_envs} x horizon={horizon}: expected at most {MOST_STEPS:,} steps together"
+        )
+
+
 @flax.struct.dataclass
 class Episode:
-    """Sums over an episode so far: float [N]; costs [N, K]; info a dict of [N]. kept_cost goes on
-    through resets, until `stop` ends an episode."""
+    """Sums over an episode so far: float [N]; costs [N, K]; info a dict of [N].
+
+    kept_cost is like cost, but only an episode that `stop` ends sets it back to 0. OmniSafe's early
+    termination counts cost so (`keep_cost`).
+    """
 
     ret: jax.Array
     cost: jax.Array
@@ -54,13 +69,26 @@ class RolloutState:
     carry: PyTree = ()
 
 
+class Bad(NamedTuple):
+    """What was not finite in a step, of the state before or after it: bool [..., N] each."""
+
+    obs: jax.Array
+    reward: jax.Array
+    cost: jax.Array
+
+    @property
+    def any(self) -> jax.Array:
+        return self.obs | self.reward | self.cost
+
+
 @flax.struct.dataclass
 class Trajectory:
     """T steps of N environments; every field is [T, N, ...].
 
     obs is before the step and next_obs after it, before any reset; first marks the first step of an
     episode; truncated means out of time and not terminated; done is either. episode and length (int32,
-    steps) are sums so far, this step included; ended marks complete episodes that end with it.
+    steps) are sums so far, this step included; ended marks complete episodes that end with it. Where a
+    step is bad, rewards, costs and next_obs are 0, and it is truncated.
     """
 
     obs: jax.Array
@@ -77,19 +105,20 @@ class Trajectory:
     ended: jax.Array
     episode: Episode
     length: jax.Array
+    bad: Bad
 
 
 def init_rollout(env: Env, key: jax.Array, num_envs: int, stagger: bool) -> RolloutState:
     """N fresh environments and a full pool.
 
-    With `stagger` the clocks of the first episodes are spread evenly over [0, episode_length), so
-    that later episodes end spread in time; all those that start above 0 are not complete. The
-    environments do not know: what they observe of the time left is of their own count of steps.
+    With `stagger` the first episodes start at ages spaced evenly over [0, episode_length), so that
+    episodes do not all end at once. Those that start above 0 are not complete. Only the rollout's
+    count of steps is staggered: what an environment itself observes of the time starts at 0.
     """
     state_key, pool_key = jax.random.split(key)
     state = reset_all(env, state_key, num_envs)
-    spread = np.arange(num_envs, dtype=np.int64) * env.episode_length // num_envs  # int32 may overflow
-    steps = jnp.asarray(spread if stagger else 0 * spread, jnp.int32)
+    ages = np.arange(num_envs, dtype=np.int64) * env.episode_length // num_envs  # int32 may overflow
+    steps = jnp.asarray(ages if stagger else 0 * ages, jnp.int32)
     episode = jax.tree.map(jnp.zeros_like, sums(state))
     pool = reset_all(env, pool_key, num_envs)
     return RolloutState(state, steps, episode, steps == 0, pool, jnp.int32(0))
@@ -130,15 +159,19 @@ def collect(
 
     def step(rollout: RolloutState, key: jax.Array) -> tuple[RolloutState, Trajectory]:
         action_key, reset_key = jax.random.split(key)
-        obs = rollout.state.obs
+        lost = ~finite(rollout.state.obs)  # by its reset
+        obs = cleared(lost, rollout.state.obs)
         first = rollout.steps == 0
         action, log_prob, carry = behave(rollout.carry, obs, first, action_key)
         state = jax.vmap(env.step)(rollout.state, action)
+        bad = bad_of(state)
+        bad = bad._replace(obs=bad.obs | lost)
+        state = mended(state, bad)
         steps = rollout.steps + 1
         episode = jax.tree.map(jnp.add, rollout.episode, sums(state))
         stopped = stop(episode)
-        terminated = state.terminated | stopped
-        truncated = (steps >= env.episode_length) & ~terminated
+        terminated = (state.terminated | stopped) & ~bad.any
+        truncated = ((steps >= env.episode_length) | bad.any) & ~terminated
         done = terminated | truncated
         record = Trajectory(
             obs=obs,
@@ -152,9 +185,10 @@ def collect(
             truncated=truncated,
             done=done,
             next_obs=state.obs,
-            ended=done & rollout.complete,
+            ended=done & rollout.complete & ~bad.any,
             episode=episode,
             length=steps,
+            bad=bad,
         )
         rollout = dataclasses.replace(rollout, state=state, steps=steps, episode=episode, carry=carry)
         rollout = restart(env, rollout, done, reset_key)
@@ -188,17 +222,33 @@ def restart(env: Env, rollout: RolloutState, done: jax.Array, key: jax.Array) ->
     entry = used + jnp.cumsum(done) - 1
     return dataclasses.replace(
         rollout,
-        state=where(done, jax.tree.map(lambda x: x[entry], pool), rollout.state),
+        state=select_rows(done, jax.tree.map(lambda x: x[entry], pool), rollout.state),
         steps=jnp.where(done, 0, rollout.steps),
-        episode=where(done, jax.tree.map(jnp.zeros_like, rollout.episode), rollout.episode),
+        episode=select_rows(done, jax.tree.map(jnp.zeros_like, rollout.episode), rollout.episode),
         complete=rollout.complete | done,
         pool=pool,
         used=used + ends,
     )
 
 
-def where(mask: jax.Array, new: PyTree, old: PyTree) -> PyTree:
-    """`new` where `mask` [N] holds, else `old`, in leaves of shape [N, ...]."""
-    return jax.tree.map(
-        lambda a, b: jnp.where(mask.reshape(mask.shape + (1,) * (b.ndim - 1)), a, b), new, old
-    )
+def finite(x: jax.Array) -> jax.Array:
+    """Whether all of each environment is, bool [N], of float [N, ...]."""
+    return jnp.isfinite(x).reshape(x.shape[0], -1).all(1)
+
+
+def bad_of(state: State) -> Bad:
+    """Where a State of N environments is not finite, bool [N] each."""
+    costs = finite(state.costs) & jnp.isfinite(state.cost)
+    return Bad(~finite(state.obs), ~jnp.isfinite(state.reward), ~costs)
+
+
+def mended(state: State, bad: Bad) -> State:
+    """`state` with zeros for what a learner sees of bad worlds. Their physics waits for a reset."""
+    seen = (state.obs, state.reward, state.cost, state.costs, state.info)
+    obs, reward, cost, costs, info = cleared(bad.any, seen)
+    return dataclasses.replace(state, obs=obs, reward=reward, cost=cost, costs=costs, info=info)
+
+
+def cleared(mask: jax.Array, tree: PyTree) -> PyTree:
+    """`tree` with zeros where `mask` [N] holds, in leaves of shape [N, ...]."""
+    return select_rows(mask, jax.tree.map(jnp.zeros_like, tree), tree)

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from jaxsafe.config import ConfigError, config
+from jaxsafe.config import ConfigError, Iterations, KLStop, Rate, config
 from jaxsafe.learn.batch import batch_mean, pmean, select
 from jaxsafe.learn.conventions import Convention
 from jaxsafe.nn.gaussian import Gaussian, kl
@@ -37,33 +37,36 @@ class Context(NamedTuple):
     cfg: the algorithm's config.
     key: a random key, for the step alone.
     axis_name: of the devices that share the batch; None means one device.
-    cost: float [] or [K], J_c, the undiscounted cost of an episode.
-    excess: float [] or [K], J_c - cost_limit.
-    length: float [], mean length of an episode in steps; excess / length is the excess per step.
+    episode_cost: float [] or [K], J_c, the undiscounted cost of an episode.
+    violation: float [] or [K], J_c - cost_limit, per episode.
+    episode_length: float [], mean length of an episode in steps.
     """
 
     iteration: Count
     cfg: Any
     key: jax.Array
     axis_name: str | None
-    cost: jax.Array
-    excess: jax.Array
-    length: jax.Array
+    episode_cost: jax.Array
+    violation: jax.Array
+    episode_length: jax.Array
 
 
-class Step(NamedTuple):
+class PolicyStep(NamedTuple):
     """A rule that moves the policy.
 
     init(actor, cfg) -> opt_state
     update(actor, opt_state, objective, batch, context) -> (actor, opt_state, metrics), with an
         `Objective` or, for steps that weigh reward against cost themselves, a `Pair` of them.
 
-    On a shared trunk `update` trains the critics too (`with_values`), or else `init` refuses it
-    (`own_trunk`).
+    check(cfg) raises ConfigError for settings that the rule cannot serve.
+
+    On a shared trunk `update` trains the critics too (`with_values`), or `check` refuses such a trunk
+    (`require_separate_trunk`).
     """
 
     init: Callable[[PyTree, Any], PyTree]
     update: Callable[..., tuple[PyTree, PyTree, Metrics]]
+    check: Callable[[Any], None] = lambda cfg: None
 
 
 @config
@@ -78,13 +81,13 @@ class AdamConfig:
         ),
     )
 
-    lr: float = 3e-4  # Adam's step of the policy, as in OmniSafe and safety-starter-agents.
+    lr: Rate = 3e-4  # Adam's step of the policy, as in OmniSafe and safety-starter-agents.
     # Whether lr falls on a line to 0 at `total_iterations`. OmniSafe's does.
     lr_decay: bool = False
     # Passes of the policy over a batch. With 8 minibatches they are the 80 steps of
     # safety-starter-agents.
-    epochs: int = 10
-    target_kl: float = 0.02  # Passes stop when KL(old || new) is above this (nats), as in OmniSafe.
+    epochs: Iterations = 10
+    target_kl: KLStop = 0.02  # Passes stop when KL(old || new) is above this (nats), as in OmniSafe.
     # Whether the critics stop when the policy does. OmniSafe's do.
     critics_stop: bool = False
 
@@ -130,15 +133,17 @@ def mean_kl(old: Gaussian, new: Gaussian, axis_name: str | None) -> jax.Array:
     return batch_mean(kl(old, new), axis_name)
 
 
-class Trained(NamedTuple):
-    params: PyTree
-    opt_state: PyTree
+class Trainable(NamedTuple):
+    """What gradient steps move, and their optimiser's state."""
+
+    params: Any
+    opt_state: Any
 
 
 class Passes(NamedTuple):
     """Passes over a batch so far."""
 
-    trained: Trained
+    trained: Trainable
     key: jax.Array
     count: jax.Array  # int32 []
     divergence: jax.Array  # float [], KL(old || new) after the last one
@@ -159,13 +164,13 @@ def update_adam(
     """
     cfg, axis_name = context.cfg, context.axis_name
     objective = with_values(objective, cfg) if cfg.trunk != "separate" else objective
-    left = remaining(context.iteration, cfg) if cfg.lr_decay else 1.0
-    optimiser = adam(cfg.lr * left, cfg)
+    share = remaining(context.iteration, cfg) if cfg.lr_decay else 1.0
+    optimiser = adam(cfg.lr * share, cfg)
 
-    def minibatch_step(trained: Trained, batch: Any) -> tuple[Trained, jax.Array]:
+    def minibatch_step(trained: Trainable, batch: Any) -> tuple[Trainable, jax.Array]:
         grads = jax.grad(lambda actor: -objective(actor, batch)[0])(trained.params)
         params, state, skipped = descend(optimiser, *trained, pmean(grads, axis_name))
-        return Trained(params, state), skipped
+        return Trainable(params, state), skipped
 
     def next_pass(now: Passes) -> Passes:
         key, shuffle_key = jax.random.split(now.key)
@@ -173,7 +178,7 @@ def update_adam(
         divergence = mean_kl(batch.old, policy(trained.params, batch.obs, cfg), axis_name)
         return Passes(trained, key, now.count + 1, divergence, now.skipped + skips.sum())
 
-    start = Passes(Trained(actor, opt_state), context.key, jnp.int32(0), jnp.zeros(()), jnp.int32(0))
+    start = Passes(Trainable(actor, opt_state), context.key, jnp.int32(0), jnp.zeros(()), jnp.int32(0))
     end = jax.lax.while_loop(
         lambda now: (now.count < cfg.epochs) & ~(now.divergence > cfg.target_kl), next_pass, start
     )
@@ -192,7 +197,7 @@ def update_adam(
     )
 
 
-adam_epochs = Step(init=init_adam, update=update_adam)
+adam_epochs = PolicyStep(init=init_adam, update=update_adam)
 
 
 def with_values(objective: Objective, cfg: Any) -> Objective:
@@ -209,67 +214,70 @@ def with_values(objective: Objective, cfg: Any) -> Objective:
         errors = jnp.mean(squares.reshape(-1, squares.shape[-1]), axis=0)
         of_cost = errors[1:].reshape(batch.ret_c.shape[batch.ret_r.ndim :])
         metrics = metrics | {"train/value_loss_r": errors[0], "train/value_loss_c": of_cost}
-        metrics |= {"train/objective": gain}
+        metrics |= {"train/objective": gain}  # the policy's part alone
         return gain - cfg.value_coef * errors.sum(), metrics
 
     return joint
 
 
-def own_trunk(actor: PyTree, cfg: Any) -> tuple[()]:
-    """The empty state of a step that moves the policy alone.
+def require_separate_trunk(cfg: Any) -> None:
+    """Refuse a shared trunk, which a step that moves the policy alone would leave without critics.
 
     Raises:
-        ConfigError: a shared trunk, which such a step would leave without critics.
+        ConfigError: `trunk` is shared, or gru.
     """
     if cfg.trunk != "separate":
         raise ConfigError(
             f"trunk={cfg.trunk}: expected separate, for a natural gradient moves the policy alone; "
             "policy and critics share a trunk where Adam takes the steps, as in ppo_lag or focops"
         )
-    return ()
+
+
+class CriticPasses(NamedTuple):
+    """Passes of a critic over a batch so far, int32 []."""
+
+    critic: Trainable
+    count: jax.Array
 
 
 def fit_critic(
-    critic: PyTree,
-    opt_state: PyTree,
-    obs: jax.Array,
-    target: jax.Array,
+    critic: Trainable,
+    data: tuple[jax.Array, jax.Array],
     passes: jax.Array | int,
     key: jax.Array,
     cfg: Any,
     axis_name: str | None,
-) -> tuple[PyTree, PyTree, jax.Array, jax.Array]:
+) -> tuple[Trainable, jax.Array, jax.Array]:
     """`cfg.critic_epochs` passes of Adam on mean (V - target)^2 + critic_norm_coef sum theta^2.
 
     Args:
-        obs, target: float [B, O] and [B].
-        passes: whose change counts, the first of them.
+        data: observations [B, O] and targets [B].
+        passes: how many passes take effect. The later ones run, too, and are discarded.
     Returns:
-        critic, opt_state, the mean squared error during the last pass that counts, and the number
-        of its and earlier minibatch steps skipped because their gradient was not finite.
+        The critic, the mean squared error during the last pass that takes effect, and the number of
+        minibatch steps up to then that were skipped because their gradient was not finite.
     """
     optimiser = adam(cfg.critic_lr, cfg)
 
-    def loss(critic: PyTree, obs: jax.Array, target: jax.Array) -> tuple[jax.Array, jax.Array]:
-        error = jnp.mean((value(critic, obs, cfg) - target) ** 2)
-        return error + cfg.critic_norm_coef * sum(jnp.sum(x**2) for x in jax.tree.leaves(critic)), error
+    def loss(params: PyTree, obs: jax.Array, target: jax.Array) -> tuple[jax.Array, jax.Array]:
+        error = jnp.mean((value(params, obs, cfg) - target) ** 2)
+        return error + cfg.critic_norm_coef * sum(jnp.sum(x**2) for x in jax.tree.leaves(params)), error
 
-    def minibatch_step(trained: Trained, data: PyTree) -> tuple[Trained, PyTree]:
-        grads, error = jax.grad(loss, has_aux=True)(trained.params, *data)
-        critic, state, skipped = descend(optimiser, *trained, pmean(grads, axis_name))
-        return Trained(critic, state), (error, skipped)
+    def minibatch_step(critic: Trainable, data: PyTree) -> tuple[Trainable, PyTree]:
+        grads, error = jax.grad(loss, has_aux=True)(critic.params, *data)
+        params, state, skipped = descend(optimiser, *critic, pmean(grads, axis_name))
+        return Trainable(params, state), (error, skipped)
 
-    def next_pass(carry: PyTree, key: jax.Array) -> tuple[PyTree, PyTree]:
-        before, done = carry
-        after, metrics = one_pass(minibatch_step, before, (obs, target), key, cfg.minibatches)
-        return (select(done < passes, after, before), done + 1), metrics
+    def next_pass(now: CriticPasses, key: jax.Array) -> tuple[CriticPasses, PyTree]:
+        after, metrics = one_pass(minibatch_step, now.critic, data, key, cfg.minibatches)
+        return CriticPasses(select(now.count < passes, after, now.critic), now.count + 1), metrics
 
-    ((critic, opt_state), _), (errors, skipped) = jax.lax.scan(
-        next_pass, (Trained(critic, opt_state), 0), jax.random.split(key, cfg.critic_epochs)
+    end, (errors, skipped) = jax.lax.scan(
+        next_pass, CriticPasses(critic, jnp.int32(0)), jax.random.split(key, cfg.critic_epochs)
     )
     counted = jnp.arange(cfg.critic_epochs) < passes
     error = errors[jnp.maximum(counted.sum(), 1) - 1]
-    return critic, opt_state, batch_mean(error, axis_name), (skipped * counted[:, None]).sum()
+    return end.critic, batch_mean(error, axis_name), (skipped * counted[:, None]).sum()
 
 
 def stops_critics(cfg: Any) -> bool:

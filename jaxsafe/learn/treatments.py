@@ -7,27 +7,31 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from jaxsafe.config import config
-from jaxsafe.learn.constraints import LimitsConfig, Names, limit, named, unnamed
-from jaxsafe.types import Metrics, PyTree
+from jaxsafe.config import Cap, Iterations, Rate, Share, Weight, config
+from jaxsafe.learn.constraints import LimitsConfig, Names, constrained_costs, limit, total_cost_alone
+from jaxsafe.types import Count, Metrics, PyTree
 
 
 class Treatment(NamedTuple):
-    """init(cfg) -> dual; update(dual, episode_cost, cfg) -> dual, once an iteration, before the
-    policy's step; advantage(dual, adv_r, adv_c) -> float [B], what the policy maximises;
-    metrics(dual); named(cfg) -> the costs it holds under limits of their own, () for `cost` alone.
+    """How the constraint enters the objective, and what is remembered of it: `dual`.
+
+    init(cfg) -> dual.
+    update(dual, episode_cost, cfg, iteration) -> dual, once an iteration, before the policy's step.
+    advantage(dual, adv_r, adv_c) -> float [B], what the policy maximises.
+    metrics(dual) -> metrics.
+    constrained_costs(cfg) -> names of the costs that have a limit each; () for `cost` alone.
     """
 
     init: Callable[[Any], PyTree]
-    update: Callable[[PyTree, jax.Array, Any], PyTree]
+    update: Callable[[PyTree, jax.Array, Any, Count], PyTree]
     advantage: Callable[[PyTree, jax.Array, jax.Array], jax.Array]
     metrics: Callable[[PyTree], Metrics]
-    named: Callable[[Any], Names] = unnamed
+    constrained_costs: Callable[[Any], Names] = total_cost_alone
 
 
-none = Treatment(
+no_treatment = Treatment(
     init=lambda cfg: (),
-    update=lambda dual, episode_cost, cfg: (),
+    update=lambda dual, episode_cost, cfg, iteration: (),
     advantage=lambda dual, adv_r, adv_c: adv_r,
     metrics=lambda dual: {},
 )
@@ -37,10 +41,10 @@ none = Treatment(
 class LagrangianConfig(LimitsConfig):
     """For `lagrangian`."""
 
-    lam_init: float = 0.001  # The price on cost at the start, as in OmniSafe.
-    lam_max: float = float("inf")  # The highest price. As in OmniSafe there is no bound.
+    lam_init: Weight = 0.001  # The price on cost at the start, as in OmniSafe.
+    lam_max: Cap = float("inf")  # The highest price. As in OmniSafe there is no bound.
     # Adam's step of the price, whatever the size of the violation. OmniSafe's is 0.035.
-    dual_lr: float = 0.1
+    dual_lr: Rate = 0.1
 
 
 class Multiplier(NamedTuple):
@@ -48,18 +52,18 @@ class Multiplier(NamedTuple):
     opt_state: PyTree
 
 
-def first_price(cfg: Any) -> jax.Array:
-    return jnp.full(jnp.shape(limit(cfg, named(cfg))), cfg.lam_init, jnp.float32)
+def initial_price(cfg: Any) -> jax.Array:
+    return jnp.full(jnp.shape(limit(cfg, constrained_costs(cfg))), cfg.lam_init, jnp.float32)
 
 
 def init_multiplier(cfg: Any) -> Multiplier:
-    lam = first_price(cfg)
+    lam = initial_price(cfg)
     return Multiplier(lam, optax.adam(cfg.dual_lr).init(lam))
 
 
-def adam_ascent(dual: Multiplier, episode_cost: jax.Array, cfg: Any) -> Multiplier:
+def adam_ascent(dual: Multiplier, episode_cost: jax.Array, cfg: Any, iteration: Count) -> Multiplier:
     """One Adam step on the loss -lam (J_c - cost_limit), then lam in [0, lam_max]."""
-    grad = -(episode_cost - limit(cfg, named(cfg)))
+    grad = -(episode_cost - limit(cfg, constrained_costs(cfg)))
     change, opt_state = optax.adam(cfg.dual_lr).update(grad, dual.opt_state)
     lam: Any = optax.apply_updates(dual.lam, change)
     return Multiplier(jnp.clip(lam, 0.0, cfg.lam_max), opt_state)
@@ -77,7 +81,7 @@ lagrangian = Treatment(
     update=adam_ascent,
     advantage=mixed,
     metrics=lambda dual: {"train/lam": dual.lam},
-    named=named,
+    constrained_costs=constrained_costs,
 )
 
 
@@ -85,14 +89,14 @@ lagrangian = Treatment(
 class PIDConfig(LimitsConfig):
     """For `pid`."""
 
-    lam_init: float = 0.001  # The price on cost at the start, as in OmniSafe.
-    pid_kp: float = 0.1  # Price for each unit of the smoothed violation, as in OmniSafe.
+    lam_init: Weight = 0.001  # The price on cost at the start, as in OmniSafe.
+    pid_kp: Weight = 0.1  # Price for each unit of the smoothed violation, as in OmniSafe.
     # Price that each unit of violation adds in each iteration, as in OmniSafe.
-    pid_ki: float = 0.01
-    pid_kd: float = 0.01  # Price for each unit that the smoothed cost rose, as in OmniSafe.
+    pid_ki: Weight = 0.01
+    pid_kd: Weight = 0.01  # Price for each unit that the smoothed cost rose, as in OmniSafe.
     # Share of the past in the smoothed violation and the smoothed cost, as in OmniSafe.
-    pid_smoothing: float = 0.95
-    pid_delay: int = 10  # Iterations over which the rise is measured, as in OmniSafe.
+    pid_smoothing: Share = 0.95
+    pid_delay: Iterations = 10  # Iterations over which the rise is measured, as in OmniSafe.
 
 
 class PID(NamedTuple):
@@ -109,14 +113,14 @@ class PID(NamedTuple):
 
 
 def init_pid(cfg: Any) -> PID:
-    lam = first_price(cfg)
+    lam = initial_price(cfg)
     zero = jnp.zeros_like(lam)
     return PID(lam, lam, zero, zero, jnp.zeros((cfg.pid_delay, *lam.shape)))
 
 
-def control(dual: PID, episode_cost: jax.Array, cfg: Any) -> PID:
+def control(dual: PID, episode_cost: jax.Array, cfg: Any, iteration: Count) -> PID:
     """lam = (K_p P + I + K_d D)+, from the error's smoothed value, its sum, and the cost's rise."""
-    error = episode_cost - limit(cfg, named(cfg))
+    error = episode_cost - limit(cfg, constrained_costs(cfg))
     integral = jnp.maximum(0.0, dual.integral + cfg.pid_ki * error)
     smooth = cfg.pid_smoothing * dual.error + (1 - cfg.pid_smoothing) * error
     cost = cfg.pid_smoothing * dual.cost + (1 - cfg.pid_smoothing) * episode_cost
@@ -133,7 +137,7 @@ pid = Treatment(
     update=control,
     advantage=lagrangian.advantage,
     metrics=lambda dual: {"train/lam": dual.lam, "train/integral": dual.integral},
-    named=named,
+    constrained_costs=constrained_costs,
 )
 
 
@@ -141,12 +145,12 @@ pid = Treatment(
 class BarrierConfig:
     """For `barrier`."""
 
-    barrier: float = 0.01  # Height of the barrier, 1 / t in the paper, as in OmniSafe.
+    barrier: Weight = 0.01  # Height of the barrier, 1 / t in the paper, as in OmniSafe.
     # The highest price, in standard deviations of A_r per unit of cost, as in OmniSafe.
-    price_max: float = 1.0
+    price_max: Weight = 1.0
 
 
-def barrier_price(dual: jax.Array, episode_cost: jax.Array, cfg: Any) -> jax.Array:
+def barrier_price(dual: jax.Array, episode_cost: jax.Array, cfg: Any, iteration: Count) -> jax.Array:
     """The slope of the barrier -barrier log(cost_limit - J_c), or price_max where there is none."""
     slack = cfg.cost_limit - episode_cost
     price = cfg.barrier / jnp.where(slack > 0, slack, 1.0)
@@ -168,12 +172,12 @@ class PenaltyConfig:
     """For `penalty`."""
 
     # Standard deviations of A_r that a unit of cost costs. The number is ours; nobody published one.
-    price: float = 0.5
+    price: Weight = 0.5
 
 
 penalty = Treatment(
     init=lambda cfg: jnp.asarray(cfg.price, jnp.float32),
-    update=lambda price, episode_cost, cfg: price,
+    update=lambda price, episode_cost, cfg, iteration: price,
     advantage=lambda price, adv_r, adv_c: adv_r - price * adv_c,
     metrics=lambda price: {"train/lam": price},
 )
@@ -184,14 +188,16 @@ class SwitchConfig:
     """For `switch`."""
 
     # Cost per episode by which the limit may be exceeded before a step lowers cost, as in OmniSafe.
-    tolerance: float = 2.0
+    tolerance: Weight = 2.0
 
 
 # Xu, Liang and Lan (2021), "CRPO: A New Approach for Safe Reinforcement Learning with Convergence
 # Guarantee", arXiv:2011.05869, algorithm 1
 switch = Treatment(
     init=lambda cfg: jnp.bool_(False),
-    update=lambda over_limit, episode_cost, cfg: episode_cost > cfg.cost_limit + cfg.tolerance,
+    update=lambda over_limit, episode_cost, cfg, iteration: (
+        episode_cost > cfg.cost_limit + cfg.tolerance
+    ),
     advantage=lambda over_limit, adv_r, adv_c: jnp.where(over_limit, -adv_c, adv_r),
     metrics=lambda over_limit: {"train/over_limit": over_limit},
 )

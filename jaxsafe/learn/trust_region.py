@@ -5,16 +5,16 @@ Vectors are flat, float [P]: the policy's parameters through `ravel_pytree`.
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from jaxsafe.config import config
+from jaxsafe.config import Bounds, Iterations, Weight, config
 from jaxsafe.learn.batch import all_finite, pmean
 from jaxsafe.learn.conventions import Convention
-from jaxsafe.learn.steps import Context, Objective, Step, mean_kl, own_trunk
+from jaxsafe.learn.steps import Context, Objective, PolicyStep, mean_kl, require_separate_trunk
 from jaxsafe.nn.gaussian import Gaussian, kl
 from jaxsafe.nn.networks import policy
 from jaxsafe.types import Metrics, PyTree
@@ -30,27 +30,27 @@ class NaturalConfig:
         Convention(
             {"kl_per_action": True, "target_kl": 0.01},
             "the KL of the trust region, and H with it, is a mean over action dimensions",
-            "their sum, with a bound for 2 dimensions; beside H our damping is then half as large",
+            "it is their sum, with a bound for 2 dimensions; beside it our damping is half as large",
         ),
     )
 
     # delta, the KL of a step (nats). OmniSafe's 0.01 is a mean over the action's dimensions, of which
     # Point and Car have 2.
-    target_kl: float = 0.02
+    target_kl: Annotated[float, Bounds(1e-9, 10)] = 0.02
     # Whether the KL is a mean over the action's dimensions, not their sum. OmniSafe's is.
     kl_per_action: bool = False
     # Added to the diagonal of the Fisher matrix, as in OmniSafe and safety-starter-agents.
-    damping: float = 0.1
-    cg_iterations: int = 15  # Iterations of conjugate gradients, as in OmniSafe.
+    damping: Weight = 0.1
+    cg_iterations: Iterations = 15  # Iterations of conjugate gradients, as in OmniSafe.
 
 
 @config
 class TrustRegionConfig(NaturalConfig):
     """For those that search the largest safe step along them."""
 
-    line_search_tries: int = 15  # Steps that the line search tries at most, as in OmniSafe.
+    line_search_tries: Iterations = 15  # Steps that the line search tries at most, as in OmniSafe.
     # Each step tried is this much of the one before, as in OmniSafe and safety-starter-agents.
-    line_search_shrink: float = 0.8
+    line_search_shrink: Annotated[float, Bounds(0.01, 0.99)] = 0.8
 
 
 def fisher_product(
@@ -84,6 +84,15 @@ def distance(old: Gaussian, new: Gaussian, cfg: Any, axis_name: str | None) -> j
     return mean_kl(old, new, axis_name) / dimensions(old, cfg)
 
 
+class CG(NamedTuple):
+    """The state of conjugate gradients: float [P], and the squared norm of the residual, float []."""
+
+    x: jax.Array
+    residual: jax.Array
+    direction: jax.Array
+    residual_sq: jax.Array
+
+
 def conjugate_gradient(matvec: Matvec, b: jax.Array, iterations: int) -> tuple[jax.Array, jax.Array]:
     """Solve A x = b for a symmetric positive definite A: (x, ||b - A x|| / ||b||).
 
@@ -95,24 +104,33 @@ def conjugate_gradient(matvec: Matvec, b: jax.Array, iterations: int) -> tuple[j
     scale = jnp.linalg.norm(b)
     b = b / jnp.where(scale > 0, scale, 1.0)  # squares of small gradients would underflow
 
-    def iterate(_: int, carry: Any) -> Any:
-        x, r, p, rr = carry
-        a_p = matvec(p)
-        curvature = p @ a_p
-        going = (rr > 1e-14) & (curvature > 0)
-        alpha = jnp.where(going, rr / jnp.where(going, curvature, 1.0), 0.0)
-        r_new = r - alpha * a_p
-        rr_new = r_new @ r_new
-        beta = jnp.where(going, rr_new / jnp.where(going, rr, 1.0), 0.0)
-        return x + alpha * p, r_new, jnp.where(going, r_new + beta * p, p), rr_new
+    def iterate(_: int, now: CG) -> CG:
+        product = matvec(now.direction)
+        curvature = now.direction @ product
+        going = (now.residual_sq > 1e-14) & (curvature > 0)
+        alpha = jnp.where(going, now.residual_sq / jnp.where(going, curvature, 1.0), 0.0)
+        residual = now.residual - alpha * product
+        residual_sq = residual @ residual
+        beta = jnp.where(going, residual_sq / jnp.where(going, now.residual_sq, 1.0), 0.0)
+        direction = jnp.where(going, residual + beta * now.direction, now.direction)
+        return CG(now.x + alpha * now.direction, residual, direction, residual_sq)
 
-    x, _, _, rr = jax.lax.fori_loop(0, iterations, iterate, (jnp.zeros_like(b), b, b, b @ b))
-    return scale * x, jnp.sqrt(rr)
+    end = jax.lax.fori_loop(0, iterations, iterate, CG(jnp.zeros_like(b), b, b, b @ b))
+    return scale * end.x, jnp.sqrt(end.residual_sq)
+
+
+class Trial(NamedTuple):
+    """Whether a step was accepted, bool [], and how many were tried before it, int32 []."""
+
+    accepted: jax.Array
+    tried: jax.Array
 
 
 class Search(NamedTuple):
-    """Whether a step was accepted, bool [], and how many were tried before it, int32 []."""
+    """Where a line search ends: params [P], whether a step was accepted, bool [], and how many were
+    tried before it, int32 []."""
 
+    params: jax.Array
     accepted: jax.Array
     tried: jax.Array
 
@@ -123,29 +141,27 @@ def line_search(
     step: jax.Array,
     tries: int,
     shrink: float,
-) -> tuple[jax.Array, jax.Array, jax.Array]:
+) -> Search:
     """The first of start + shrink^i step, i < tries, that `accept` takes; else `start`.
 
     Args:
         accept: params [P] -> bool []. Comparisons with NaN are False, so it should ask for what
             must hold rather than for what must not.
-    Returns:
-        params [P], accepted (bool []), and i (int32 [], `tries` if there is none).
     """
 
     def candidate(i: jax.Array) -> jax.Array:
         return start + shrink ** i.astype(start.dtype) * step
 
-    def attempt(now: Search) -> Search:
+    def attempt(now: Trial) -> Trial:
         ok = accept(candidate(now.tried))
-        return Search(ok, now.tried + jnp.where(ok, 0, 1))
+        return Trial(ok, now.tried + jnp.where(ok, 0, 1))
 
     accepted, i = jax.lax.while_loop(
         lambda now: ~now.accepted & (now.tried < tries),
         attempt,
-        Search(jnp.bool_(False), jnp.int32(0)),
+        Trial(jnp.bool_(False), jnp.int32(0)),
     )
-    return jnp.where(accepted, candidate(i), start), accepted, i
+    return Search(jnp.where(accepted, candidate(i), start), accepted, i)
 
 
 def update_natural(
@@ -182,23 +198,31 @@ def update_natural(
         return (gain >= before) & (divergence <= cfg.target_kl) if search else jnp.isfinite(gain)
 
     tries, shrink = (cfg.line_search_tries, cfg.line_search_shrink) if search else (1, 1.0)
-    params, accepted, tried = line_search(accept, start, step, tries, shrink)
-    after, divergence = evaluate(params)
+    found = line_search(accept, start, step, tries, shrink)
+    after, divergence = evaluate(found.params)
     return (
-        unravel(params),
+        unravel(found.params),
         opt_state,
         {
             "train/kl": divergence,
             "train/objective": after - before,
-            "train/accepted": accepted,
-            "train/line_search": tried,
+            "train/accepted": found.accepted,
+            "train/line_search": found.tried,
             "train/cg_residual_r": residual,
             "train/nonfinite": ~all_finite((g, step)),
         },
     )
 
 
+def no_state(actor: PyTree, cfg: Any) -> tuple[()]:
+    return ()
+
+
 # Kakade (2001), "A Natural Policy Gradient", with the step's length from the trust region
-natural_gradient = Step(own_trunk, partial(update_natural, search=False))
+natural_gradient = PolicyStep(
+    init=no_state, update=partial(update_natural, search=False), check=require_separate_trunk
+)
 # Schulman et al. (2015), "Trust Region Policy Optimization", arXiv:1502.05477, appendix C
-trust_region = Step(own_trunk, partial(update_natural, search=True))
+trust_region = PolicyStep(
+    init=no_state, update=partial(update_natural, search=True), check=require_separate_trunk
+)

@@ -1,4 +1,4 @@
-"""Diagonal Gaussians: the distribution of every policy here."""
+"""Diagonal Gaussians. On-policy methods use them as they are; `squashed` takes their tanh."""
 
 import math
 from typing import NamedTuple
@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 
 class Gaussian(NamedTuple):
-    """mean, log_std: float [..., A]. Actions are not squashed: environments clip them."""
+    """mean, log_std: float [..., A]."""
 
     mean: jax.Array
     log_std: jax.Array

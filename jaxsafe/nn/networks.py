@@ -70,13 +70,23 @@ def mlp(cfg: Any, out: int, gain: float = 1.0) -> MLP:
     return MLP(cfg.hidden, out, cfg.init, cfg.activation, gain)
 
 
+def coarse_mlp(cfg: Any, out: int, layer_norm: bool = False) -> MLP:
+    """With products in the device's own precision (TensorFloat-32 on a GPU): enough for Q-learning and
+    imitation, which bound no KL."""
+    precision = jax.lax.Precision.DEFAULT
+    return MLP(cfg.hidden, out, cfg.init, cfg.activation, layer_norm=layer_norm, precision=precision)
+
+
 def policy_outputs(action_size: int, cfg: Any) -> int:
     return 2 * action_size if cfg.std == "state" else action_size
 
 
 def init_params(key: jax.Array, obs_size: int, action_size: int, cfg: Any) -> dict[str, PyTree]:
-    """{'actor': {'mean', 'log_std' [A]}, 'critic_r', 'critic_c'}, where with `std` 'state' the second
-    half of what 'mean' gives is added to log_std."""
+    """{'actor': {'mean', 'log_std' [A]}, 'critic_r', 'critic_c'}.
+
+    'mean' is the policy's network. With `std` 'state' the second half of its outputs is added to
+    log_std; on a common trunk the last outputs are values.
+    """
     keys, obs = jax.random.split(key, 3), jnp.zeros(obs_size)
     actor = {
         "mean": mlp(cfg, policy_outputs(action_size, cfg), gain=0.01).init(keys[0], obs),
@@ -100,7 +110,7 @@ def share_trunk(params: dict[str, PyTree], cfg: Any) -> dict[str, PyTree]:
     """{'actor'} alone: the policy's hidden layers, with the critics' outputs after its own."""
     layers, last = params["actor"]["mean"]["params"], f"Dense_{len(cfg.hidden)}"
     joined = jax.tree.map(
-        lambda own, critics: jnp.concatenate([own, jnp.moveaxis(critics[..., 0], 0, -1)], -1),
+        lambda policy, critics: jnp.concatenate([policy, jnp.moveaxis(critics[..., 0], 0, -1)], -1),
         layers[last],
         stack_critics(params)["params"][last],
     )
@@ -137,32 +147,32 @@ def net_of(actor: PyTree, cfg: Any) -> Recurrent:
     return recurrent(cfg, actor["log_std"].shape[-1], critics)
 
 
-def outputs(actor: PyTree, seen: Any, cfg: Any) -> tuple[jax.Array, jax.Array]:
+def outputs(actor: PyTree, inputs: Any, cfg: Any) -> tuple[jax.Array, jax.Array]:
     """What the actor's network gives: the policy's outputs and, of a common trunk, the critics' values
     of reward and of each cost, float [..., 1 + K].
 
     Args:
-        seen: observations [..., O] or, for a recurrent network, `Sequences`.
+        inputs: observations [..., O] or, for a recurrent network, `Sequences`.
     """
     size = policy_outputs(actor["log_std"].shape[-1], cfg)
     if cfg.trunk == "gru":
-        out: Any = unroll(net_of(actor, cfg), actor["mean"], seen)[1]
+        out: Any = unroll(net_of(actor, cfg), actor["mean"], inputs)[1]
     else:
         last = actor["mean"]["params"][f"Dense_{len(cfg.hidden)}"]
-        out = mlp(cfg, last["bias"].shape[-1]).apply(actor["mean"], seen)
+        out = mlp(cfg, last["bias"].shape[-1]).apply(actor["mean"], inputs)
     return out[..., :size], out[..., size:]
 
 
-def policy(actor: PyTree, seen: Any, cfg: Any) -> Gaussian:
+def policy(actor: PyTree, inputs: Any, cfg: Any) -> Gaussian:
     """The policy's action distribution; its mean and log std are [..., A].
 
     Args:
-        seen: observations [..., O] or, for a recurrent network, `Sequences`.
+        inputs: observations [..., O] or, for a recurrent network, `Sequences`.
     """
-    return distribution(actor, outputs(actor, seen, cfg)[0], cfg)
+    return distribution(actor, outputs(actor, inputs, cfg)[0], cfg)
 
 
-def remember(
+def recurrent_step(
     actor: PyTree, carry: jax.Array, obs: jax.Array, cfg: Any
 ) -> tuple[jax.Array, Gaussian, jax.Array]:
     """One step of a recurrent network: what it remembers [..., H], the action distribution, values."""
@@ -193,29 +203,29 @@ def values(params: dict[str, PyTree], obs: jax.Array, cfg: Any) -> jax.Array:
     return jax.vmap(lambda critic: value(critic, obs, cfg), out_axes=-1)(stack_critics(params))
 
 
-class Reading(NamedTuple):
-    """What the networks say of a rollout of T steps in N environments.
+class RolloutOutputs(NamedTuple):
+    """What the networks give for a rollout of T steps in N environments.
 
-    seen: what `policy` takes to say it again: observations [T, N, O], or `Sequences` of N.
+    inputs: what `policy` takes to compute `dist` anew: observations [T, N, O], or `Sequences` of N.
     dist: the action distribution [T, N, A].
     value, next_value: float [T, N, 1 + K], of the observation before and after each step.
     """
 
-    seen: Any
+    inputs: Any
     dist: Gaussian
     value: jax.Array
     next_value: jax.Array
 
 
-def read(
+def apply_to_rollout(
     params: dict[str, PyTree],
     obs: jax.Array,
     next_obs: jax.Array,
     first: jax.Array,
     carry: PyTree,
     cfg: Any,
-) -> Reading:
-    """Read a rollout.
+) -> RolloutOutputs:
+    """The networks' outputs for a rollout.
 
     Args:
         obs, next_obs: float [T, N, O], before and after each step, before any reset.
@@ -225,10 +235,10 @@ def read(
     actor = params["actor"]
     if cfg.trunk != "gru":
         v, next_v = values(params, obs, cfg), values(params, next_obs, cfg)
-        return Reading(obs, policy(actor, obs, cfg), v, next_v)
-    seen = Sequences(jnp.swapaxes(obs, 0, 1), jnp.swapaxes(first, 0, 1), carry)
-    h, out = unroll(net_of(actor, cfg), actor["mean"], seen)
+        return RolloutOutputs(obs, policy(actor, obs, cfg), v, next_v)
+    inputs = Sequences(jnp.swapaxes(obs, 0, 1), jnp.swapaxes(first, 0, 1), carry)
+    h, out = unroll(net_of(actor, cfg), actor["mean"], inputs)
     h, out = jnp.swapaxes(h, 0, 1), jnp.swapaxes(out, 0, 1)
     size = policy_outputs(actor["log_std"].shape[-1], cfg)
-    _, _, next_v = remember(actor, h, next_obs, cfg)
-    return Reading(seen, distribution(actor, out[..., :size], cfg), out[..., size:], next_v)
+    _, _, next_v = recurrent_step(actor, h, next_obs, cfg)
+    return RolloutOutputs(inputs, distribution(actor, out[..., :size], cfg), out[..., size:], next_v)

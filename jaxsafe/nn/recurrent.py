@@ -24,7 +24,7 @@ class Sequences(NamedTuple):
 
 
 class GRU(nn.Module):
-    """One step: what is remembered, h [..., H], after x [..., I] is seen.
+    """One step: the memory h [..., H] after the input x [..., I].
 
         z = sigmoid(W_z [x, h]),   r = sigmoid(W_r [x, h])
         h <- (1 - z) tanh(W x + r U h) + z h
@@ -64,7 +64,7 @@ class Recurrent(nn.Module):
         return h, jnp.concatenate([head(h) for head in self.heads], -1)
 
 
-def unroll(net: Recurrent, params: PyTree, seen: Sequences) -> tuple[jax.Array, jax.Array]:
+def unroll(net: Recurrent, params: PyTree, inputs: Sequences) -> tuple[jax.Array, jax.Array]:
     """What is remembered after each step, float [B, T, H], and the outputs [B, T, out]."""
 
     def step(h: jax.Array, now: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, Any]:
@@ -72,7 +72,7 @@ def unroll(net: Recurrent, params: PyTree, seen: Sequences) -> tuple[jax.Array, 
         h, out = net.apply(params, jnp.where(first[:, None], 0.0, h), obs)  # type: ignore[misc]
         return h, (h, out)
 
-    time_first = jnp.swapaxes(seen.obs, 0, 1), jnp.swapaxes(seen.first, 0, 1)
-    _, found = jax.lax.scan(step, seen.carry, time_first)
+    time_first = jnp.swapaxes(inputs.obs, 0, 1), jnp.swapaxes(inputs.first, 0, 1)
+    _, found = jax.lax.scan(step, inputs.carry, time_first)
     h, out = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), found)
     return h, out

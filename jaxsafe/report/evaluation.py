@@ -10,10 +10,10 @@ import numpy as np
 from jaxsafe.learn.constraints import limits_of
 from jaxsafe.report import scores, stats
 from jaxsafe.report.stats import Estimate
-from jaxsafe.run import run_folder
+from jaxsafe.run import memory, run_folder
 from jaxsafe.run.evaluate import Episodes, measures, run_episodes
-from jaxsafe.run.policies import Opened
-from jaxsafe.run.spread import members
+from jaxsafe.run.policies import RunPolicies
+from jaxsafe.run.programs import members
 
 
 class Scores(NamedTuple):
@@ -29,9 +29,11 @@ class Scores(NamedTuple):
         return table(self.rows)
 
 
-def evaluate(run: Opened, num: int, seed: int) -> list[Scores]:
+def evaluate(run: RunPolicies, num: int, seed: int) -> list[Scores]:
     """`num` fresh episodes of each seed in each setting."""
     settings = run.settings
+    policies = len(settings.configs) * settings.train.num_seeds
+    memory.check_episodes(run.env, num, policies)
     episodes = run_episodes(run.algo, run.params, num, seed)
     tables = list(run_folder.by_setting(run_folder.read_metrics(run.folder)).values())
     cost_names = run.algo.task(jax.tree.map(lambda x: x[0], run.params)).cost_names
@@ -100,5 +102,9 @@ def table(rows: dict[str, Estimate]) -> str:
     return "\n".join([f"{'':<22}{'mean':>10}   95 % interval", *(line(n, e) for n, e in rows.items())])
 
 
-def as_json(rows: dict[str, Estimate]) -> dict[str, list[float | None]]:
-    return {name: [x if math.isfinite(x) else None for x in e] for name, e in rows.items()}
+def as_json(rows: dict[str, Estimate]) -> dict[str, dict[str, float | None]]:
+    """{'return': {'mean': 1.5, 'low': 1.2, 'high': 1.8}, ...}, with null for what is not finite."""
+    return {
+        name: {k: x if math.isfinite(x) else None for k, x in e._asdict().items()}
+        for name, e in rows.items()
+    }

@@ -1,11 +1,13 @@
 """Films of policies as they act."""
 
+import os
 from pathlib import Path
 
 import jax
 
 from jaxsafe.config import ConfigError, one_line
 from jaxsafe.envs.view import render
+from jaxsafe.run import files
 from jaxsafe.run.policies import Actor
 
 OF_PHYSICS = ("engine", "awake")  # options that leave a task what it is
@@ -16,8 +18,15 @@ class NoVideo(RuntimeError):
 
 
 def check_video(path: Path) -> None:
+    """Make the folder of a film. Raise ConfigError where none could be written."""
     if path.suffix not in (".mp4", ".gif"):
         raise ConfigError(f"{path}: expected a name that ends in .mp4 or .gif")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}") from error
+    if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
+        raise ConfigError(f"{path} cannot be written")
 
 
 def film(actors: list[Actor], path: Path, seed: int, labels: list[str] | None = None) -> None:
@@ -34,7 +43,9 @@ def film(actors: list[Actor], path: Path, seed: int, labels: list[str] | None = 
         ]
     except render.NoDisplay as error:
         raise NoVideo(one_line(error)) from error
-    render.write_video(render.side_by_side(films), path, fps=30)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with files.replacing(path) as part:
+        render.write_video(render.side_by_side(films), part, fps=30)
 
 
 def check_one_task(folders: list[Path], actors: list[Actor]) -> None:

@@ -4,17 +4,17 @@ import functools
 import json
 
 from jaxsafe.config import one_line
-from jaxsafe.learn.constraints import in_words, own_limits
+from jaxsafe.learn.constraints import limits_by_name, limits_in_words
 from jaxsafe.report import evaluation, plots
 from jaxsafe.report.film import film
-from jaxsafe.run import run_folder
+from jaxsafe.run import files, run_folder
 from jaxsafe.run.interrupts import Interrupts
-from jaxsafe.run.policies import Opened, policy_of
-from jaxsafe.run.progress import Report
+from jaxsafe.run.policies import RunPolicies, policy_of
+from jaxsafe.run.progress import Reporter
 from jaxsafe.run.session import Session
 
 
-def finish(session: Session, report: Report, stop: Interrupts) -> None:
+def finish(session: Session, report: Reporter, stop: Interrupts) -> None:
     """Curves, evaluation and video. What fails costs one line, never the training.
 
     Raises:
@@ -23,38 +23,45 @@ def finish(session: Session, report: Report, stop: Interrupts) -> None:
     settings, folder, env = session.settings, session.folder, session.env
     train = settings.train
     title = f"{settings.env_name}, {settings.algo_name}"
-    run = functools.cache(lambda: Opened(folder, settings, env, *policy_of(settings, env, folder)))
+    run = functools.cache(lambda: RunPolicies(folder, settings, env, *policy_of(settings, env, folder)))
 
     def curves() -> None:
         limit = float(settings.algo.cost_limit)
-        metrics, own = run_folder.read_metrics(folder), own_limits(settings.algo)
+        metrics, own = run_folder.read_metrics(folder), limits_by_name(settings.algo)
         plots.curves(metrics, folder / "curves.png", title, limit, own)
 
     def scores() -> None:
         found = evaluation.evaluate(run(), train.eval_episodes, train.seed)
         tables = {s.name: evaluation.as_json(s.rows) | {"seeds": s.seeds} for s in found}
         text = json.dumps({"episodes": train.eval_episodes, **tables.get("", tables)}, indent=1)
-        run_folder.replace_text(folder / "evaluation.json", text)
+        files.write(folder / "evaluation.json", text)
         for name, limits, episodes, rows, _ in found:
             ret, cost, rate = rows["return"], rows["cost"], rows["violation rate"]
             report.line(
                 f"final policy{name and ', ' + name}: return {ret.mean:.4g} [{ret.low:.4g}, "
                 f"{ret.high:.4g}], cost {cost.mean:.4g} [{cost.low:.4g}, {cost.high:.4g}] "
-                f"(limit {in_words(limits)}), "
+                f"(limit {limits_in_words(limits)}), "
                 f"{100 * rate.mean:.0f}% of {episodes} episodes over it"
             )
 
     def video() -> None:
         film([run().actor(0)], folder / "video.mp4", train.seed)
 
+    members = len(settings.configs) * train.num_seeds
     wanted = {
-        "curves": (curves, True),
-        "evaluation": (scores, train.eval_episodes > 0),
-        "video": (video, train.video),
+        "curves": (curves, True, ""),
+        "evaluation": (
+            scores,
+            train.eval_episodes > 0,
+            f"evaluating {members} x {train.eval_episodes} episodes ...",
+        ),
+        "video": (video, train.video, "filming an episode ..."),
     }
-    for name, (task, yes) in wanted.items():
+    for name, (task, yes, about) in wanted.items():
         try:
             if yes:
+                if about:
+                    report.line(about)
                 task()
         except Exception as error:  # training is done and saved; this is an extra
             report.line(f"no {name}: {one_line(error)}")

@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxsafe.config import ConfigError, nearest
-from jaxsafe.learn.constraints import written
+from jaxsafe.learn.constraints import cost_title
 from jaxsafe.report import stats
-from jaxsafe.report.read import Run
+from jaxsafe.report.read import SettingRun
 from jaxsafe.report.stats import Estimate
 from jaxsafe.run import run_folder
 
@@ -19,7 +19,7 @@ class Group(NamedTuple):
 
     env: str
     by: dict[str, Any]
-    runs: list[Run]
+    runs: list[SettingRun]
 
     @property
     def name(self) -> str:
@@ -77,6 +77,11 @@ class Group(NamedTuple):
         return self.estimate("cost")
 
     @property
+    def estimated(self) -> bool:
+        """Whether no episode has ended in any run, so that return and cost are estimates."""
+        return all(run.estimated for run in self.runs)
+
+    @property
     def held(self) -> str:
         """Whether each limit is: 'unclear' where the mean is above it and its interval is not."""
 
@@ -87,7 +92,7 @@ class Group(NamedTuple):
                 return "yes"
             return "unclear" if cost.low <= limit else "no"
 
-        found = {answer(self.estimate(written(name)), most) for name, most in self.limits.items()}
+        found = {answer(self.estimate(cost_title(name)), most) for name, most in self.limits.items()}
         return next((word for word in ("no", "-", "unclear", "yes") if word in found), "-")
 
 
@@ -96,7 +101,7 @@ def over_seeds(values: tuple[float, ...], statistic: Callable[..., np.ndarray]) 
     return stats.estimate(np.array(values), statistic=statistic)
 
 
-def group(runs: Sequence[Run], by: Sequence[str]) -> list[Group]:
+def group(runs: Sequence[SettingRun], by: Sequence[str]) -> list[Group]:
     """The runs of each task, told apart by some fields of their configs.
 
     Raises:
@@ -127,7 +132,7 @@ def differing(groups: Iterable[Group]) -> dict[str, list[Any]]:
     return found
 
 
-def telling(runs: Sequence[Run]) -> list[str]:
+def telling(runs: Sequence[SettingRun]) -> list[str]:
     """Fields that tell all settings apart: the algorithm and, where they differ, preset, compat and
     others."""
     by = ["algo.name"]

@@ -10,15 +10,17 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from matplotlib.ticker import EngFormatter
 
-from jaxsafe.learn.constraints import written
+from jaxsafe.learn.constraints import cost_title
 from jaxsafe.report import stats
-from jaxsafe.run import run_folder
+from jaxsafe.run import files, run_folder
 
 FORMATS = ("png", "svg")
 LONG = 30  # letters of a name in the legend that leave the panels too little room
 MARKERS = {"-": "o", "--": "s", ":": "^", "-.": "v"}  # by the kind of line that goes with it
+ESTIMATED = "estimate, no episode ended yet"
 PANELS = (("train/return", "return of an episode"), ("train/cost", "cost of an episode"))
 
 
@@ -28,7 +30,7 @@ EVALUATED = {"": ("evaluated, mean action", "o"), "_sampled": ("evaluated, sampl
 
 def by_seed(metrics: dict[str, np.ndarray], name: str) -> tuple[np.ndarray, np.ndarray]:
     """Steps [T] and values [S, T] of one metric; NaN where a seed has no value yet."""
-    clock = metrics[run_folder.clock_of(metrics)]
+    clock = metrics[run_folder.step_column(metrics)]
     steps, seeds = np.unique(clock), np.unique(metrics["seed"])
     values = np.full((len(seeds), len(steps)), np.nan)
     values[np.searchsorted(seeds, metrics["seed"]), np.searchsorted(steps, clock)] = metrics[name]
@@ -66,7 +68,8 @@ def curves(
     for axes, (name, label) in zip(figure.subplots(1, len(panels)), panels, strict=True):
         for i, (setting, table) in enumerate(settings.items()):
             if name in table and len(table["steps"]):
-                draw(axes, *by_seed(table, name), f"C{i % 10}", setting)
+                column, estimated = drawn_of(table, name)
+                draw(axes, *by_seed(table, column), f"C{i % 10}", setting, estimated)
             for end, (called, marker) in EVALUATED.items():
                 if (column := name.replace("train/", "eval/") + end) in table:
                     look = {"marker": marker, "mfc": "none" if end else None, "color": f"C{i % 10}"}
@@ -80,32 +83,49 @@ def curves(
         if axes.get_legend_handles_labels()[0]:
             axes.legend(frameon=False, fontsize="small")
     figure.suptitle(title)
-    figure.savefig(path, dpi=120)
+    write(figure, path, dpi=120)
+
+
+def drawn_of(table: Mapping[str, np.ndarray], name: str) -> tuple[str, bool]:
+    """The column to draw for a metric: its estimate, and True, where no episode has ended yet."""
+    other = run_folder.estimate_of(name)
+    estimated = other in table and not np.isfinite(table[name]).any()
+    return (other, True) if estimated else (name, False)
 
 
 def evaluated(metrics: Mapping[str, np.ndarray], name: str) -> tuple[np.ndarray, np.ndarray]:
     """Where a metric has values, as steps [T], and their means over seeds [T]."""
     known = np.isfinite(metrics[name])
-    clock, values = metrics[run_folder.clock_of(metrics)][known], metrics[name][known]
+    clock, values = metrics[run_folder.step_column(metrics)][known], metrics[name][known]
     steps = np.unique(clock)
     return steps, np.array([values[clock == step].mean() for step in steps])
 
 
 def axis_of(metrics: Mapping[str, np.ndarray]) -> str:
     """What the axis of training is called."""
-    known = metrics and run_folder.clock_of(metrics) == "updates"
+    known = metrics and run_folder.step_column(metrics) == "updates"
     return "gradient steps" if known else "environment steps"
 
 
-def draw(axes: Axes, steps: np.ndarray, values: np.ndarray, color: str, setting: str) -> None:
-    """The curves of one setting, `values` [S, T]."""
-    alone = len(values) == 1
-    lines = axes.plot(steps, values.T, color=color, lw=1.2 if alone else 0.6, alpha=1 if alone else 0.4)
+def draw(
+    axes: Axes,
+    steps: np.ndarray,
+    values: np.ndarray,
+    color: str,
+    setting: str,
+    estimated: bool = False,
+) -> None:
+    """The curves of one setting, `values` [S, T]. Estimates are dashed."""
+    alone, ls = len(values) == 1, "--" if estimated else "-"
+    look = {"lw": 1.2 if alone else 0.6, "alpha": 1 if alone else 0.4, "color": color, "ls": ls}
+    lines = axes.plot(steps, values.T, **look)
+    label = ", ".join(filter(None, [setting, ESTIMATED * estimated]))
     if not alone:
-        band(axes, steps, values, setting or f"mean of {len(values)} seeds", color=color)
+        label = label or f"mean of {len(values)} seeds"
+        band(axes, steps, values, label, color=color, ls=ls)
         axes.collections[-1].set_label(None if setting else "95 % interval")
-    elif setting:
-        lines[0].set_label(setting)
+    elif label:
+        lines[0].set_label(label)
 
 
 def band(axes: Axes, steps: np.ndarray, values: np.ndarray, label: str, **style: Any) -> None:
@@ -134,8 +154,8 @@ def trade_off(
         means = []
         for i, row in enumerate(shown):
             color, marker = looks[row.name]["color"], MARKERS[looks[row.name]["ls"]]
-            axes.plot(row.values(written(name)), row.returns, ".", color=color, ms=4, alpha=0.5)
-            ret, cost = row.ret, row.estimate(written(name))
+            axes.plot(row.values(cost_title(name)), row.returns, ".", color=color, ms=4, alpha=0.5)
+            ret, cost = row.ret, row.estimate(cost_title(name))
             means.append((cost.mean, ret.mean))
             axes.errorbar(
                 cost.mean,
@@ -193,8 +213,17 @@ def learning(groups: Sequence[Any]) -> Figure:
         for g in shown:
             for axes, name in zip(panels, names, strict=True):
                 if all(name in run.table for run in g.runs):
-                    values = np.concatenate([stretches(run.table, name, edges) for run in g.runs])
-                    band(axes, edges[1:], values, g.name, **looks[g.name])
+                    guess = g.estimated and name != "train/cost_rate"
+                    column = run_folder.estimate_of(name) if guess else name
+                    values = np.concatenate([stretches(run.table, column, edges) for run in g.runs])
+                    label = f"{g.name}, {ESTIMATED}" if guess else g.name
+                    band(
+                        axes,
+                        edges[1:],
+                        values,
+                        label,
+                        **looks[g.name] | ({"ls": "--"} if guess else {}),
+                    )
         limits = [g.cost_limit for g in shown]
         for g in shown:
             own = limits.count(g.cost_limit) == 1 and len(set(limits)) > 1
@@ -221,7 +250,7 @@ def stretches(table: Mapping[str, np.ndarray], name: str, edges: np.ndarray) -> 
     found = np.full((len(seeds), len(edges) - 1), np.nan)
     for row, seed in zip(found, seeds, strict=True):
         own = table["seed"] == seed
-        values, steps = table[name][own], table[run_folder.clock_of(table)][own]
+        values, steps = table[name][own], table[run_folder.step_column(table)][own]
         if name == "train/cost_rate":
             values = np.cumsum(values) / np.arange(1, len(values) + 1)
         known = np.isfinite(values)
@@ -333,10 +362,18 @@ def legend(figure: Figure, panels: Iterable[Axes], names: Iterable[str] = ()) ->
         figure.legend(entries.values(), entries.keys(), **place)
 
 
+def write(figure: Figure, path: Path, **how: Any) -> None:
+    """Replace `path` with the figure. Names in it are shown as they are, not read as mathematics."""
+    for text in figure.findobj(Text):
+        text.set_parse_math(False)  # type: ignore[attr-defined]
+    with files.replacing(path) as part:
+        figure.savefig(part, **how)
+
+
 def save(figure: Figure, path: Path, formats: Sequence[str] = FORMATS) -> None:
     """Write `path` with each suffix; the same figure is the same file."""
     for suffix in formats:
         with matplotlib.rc_context({"svg.hashsalt": "jaxsafe"}):
             about = {"Date": None} if suffix == "svg" else None
-            figure.savefig(path.with_suffix(f".{suffix}"), dpi=120, metadata=about)
+            write(figure, path.with_suffix(f".{suffix}"), dpi=120, metadata=about)
         figure.set_layout_engine("none")  # is laid out, and the next file is like it

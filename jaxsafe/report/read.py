@@ -11,12 +11,18 @@ import numpy as np
 
 import jaxsafe
 from jaxsafe.config import ConfigError, flat
-from jaxsafe.learn.constraints import limits_of, written
-from jaxsafe.report import condensed, scores
+from jaxsafe.learn.constraints import cost_title, limits_of
+from jaxsafe.report import scores, study_files
 from jaxsafe.report.evaluation import cost_rate
-from jaxsafe.run import run_folder
-from jaxsafe.run.settings import NOT_COMPARED, REGISTERED, Entries, ask, settle
-from jaxsafe.run.spread import members
+from jaxsafe.run import files, run_folder
+from jaxsafe.run.programs import members
+from jaxsafe.run.settings import (
+    NO_EXTRAS,
+    NOT_COMPARED,
+    Extras,
+    settings_from_config,
+    settings_from_options,
+)
 
 # Fields that do not make another setting.
 NOT_A_SETTING = {"seed", "num_seeds", "num_envs", "devices", *NOT_COMPARED}
@@ -26,7 +32,7 @@ NEEDED = ("iteration", "steps", "seed", "train/return", "train/cost")  # columns
 STAND_IN = {"train/return": "eval/return", "train/cost": "eval/cost"}  # where training has no episodes
 
 
-class Run(NamedTuple):
+class SettingRun(NamedTuple):
     """One setting of a run folder, over the seeds that were trained in it."""
 
     folder: Path
@@ -36,6 +42,7 @@ class Run(NamedTuple):
     table: dict[str, np.ndarray]  # the columns of metrics.csv
     seeds: np.ndarray  # [S]
     values: dict[str, np.ndarray]  # [S] by name; NaN for a seed without complete episodes
+    estimated: bool = False  # no episode has ended yet, so return and cost are estimates from all steps
 
     @property
     def setting(self) -> dict[str, Any]:
@@ -44,25 +51,31 @@ class Run(NamedTuple):
     @property
     def steps(self) -> int:
         """Environment steps, or gradient steps where training takes none."""
-        return int(self.table[run_folder.clock_of(self.table)].max())
+        return int(self.table[run_folder.step_column(self.table)].max())
+
+    @property
+    def progress(self) -> tuple[int, int, str]:
+        """How far training is, the end that its config gives, and what both count."""
+        updates = self.config.get("total_updates")  # a study of an older version has none
+        if updates is None:
+            return self.steps, int(self.config["total_steps"]), "steps"
+        column = "updates" if "updates" in self.table else "steps"  # a study has one clock
+        return int(self.table[column].max()), int(updates), "updates"
 
     @property
     def ended(self) -> bool:
         """Whether training is at the end that its config gives."""
-        updates = self.config.get("total_updates")  # a study of an older version has none
-        if updates is not None:
-            column = "updates" if "updates" in self.table else "steps"  # a study has one clock
-            return int(self.table[column].max()) >= updates
-        return self.steps >= self.config["total_steps"]
+        done, end, _ = self.progress
+        return done >= end
 
 
-def read(paths: Iterable[Path]) -> list[Run]:
+def read(paths: Iterable[Path]) -> list[SettingRun]:
     """Every setting that has begun, of run folders, sweeps, studies, and folders that hold them.
 
     Raises:
         ConfigError: no run; one that this version cannot read; or the same run twice.
     """
-    folders = {folder.resolve(): folder for path in paths for folder in find(path)}
+    folders = {folder.resolve(): folder for path in paths for folder in run_folders_under(path)}
     runs = [run for folder in folders.values() for run in read_one(folder)]
     if not runs:
         raise ConfigError(f"no run has begun in {', '.join(map(str, folders.values()))}")
@@ -77,15 +90,15 @@ def read(paths: Iterable[Path]) -> list[Run]:
     return runs
 
 
-def find(path: Path) -> list[Path]:
+def run_folders_under(path: Path) -> list[Path]:
     """The run folders and studies at or under `path`."""
     path = path.expanduser()
     if not path.is_dir():
         raise ConfigError(f"{path} is not a folder")
     found = []
-    for folder, inside, files in os.walk(path):
+    for folder, inside, names in os.walk(path):
         inside.sort()
-        if "config.yaml" in files or "final.csv" in files:
+        if "config.yaml" in names or "final.csv" in names:
             found.append(Path(folder))
             inside.clear()
         inside[:] = [name for name in inside if not name.startswith(".")]
@@ -94,13 +107,13 @@ def find(path: Path) -> list[Path]:
     return found
 
 
-def read_one(folder: Path, entries: Entries = REGISTERED) -> list[Run]:
+def read_one(folder: Path, extras: Extras = NO_EXTRAS) -> list[SettingRun]:
     """The settings of a run folder, none if it has no iteration yet; or the runs of a study."""
-    if condensed.there(folder):
+    if study_files.there(folder):
         return read_study(folder)
     plain = run_folder.read_config(folder)
     try:
-        saved = settle(plain, entries)
+        saved = settings_from_config(plain, extras)
     except ConfigError as error:
         by = run_folder.trained_by(folder)
         raise ConfigError(
@@ -109,7 +122,7 @@ def read_one(folder: Path, entries: Entries = REGISTERED) -> list[Run]:
     metrics = run_folder.read_metrics(folder)
     if not len(metrics.get("iteration", ())):
         return []
-    if run_folder.clock_of(metrics) == "updates":
+    if run_folder.step_column(metrics) == "updates":
         nothing = np.full(len(metrics["seed"]), np.nan)
         metrics = {name: metrics.get(other, nothing) for name, other in STAND_IN.items()} | metrics
     for name in NEEDED:
@@ -128,22 +141,37 @@ def read_one(folder: Path, entries: Entries = REGISTERED) -> list[Run]:
                     f"{folder}: evaluation.json is of {len(final)} seeds, metrics.csv of {len(seeds)}"
                 )
             values[f"final {what}"] = final
-        runs.append(Run(folder, saved.env_name, fields, limits, table, seeds, values))
+        guessed = not_ended(table)
+        runs.append(SettingRun(folder, saved.env_name, fields, limits, table, seeds, values, guessed))
     return runs
 
 
-def read_study(folder: Path) -> list[Run]:
+def not_ended(table: Mapping[str, np.ndarray]) -> bool:
+    """Whether no episode has ended, so that return and cost are only estimated."""
+    known = {"train/return_estimate", "train/cost_estimate"} <= table.keys()
+    return known and not np.isfinite(table["train/return"]).any()
+
+
+def read_study(folder: Path) -> list[SettingRun]:
     """The runs of a study. `run_dir` ends in the name of each, and tables hold a hundred points a seed.
 
     Options that did not exist when a run was trained have their defaults of today.
+
+    Raises:
+        ConfigError: the study's files cannot be read.
     """
-    rows, curves, settings = study = condensed.read(folder)
+    with files.reading(folder):
+        return runs_of(folder, study_files.read(folder))
+
+
+def runs_of(folder: Path, study: study_files.Condensed) -> list[SettingRun]:
+    rows, curves, settings = study
     runs = []
     for run, options in settings.items():
         own = [row for row in rows if row["run"] == run]
         env, algo = options["env.name"], options["algo.name"]
         config = defaults(env, algo) | options
-        config["run_dir"] = str(folder / condensed.name_of(run))
+        config["run_dir"] = str(folder / study_files.name_of(run))
         named = {k: v for k, v in config.items() if k.startswith("algo.cost_limits.") and v is not None}
         limits = {k.removeprefix("algo.cost_limits."): float(v) for k, v in named.items()}
         limits = limits or {"": float(config["algo.cost_limit"])}
@@ -151,9 +179,9 @@ def read_study(folder: Path) -> list[Run]:
         figures = [k for k in study.figures() if k in always or any(row[k] for row in own)]
         values = {k: np.array([float(row[k] or "nan") for row in own]) for k in figures}
         values |= normalised(env, values, limits)
-        table = condensed.table(own, [curves[run, row["seed"]] for row in own])
+        table = study_files.table(own, [curves[run, row["seed"]] for row in own])
         seeds = np.array([float(row["seed"]) for row in own])
-        runs.append(Run(folder, env, config, limits, table, seeds, values))
+        runs.append(SettingRun(folder, env, config, limits, table, seeds, values))
     return runs
 
 
@@ -161,7 +189,7 @@ def defaults(env: str, algo: str, preset: str = "fast", compat: str = "none") ->
     """Today's settings by their names in `flat`; none where this version lacks the names."""
     named = {"env": {"name": env}, "algo": {"name": algo}, "preset": preset, "compat": compat}
     try:
-        return flat(ask(named).plain())
+        return flat(settings_from_options(named).plain())
     except ConfigError:
         return {}
 
@@ -175,8 +203,12 @@ def measured(
         env: the task, for its characteristic scores.
         table: the columns.
         limits: by the name of a cost; '' is their sum.
+
+    Return and cost are the learner's estimates where no episode has ended.
     """
     columns = dict(table)
+    if not_ended(table):
+        columns |= {name: table[run_folder.estimate_of(name)] for name in STAND_IN}
     over = [table[f"train/cost_{k}" if k else "train/cost"] - limit for k, limit in limits.items()]
     worst = np.max(over, axis=0)
     columns["over"] = np.where(np.isnan(worst), np.nan, worst > 0)
@@ -189,7 +221,7 @@ def measured(
     if (rate := cost_rate(columns)) is not None:
         values["cost rate"] = rate
     for name in cost_names(table):
-        values[written(name)] = late(f"train/cost_{name}")
+        values[cost_title(name)] = late(f"train/cost_{name}")
     return values | normalised(env, values, limits)
 
 

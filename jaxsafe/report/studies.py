@@ -21,25 +21,23 @@ study.yaml has these keys; the first four are needed:
 
 import functools
 import io
-import json
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import yaml
 from matplotlib.figure import Figure
 from PIL import Image
 
 from jaxsafe.config import ConfigError
-from jaxsafe.report import condensed, plots, scores, stats, tables
-from jaxsafe.report.condensed import CURVES, POINTS, Origin
+from jaxsafe.report import plots, scores, stats, study_files, tables
 from jaxsafe.report.group import Group, group, tasks_of, telling
 from jaxsafe.report.published import Published, beside, read_published
-from jaxsafe.report.read import Run, defaults
+from jaxsafe.report.read import SettingRun, defaults
 from jaxsafe.report.read import read as read_runs
-from jaxsafe.run import run_folder
+from jaxsafe.report.study_files import CURVES, POINTS, Origin
+from jaxsafe.run import files, run_folder
 
 SPAN = 20  # iterations over which costs are averaged before their swing is taken
 CHUNK = 8  # settings in one figure of curves
@@ -58,8 +56,13 @@ PAGE = """# {title}
 
 ## Runs
 
+<details markdown>
+<summary>The table: every run, with its intervals and its commit</summary>
+
 <!-- measured: runs -->
 <!-- end -->
+
+</details>
 """
 
 
@@ -87,10 +90,7 @@ def read(folder: Path) -> Study:
         ConfigError: there is none, or it says something else.
     """
     path = folder / "study.yaml"
-    try:
-        found = yaml.safe_load(path.read_text())
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ConfigError(f"{path} cannot be read: {' '.join(str(error).split())}") from error
+    found = files.read_yaml(path)
     needed, more = {"title", "about", "options", "runs"}, {"windows", "published", "printed"}
     if not isinstance(found, dict) or not needed <= found.keys() <= needed | more:
         raise ConfigError(
@@ -99,7 +99,7 @@ def read(folder: Path) -> Study:
     runs, printed = found["runs"], found.get("printed") or {}
     if not isinstance(runs, list) or not all(isinstance(run, str) for run in runs):
         raise ConfigError(f"{path}: expected runs as a list of options, as 'env=point_goal1 algo=cpo'")
-    names = [condensed.name_of(run) for run in runs]
+    names = [study_files.name_of(run) for run in runs]
     for name in names:
         if names.count(name) > 1:
             raise ConfigError(f"{path}: {name} occurs twice")
@@ -119,29 +119,36 @@ def read(folder: Path) -> Study:
 # ---- condensing ------------------------------------------------------------------------------
 
 
-def add(study: Study, run: str, trained: Run, origin: Origin, failed: bool = False) -> None:
-    """Put a run into final.csv and curves.npz, in place of what they had of it."""
-    rows, curves, settings = condensed.read(study.folder)
-    made = rows_of(study, run, trained, origin, failed)
+def add(study: Study, run: str, trained: SettingRun, origin: Origin, failure: str = "") -> None:
+    """Put a run into final.csv and curves.npz, in place of what they had of it.
+
+    `failure` is 'failed' or 'diverged' where the command said so.
+    """
+    rows, curves, settings = study_files.read(study.folder)
+    made = rows_of(study, run, trained, origin, failure)
     worth = {text: i for i, text in enumerate(study.runs)}
     rows = [*(row for row in rows if row["run"] != run), *made]
     rows.sort(key=lambda row: worth.get(row["run"], len(worth)))
     curves |= {(run, row["seed"]): x for row, x in zip(made, points(trained), strict=True)}
     settings[run] = {k: v for k, v in trained.config.items() if k not in ("run_dir", "resume")}
-    condensed.write(study.folder, condensed.Condensed(rows, curves, settings))
+    study_files.write(study.folder, study_files.Condensed(rows, curves, settings))
 
 
-def rows_of(study: Study, run: str, trained: Run, origin: Origin, failed: bool) -> list[dict[str, str]]:
+def rows_of(
+    study: Study, run: str, trained: SettingRun, origin: Origin, failure: str
+) -> list[dict[str, str]]:
     """The rows of final.csv of a run, one a seed."""
     table, values = trained.table, trained.values | more_figures(trained.table, study.windows)
     named = {name: x for name, x in values.items() if not name.startswith("normalised")}
+    if trained.estimated:  # they have columns of their own
+        named |= dict.fromkeys(("return", "cost"), np.full(len(trained.seeds), np.nan))
     known = dict.fromkeys(trained.seeds.astype(int).astype(str), "done")
     if "train/nonfinite" in table:
         bad = run_folder.last_tenth(table, "train/nonfinite") > 0
         known = {seed: "diverged" if b else "done" for seed, b in zip(known, bad, strict=True)}
-    state = "failed" if failed else "unfinished" if not trained.ended else ""
+    state = failure or ("" if trained.ended else "unfinished")
     seconds = [table["seconds"][table["seed"] == s].max() for s in trained.seeds]
-    clock = run_folder.clock_of(table)
+    clock = run_folder.step_column(table)
     named = {"minutes": np.array(seconds) / 60} | named
     return [
         {
@@ -159,7 +166,7 @@ def rows_of(study: Study, run: str, trained: Run, origin: Origin, failed: bool) 
     ]
 
 
-def points(trained: Run) -> list[np.ndarray]:
+def points(trained: SettingRun) -> list[np.ndarray]:
     """Return, cost and cost rate of each seed over a hundred equal stretches, float32 [3, 100].
 
     Twelve bits of the mantissa are kept, four digits: the rest is noise that does not compress.
@@ -233,23 +240,20 @@ def unusual(config: Mapping[str, Any]) -> dict[str, Any]:
 
 def origin_of(folder: Path) -> Origin:
     """What a run folder's last start says of itself."""
-    try:
-        last = json.loads((folder / "versions.json").read_text())[-1]
-        commit = str(last["commit"] or "")
-        return Origin(
-            commit=commit.removesuffix("-dirty")[:7],
-            dirty=("yes" if commit.endswith("-dirty") else "no") if commit else "",
-            device=last["device"],
-            engine=last["engine"] or "",
-            python=last["python"],
-            jax=last["jax"],
-            mujoco=last["mujoco"],
-            warp=last["warp-lang"] or "",
-            trained=last["time"][:10],
-            source=str(folder),
-        )
-    except (OSError, ValueError, LookupError, TypeError):
-        return Origin(source=str(folder))
+    last = {name: str(value or "") for name, value in run_folder.last_start(folder).items()}
+    commit = last.get("commit", "")
+    return Origin(
+        commit=commit.removesuffix("-dirty")[:7],
+        dirty=("yes" if commit.endswith("-dirty") else "no") if commit else "",
+        device=last.get("device", ""),
+        engine=last.get("engine", ""),
+        python=last.get("python", ""),
+        jax=last.get("jax", ""),
+        mujoco=last.get("mujoco", ""),
+        warp=last.get("warp-lang", ""),
+        trained=last.get("time", "")[:10],
+        source=str(folder),
+    )
 
 
 # ---- the page --------------------------------------------------------------------------------
@@ -266,13 +270,12 @@ class Picture(NamedTuple):
 def write_page(study: Study) -> None:
     """Write README.md, and draw its figures into images/ beside the study."""
     text, pictures = page(study)
-    images = study.folder.parent / "images"
-    images.mkdir(exist_ok=True)
+    images = files.make_folder(study.folder.parent, "images")
     for old in images.glob(f"{study.folder.name}-*.png"):
         old.unlink()
     for picture in pictures:
         save_small(picture.draw(), picture.path)
-    run_folder.replace_text(study.folder / "README.md", text)
+    files.write(study.folder / "README.md", text)
 
 
 def page(study: Study) -> tuple[str, list[Picture]]:
@@ -282,7 +285,11 @@ def page(study: Study) -> tuple[str, list[Picture]]:
     `about` is all that the page says.
     """
     path = study.folder / "README.md"
-    text = path.read_text() if path.exists() else PAGE.format(title=study.title, about=study.about)
+    text = (
+        files.read_text(path)
+        if files.there(path)
+        else PAGE.format(title=study.title, about=study.about)
+    )
     runs = read_runs([study.folder])
     groups = in_order(runs)
     known = read_published(study.published) if study.published else {}
@@ -299,7 +306,7 @@ def page(study: Study) -> tuple[str, list[Picture]]:
     return tables.between_marks(text, made, "measured"), pictures
 
 
-def in_order(runs: Sequence[Run]) -> list[Group]:
+def in_order(runs: Sequence[SettingRun]) -> list[Group]:
     """The groups of each setting and task, in the order of the runs, the order of their worth."""
     by = [name for name in telling(runs) if name != "total_steps"]
     for name in ("compat", "devices"):
@@ -335,9 +342,9 @@ def save_small(figure: Figure, path: Path) -> None:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=80)
     picture = Image.open(buffer).convert("RGB")
-    picture.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(
-        path, optimize=True
-    )
+    small = picture.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+    with files.replacing(path) as part:
+        small.save(part, optimize=True)
 
 
 def matrix(groups: Sequence[Group], known: Mapping[tuple[str, str], Published]) -> str:
@@ -358,11 +365,13 @@ def matrix(groups: Sequence[Group], known: Mapping[tuple[str, str], Published]) 
     return "\n".join(lines)
 
 
-def run_table(study: Study, runs: Sequence[Run], known: Mapping[tuple[str, str], Published]) -> str:
+def run_table(
+    study: Study, runs: Sequence[SettingRun], known: Mapping[tuple[str, str], Published]
+) -> str:
     """A row a run: what it reached in training and after it, and what it was made with."""
-    origins = {row["run"]: row for row in condensed.read(study.folder).rows}
+    origins = {row["run"]: row for row in study_files.read(study.folder).rows}
     states: dict[str, set[str]] = {}
-    for row in condensed.read(study.folder).rows:
+    for row in study_files.read(study.folder).rows:
         states.setdefault(row["run"], set()).add(row["state"])
     named = {Path(run.config["run_dir"]).name: run for run in runs}
     header = ["run", "seeds", "return, last 10%", "cost, last 10%", "final policy"]
@@ -370,8 +379,8 @@ def run_table(study: Study, runs: Sequence[Run], known: Mapping[tuple[str, str],
     numbers = ("seeds", "return, last 10%", "cost, last 10%", "minutes")
     ends = ["---:" if name in numbers else "---" for name in header]
     lines = [f"| {' | '.join(header)} |", f"|{'|'.join(ends)}|"]
-    for text, row in sorted(origins.items(), key=lambda item: condensed.name_of(item[0])):
-        run = named[condensed.name_of(text)]
+    for text, row in sorted(origins.items(), key=lambda item: study_files.name_of(item[0])):
+        run = named[study_files.name_of(text)]
         ret, cost = (tables.cell(stats.estimate(run.values[k]), ".2f") for k in ("return", "cost"))
         words = " ".join(f"`{re.sub('^(env|algo)=', '', word)}`" for word in text.split())
         odd = ", ".join(sorted(states[text] - {"done"}))
@@ -385,7 +394,7 @@ def run_table(study: Study, runs: Sequence[Run], known: Mapping[tuple[str, str],
     return "\n".join(lines)
 
 
-def final_policy(run: Run, otherwise: str) -> str:
+def final_policy(run: SettingRun, otherwise: str) -> str:
     """What the mean action made in fresh episodes, mean over seeds and its interval."""
     if not {"final return", "final cost"} <= run.values.keys():
         return otherwise

@@ -5,31 +5,31 @@ import io
 import math
 from pathlib import Path
 
-from jaxsafe.learn.constraints import in_words, written
+from jaxsafe.learn.constraints import cost_title, limits_in_words
 from jaxsafe.report import plots, tables
 from jaxsafe.report.group import Group, group
 from jaxsafe.report.read import read_one
 from jaxsafe.report.tables import Table
-from jaxsafe.run import run_folder
-from jaxsafe.run.settings import REGISTERED, Entries
+from jaxsafe.run import files
+from jaxsafe.run.settings import NO_EXTRAS, Extras
 from jaxsafe.run.sweep import read_folder
 
 
-def rows_of(folder: Path, entries: Entries = REGISTERED) -> list[Group]:
+def rows_of(folder: Path, extras: Extras = NO_EXTRAS) -> list[Group]:
     """A row for each setting that has begun."""
     swept = read_folder(folder)["swept"]
-    paths = sorted(folder.glob("*/config.yaml"))
-    runs = [run for path in paths for run in read_one(path.parent, entries)]
+    runs = [run for path in files.runs_in(folder) for run in read_one(path, extras)]
     return group(runs, swept) if runs else []
 
 
-def summarise(folder: Path, entries: Entries = REGISTERED) -> str:
+def summarise(folder: Path, extras: Extras = NO_EXTRAS) -> str:
     """Write summary.md, .csv and .png of a sweep; returns the table."""
-    rows = rows_of(folder, entries)
+    rows = rows_of(folder, extras)
     text = markdown(rows)
-    run_folder.replace_text(folder / "summary.md", text)
-    run_folder.replace_text(folder / "summary.csv", as_csv(rows))
+    files.write(folder / "summary.md", text)
+    files.write(folder / "summary.csv", as_csv(rows))
     title = "last 10 % of training, mean and 95 % interval"
+    title += f"; {plots.ESTIMATED}" * any(row.estimated for row in rows)
     plots.save(plots.trade_off(rows, title), folder / "summary", ["png"])
     return text
 
@@ -45,23 +45,34 @@ def limited(rows: list[Group]) -> list[str]:
 
 def markdown(rows: list[Group]) -> str:
     costs = limited(rows)
-    header = [*columns(rows), "seeds", "steps", "return", *map(written, costs), "limit", "limit held"]
+    header = [
+        *columns(rows),
+        "seeds",
+        "steps",
+        "return",
+        *map(cost_title, costs),
+        "limit",
+        "limit held",
+    ]
     lines = [
         [
             *(tables.number(v) if isinstance(v, float) else str(v) for v in r.by.values()),
             str(len(r.costs)), f"{r.steps:,}", tables.cell(r.ret),
-            *(tables.cell(r.estimate(written(name))) for name in costs), in_words(r.limits), r.held,
+            *(tables.cell(r.estimate(cost_title(name))) for name in costs),
+            limits_in_words(r.limits), r.held,
         ]
         for r in rows
     ]  # fmt: skip
-    return tables.markdown(Table("", header, lines))
+    begun = [r.name for r in rows if r.estimated]
+    note = f"\nNo episode ended yet: return and cost of {'; '.join(begun)} are estimates.\n"
+    return tables.markdown(Table("", header, lines)) + note * bool(begun)
 
 
 def as_csv(rows: list[Group]) -> str:
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     costs = limited(rows)
-    measured = ["return", *map(written, costs)]
+    measured = ["return", *map(cost_title, costs)]
     bounds = [f"{m.replace(' ', '_')}{end}" for m in measured for end in ("", "_low", "_high")]
     limits = [f"cost_limit_{name}" if name else "cost_limit" for name in costs]
     writer.writerow([*columns(rows), "seeds", "steps", *bounds, *limits, "held"])

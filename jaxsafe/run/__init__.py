@@ -3,11 +3,11 @@
     arguments           key=value and Hydra -> plain values
     settings            plain values -> checked Settings
     session             the folder, the environment, the program; then the loop and what follows it
-    spread              an algorithm over settings, seeds and devices -> Program
+    programs            an algorithm over settings, seeds and devices -> Program
     memory, devices     whether it fits, and on what it runs
     loop                compile, update, log, evaluate, checkpoint
     log, run_folder     what goes into the folder, with checkpoint and progress
-    policies, evaluate  what acts, read from a folder; fresh episodes of it
+    policies, evaluate  policies, read from a folder; fresh episodes of them
     sweep               many settings in few programs
 
 `jaxsafe.commands.train` calls arguments, settings and session in this order; `jaxsafe.report.finish`

@@ -4,7 +4,11 @@ This is the only module that knows Hydra and its grammar. Arguments are checked 
 because its own errors are long.
 """
 
+import argparse
+import contextlib
+import math
 import os
+import re
 import sys
 from collections.abc import Callable
 from typing import Any, NamedTuple, NoReturn
@@ -14,26 +18,30 @@ from hydra._internal.utils import get_args_parser
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override, OverrideType, ValueType
+from hydra.core.override_parser.types import ChoiceSweep, Override, OverrideType, RangeSweep
 from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from jaxsafe import algos, envs
-from jaxsafe.config import ConfigError
+from jaxsafe.config import ConfigError, convert, describe
 from jaxsafe.run import distributed
 from jaxsafe.run.settings import (
+    COST_LIMITS,
     DEFAULT,
-    NAMED,
+    MOST,
     Settings,
     algo_options,
-    ask,
+    check_agreement,
     check_option,
     defaults_of,
     find_env,
     load,
     nested,
+    repeated,
+    settings_from_config,
+    settings_from_options,
     to_plain,
 )
 
@@ -47,12 +55,18 @@ class Request(NamedTuple):
     argv: list[str]  # for Hydra: aliases replaced
     base: dict[str, Any]  # top-level defaults, or those of the run to continue
     groups: dict[str, dict[str, dict[str, Any]]]  # 'env' and 'algo': name -> options, if chosen
+    texts: list[str]  # the overrides in argv
+    printed: bool  # --cfg: the config is printed, and no job is called
+
+
+class JobFailed(Exception):
+    """A job of a --multirun, in a process of its own, ended with this exit status."""
 
 
 class Given(NamedTuple):
     """What the arguments of a sweep say."""
 
-    options: dict[str, Any]  # those with one value, as `settings.ask` takes them
+    options: dict[str, Any]  # those with one value, as `settings_from_options` takes them
     several: dict[str, list[Any]]  # those with several, by name: 'seed', 'env', 'algo.clip'
 
 
@@ -64,7 +78,7 @@ def compose(texts: list[str]) -> Settings:
     given = read_values(texts)
     for name in given.several:
         raise ConfigError(f"{name}: expected one value")
-    return ask(given.options)
+    return settings_from_options(given.options)
 
 
 def read_values(texts: list[str]) -> Given:
@@ -75,9 +89,10 @@ def read_values(texts: list[str]) -> Given:
         ConfigError: an argument that cannot be read, or that is no `key=value`.
     """
     overrides = [parse(text) for text in texts]
+    check_grid(overrides)
     for override in overrides:
         check_kind(override)
-        load_named(override)
+        import_named_code(override)
     several = {o.key_or_group: choices(o) for o in overrides if o.is_sweep_override()}
     options = nested({o.key_or_group: o.value() for o in overrides if not o.is_sweep_override()})
     resolved: Any = OmegaConf.to_container(OmegaConf.create(options), resolve=True)
@@ -94,22 +109,44 @@ def parse(text: str) -> Override:
 def choices(override: Override) -> list[Any]:
     """The values of an option that has several."""
     key = override.key_or_group
-    if override.value_type is ValueType.GLOB_CHOICE_SWEEP:
-        raise ConfigError(f"{override.input_line}: name the values, a pattern has none")
     found = [parse(f"{key}={text}").value() for text in override.sweep_string_iterator()]
-    for value in found:
-        if found.count(value) > 1:
-            raise ConfigError(f"{key}={value} occurs twice")
+    if (value := repeated(found)) is not None:
+        raise ConfigError(f"{key}={value} occurs twice")
     return found
+
+
+def check_grid(overrides: list[Override]) -> None:
+    """Refuse more settings than anybody trains, before they are listed."""
+    count = math.prod(count_of(o) for o in overrides if o.is_sweep_override())
+    if count > MOST:
+        raise ConfigError(f"{count:,} settings: expected at most {MOST:,} in a sweep")
+
+
+def count_of(override: Override) -> int:
+    """How many values an option has, at least 1."""
+    value, text = override.value(), override.input_line
+    if isinstance(value, RangeSweep):
+        ends = [float(x) for x in (value.start, value.stop, value.step) if x is not None]
+        if len(ends) < 3 or not all(map(math.isfinite, ends)) or not ends[2]:
+            raise ConfigError(f"{text}: expected range(start,stop,step) of finite numbers, step not 0")
+        count = math.ceil((ends[1] - ends[0]) / ends[2])
+    elif isinstance(value, ChoiceSweep):
+        count = len(value.list)
+    else:
+        raise ConfigError(f"{text}: name the values; a pattern or an interval has none")
+    if count < 1:
+        raise ConfigError(f"{text} holds no value")
+    return count
 
 
 def names_in(override: Override) -> list[str]:
     """The values of env= or algo=."""
     several = override.is_sweep_override()
-    return [str(v) for v in (override.sweep_iterator() if several else [override.value()])]
+    values = override.sweep_iterator() if several else [override.value()]
+    return [convert(value, str, override.key_or_group) for value in values]
 
 
-def load_named(override: Override) -> None:
+def import_named_code(override: Override) -> None:
     if override.key_or_group in DEFAULT and not override.is_delete():
         for name in names_in(override):
             load(override.key_or_group, name)
@@ -126,30 +163,47 @@ def check_kind(override: Override) -> None:
 
 def each_job(argv: list[str], job: Callable[[dict[str, Any], int | None], None]) -> None:
     """Let Hydra compose the arguments and call `job(config, number)`: once, or for each run of a
-    --multirun with its number. --help and --cfg print instead.
+    --multirun with its number. --help and --cfg print instead. A launcher of Hydra's may call `job` in
+    another process or on another host, to which `called` is pickled.
 
     Raises:
         ConfigError: something that no run could use, with the nearest valid name.
+        SystemExit: `job` raised it, here or there.
     """
+    home = os.getpid()
 
     def called(config: Any) -> None:
-        several = HydraConfig.get().mode == RunMode.MULTIRUN
+        hydra_config = HydraConfig.get()
+        several = hydra_config.mode == RunMode.MULTIRUN
+        for text in hydra_config.overrides.task:  # as typed; a process of its own has yet to import
+            import_named_code(parse(text))
         plain: Any = OmegaConf.to_container(config, resolve=True)
-        job(plain, HydraConfig.get().job.num if several else None)
+        try:
+            job(plain, hydra_config.job.num if several else None)
+        except SystemExit as end:  # no launcher can bring this back from a process of its own
+            if os.getpid() == home:
+                raise
+            raise JobFailed(end.code) from None
 
-    request = read(argv)
+    request = check_arguments(argv)
     register(request)
+    if request.printed and not {"-m", "--multirun"} & {*request.argv}:
+        with hydra.initialize(version_base="1.3", config_path=None):
+            config: Any = hydra.compose("train", request.texts)
+        settings_from_config(OmegaConf.to_container(config, resolve=True))  # type: ignore[arg-type]
     sys.argv[1:] = request.argv
     os.environ["HYDRA_FULL_ERROR"] = "1"  # raise, do not print
     try:
         hydra.main(version_base="1.3", config_path=None, config_name="train")(called)()
+    except JobFailed as failed:  # the job's own output says why, Hydra's line which one
+        raise SystemExit(*failed.args) from None
     except ValueError as error:
         if not str(error).startswith("Only one of --run"):  # Hydra's, of its own flags
             raise
         fail(str(error))
 
 
-def read(argv: list[str]) -> Request:
+def check_arguments(argv: list[str]) -> Request:
     """Check every argument of train.py against the registries.
 
     Raises:
@@ -166,9 +220,10 @@ def read(argv: list[str]) -> Request:
     for text in args.overrides:
         flags.remove(text)
     overrides = [parse(text) for text in args.overrides]
+    check_grid(overrides)
     given = {o.key_or_group: o for o in overrides}
     for override in overrides:
-        load_named(override)
+        import_named_code(override)
     if args.multirun and given.keys() & {*distributed.OPTIONS}:
         raise ConfigError(f"{', '.join(distributed.OPTIONS)} are for one run, without --multirun")
     for name in ONE_VALUE:
@@ -178,11 +233,17 @@ def read(argv: list[str]) -> Request:
     names: dict[str, list[Any]] = {
         kind: names_in(given[kind]) if kind in given else [None] for kind in DEFAULT
     }
-    known = [defaults_of(top, {"env": e, "algo": a}) for e in names["env"] for a in names["algo"]]
+    known = [
+        defaults_of(top, {"env": e, "algo": a}, given=given)
+        for e in names["env"]
+        for a in names["algo"]
+    ]
     chosen = {kind: {each[kind]["name"]: each[kind] for each in known} for kind in DEFAULT}
     texts = []
     for override in overrides:
         text = override.input_line or ""
+        if text.startswith("hydra/") and not isinstance(override.value(), str):
+            raise ConfigError(f"{text}: expected a name")
         if not override.is_hydra_override():
             check_kind(override)
             for each in known:
@@ -194,13 +255,15 @@ def read(argv: list[str]) -> Request:
             if override.key_or_group in DEFAULT:
                 text = f"{override.key_or_group}={','.join(chosen[override.key_or_group])}"
         texts.append(text)
+    values = {name: o.value() for name, o in given.items() if not o.is_sweep_override()}
+    check_agreement(values)
     # Hydra adds a name to a dict, or to what was null, only if told to, and after the dict itself
-    alone = [text for text in texts if text.startswith(f"algo.{NAMED}.")]
+    alone = [text for text in texts if text.startswith(f"algo.{COST_LIMITS}.")]
     texts = [text for text in texts if text not in alone] + [f"++{text}" for text in alone]
     base = {k: v for k, v in known[0].items() if k not in DEFAULT}
     base |= {k: v for k, v in top.items() if k != "resume" or isinstance(v, str)}
     if isinstance(top.get("resume"), str):
-        return Request([*flags, *texts], base, chosen)
+        return Request([*flags, *texts], base, chosen, texts, bool(args.cfg))
     # Hydra copies every entry again and again, so one that nobody chooses is known by its name only
     sweeper = any(o.key_or_group.startswith(("hydra.sweeper", "hydra/sweeper")) for o in overrides)
     entries = {
@@ -210,7 +273,8 @@ def read(argv: list[str]) -> Request:
             for name, row in algos.ALGOS.items()
         },
     }
-    return Request([*flags, *texts], base, {kind: entries[kind] | chosen[kind] for kind in DEFAULT})
+    groups = {kind: entries[kind] | chosen[kind] for kind in DEFAULT}
+    return Request([*flags, *texts], base, groups, texts, bool(args.cfg))
 
 
 def env_options(name: str) -> dict[str, Any]:
@@ -222,7 +286,7 @@ def register(request: Request) -> None:
     store = ConfigStore.instance()
     for group, options in request.groups.items():
         for name, node in options.items():
-            store.store(group=group, name=name, node=OmegaConf.create(to_plain(node)))
+            store.store(group=group, name=name, node=OmegaConf.create(as_it_is(to_plain(node))))
     first = {
         group: DEFAULT[group] if DEFAULT[group] in g else next(iter(g))
         for group, g in request.groups.items()
@@ -234,19 +298,44 @@ def register(request: Request) -> None:
             {"override hydra/job_logging": "none"},
             {"override hydra/hydra_logging": "none"},
         ],
-        **to_plain(request.base),
+        **as_it_is(to_plain(request.base)),
         "hydra": {
             "run": {"dir": "."},
             "sweep": {"dir": "runs/.multirun", "subdir": "."},
             "output_subdir": None,
             "job": {"name": "train", "chdir": False},
             "help": {
-                "header": "python scripts/train.py env=car_push1 algo=cpo [key=value ...]",
+                "header": "jaxsafe train env=car_push1 algo=cpo [key=value ...]",
                 "footer": "Several values with -m: seed=0,1,2. A list is written [a,b].",
             },
         },
     }
     store.store(name="train", node=OmegaConf.create(node))
+
+
+def as_it_is(value: Any) -> Any:
+    """Plain values that OmegaConf gives back as they are: a file may hold '${oc.env:HOME}' as text."""
+    if isinstance(value, dict):
+        return {k: as_it_is(v) for k, v in value.items()}
+    if isinstance(value, list):
+        return [as_it_is(v) for v in value]
+    return re.sub(r"(\\*)\$\{", r"\1\1\\${", value) if isinstance(value, str) else value
+
+
+def number(kind: Any) -> Callable[[str], Any]:
+    """What argparse calls for an option that is a number within the bounds of the annotated `kind`."""
+
+    def read(text: str) -> Any:
+        value: Any = text
+        with contextlib.suppress(ValueError):
+            value = float(text)
+            value = int(text)
+        try:
+            return convert(value, kind, "")
+        except ConfigError as error:
+            raise argparse.ArgumentTypeError(f"{text}: expected {describe(kind)}") from error
+
+    return read
 
 
 def fail(message: str) -> NoReturn:

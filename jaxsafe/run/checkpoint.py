@@ -11,22 +11,30 @@ algorithm may be left out, as it can be large; a run that is resumed without it 
 
 import hashlib
 import json
+import math
 import os
+import re
 import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import ml_dtypes
 import numpy as np
 import orbax.checkpoint as ocp
 
+from jaxsafe.config import ConfigError
+from jaxsafe.run import files
 from jaxsafe.types import PyTree
 
 KEEP = 2  # the newest ones that stay
 REPLAY = "replay"  # the part of a train state that may be left out
 SMALL_REPLAY = 2e9  # bytes up to which it is kept, unless the user says otherwise
+NUMBER = re.compile(r"bool|bfloat16|float(16|32|64)|u?int(8|16|32|64)")  # dtypes of leaves
+NAME = re.compile(r"[\w.'\[\]<>-]+")  # of a leaf
+OVERHEAD = 64 * files.MB  # bytes by which the files may exceed their arrays
 
 
 class CheckpointError(RuntimeError):
@@ -121,7 +129,7 @@ def save(folder: Path, ts: PyTree, at: Progress, since: int = 0, replay: bool = 
     try:
         for leftover in folder.glob("*.part"):  # of a process that was killed
             shutil.rmtree(leftover)
-        part.mkdir(parents=True)
+        files.make_folder(folder, part.name)
         named = zip(leaf_names(ts), jax.tree.leaves(ts), strict=True)
         arrays = to_arrays({name: x for name, x in named if replay or not in_replay(name)})
         with orbax_checkpointer() as orbax:
@@ -132,11 +140,11 @@ def save(folder: Path, ts: PyTree, at: Progress, since: int = 0, replay: bool = 
         manifest = {
             **at._asdict(),
             "since": since,
-            "files": {name: digest(part / name) for name in files(part)},
+            "files": {name: digest(part / name) for name in files.below(part)},
             "leaves": {k: [str(v.dtype), list(v.shape)] for k, v in arrays.items()},
         }
-        (part / "manifest.json").write_text(json.dumps(manifest, indent=1))
-        for name in files(part):
+        files.write(part / "manifest.json", json.dumps(manifest, indent=1))
+        for name in files.below(part):
             sync(part / name)
         if target.exists():
             shutil.rmtree(target)
@@ -201,33 +209,91 @@ def load(
 
 
 def read_manifest(path: Path) -> Manifest:
-    raw = json.loads((path / "manifest.json").read_text())
-    leaves = {
-        str(k): (str(dtype), tuple(int(n) for n in shape))
-        for k, (dtype, shape) in raw["leaves"].items()
-    }
-    at = Progress(*(int(raw.get(name, 0)) for name in Progress._fields))  # of 0.1, updates are absent
-    since = int(raw.get("since", 0))  # likewise: there was no replay
-    return Manifest(at, dict(raw["files"]), leaves, since)
+    """What a checkpoint says about itself.
+
+    Raises:
+        ConfigError: it says something else.
+    """
+    file = path / "manifest.json"
+    raw = files.read_json(file)
+    with files.reading(file):
+        leaves = {
+            k: (str(dtype), tuple(int(n) for n in shape)) for k, (dtype, shape) in raw["leaves"].items()
+        }
+        at = Progress(*(int(raw.get(name, 0)) for name in Progress._fields))  # 0.1 had no updates
+        since = int(raw.get("since", 0))  # likewise: there was no replay
+        manifest = Manifest(at, {k: str(v) for k, v in raw["files"].items()}, leaves, since)
+    if min(*at, since) < 0:
+        raise ConfigError(f"{file}: expected an iteration and steps of at least 0")
+    for name, (dtype, shape) in leaves.items():
+        if not NAME.fullmatch(name) or not NUMBER.fullmatch(dtype) or min(shape, default=0) < 0:
+            raise ConfigError(f"{file}: {name} is {describe((dtype, shape))}; expected numbers")
+    return manifest
+
+
+def size_of(leaves: Mapping[str, tuple[str, tuple[int, ...]]]) -> int:
+    """The bytes of arrays of these dtypes and shapes."""
+    return sum(dtype_of(dtype).itemsize * math.prod(shape) for dtype, shape in leaves.values())
+
+
+def dtype_of(name: str) -> np.dtype:
+    return np.dtype(ml_dtypes.bfloat16 if name == "bfloat16" else name)
 
 
 def verify(path: Path, manifest: Manifest) -> None:
-    present = set(files(path)) - {"manifest.json"}
+    """Raise CheckpointError or ConfigError unless the files are those that the manifest lists, and no
+    larger than their arrays, which fit this machine."""
+    present = set(files.below(path)) - {"manifest.json"}
     if present != set(manifest.files):
         odd = sorted(present ^ set(manifest.files))
         raise CheckpointError(f"missing or unknown file {odd[0]}")
+    size, room = size_of(manifest.leaves), host_memory()
+    if size > room:
+        raise CheckpointError(f"its arrays need {size:.1e} bytes, this machine has {room:.1e}")
+    if (found := sum((path / name).lstat().st_size for name in present)) > 2 * size + OVERHEAD:
+        raise CheckpointError(f"its files have {found:,} bytes, its arrays {size:,}")
     for name, expected in manifest.files.items():
         if digest(path / name) != expected:
             raise CheckpointError(f"checksum of {name} differs")
 
 
+def host_memory() -> float:
+    """Bytes of memory that this machine has free, or infinity where it does not say."""
+    try:
+        return float(os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    except (ValueError, OSError):
+        return math.inf
+
+
+def check_stored(state: Path, leaves: Mapping[str, tuple[str, tuple[int, ...]]], orbax: Any) -> None:
+    """Raise CheckpointError unless Orbax's own files say the same of their arrays: it would read what
+    they say."""
+    stored = {k: v for k, v in orbax.metadata(state).item_metadata.tree.items() if v is not None}
+    if stored.keys() != leaves.keys():
+        raise CheckpointError(f"state/ holds {len(stored)} arrays, the manifest {len(leaves)}")
+    for name, (dtype, shape) in leaves.items():
+        have = stored[name]
+        if (str(np.dtype(have.dtype)), tuple(have.shape)) != (dtype, shape):
+            raise CheckpointError(f"{name} is {have.dtype}{list(have.shape)} in state/")
+        chunk = have.storage.chunk_shape if have.storage else None
+        if chunk is not None and math.prod(chunk) > max(math.prod(shape), 1):
+            raise CheckpointError(f"{name} is stored in parts larger than itself")
+
+
 def read_arrays(path: Path, manifest: Manifest) -> dict[str, np.ndarray]:
     """Read exactly the arrays that the manifest lists, as host arrays of those shapes and dtypes."""
-    empty = {k: np.zeros(shape, dtype) for k, (dtype, shape) in manifest.leaves.items() if 0 in shape}
-    like = {
-        k: np.zeros(shape, dtype) for k, (dtype, shape) in manifest.leaves.items() if 0 not in shape
+    empty = {
+        k: np.zeros(shape, dtype_of(dtype))
+        for k, (dtype, shape) in manifest.leaves.items()
+        if 0 in shape
+    }
+    like = {  # one number each, whatever the shape
+        k: np.broadcast_to(np.zeros((), dtype_of(dtype)), shape)
+        for k, (dtype, shape) in manifest.leaves.items()
+        if 0 not in shape
     }
     with orbax_checkpointer() as orbax:
+        check_stored((path / "state").absolute(), {k: manifest.leaves[k] for k in like}, orbax)
         restored = orbax.restore((path / "state").absolute(), args=ocp.args.StandardRestore(like))  # type: ignore[call-arg]
     for name, (dtype, shape) in manifest.leaves.items():
         if name in like and (str(restored[name].dtype), restored[name].shape) != (dtype, shape):
@@ -238,17 +304,19 @@ def read_arrays(path: Path, manifest: Manifest) -> dict[str, np.ndarray]:
 
 
 def checkpoints(folder: Path) -> list[Path]:
-    """The complete checkpoints under `folder`, newest first."""
+    """The complete checkpoints under `folder`, newest first.
+
+    Raises:
+        ConfigError: one of them is a link.
+    """
     found = folder.glob("[0-9]" * 8) if folder.is_dir() else ()
-    return sorted((p for p in found if (p / "manifest.json").is_file()), reverse=True)
-
-
-def files(path: Path) -> list[str]:
-    return sorted(p.relative_to(path).as_posix() for p in path.rglob("*") if p.is_file())
+    found = (files.inside(folder, path.name) for path in found)
+    return sorted((p for p in found if files.there(p / "manifest.json")), reverse=True)
 
 
 def digest(path: Path) -> str:
-    with path.open("rb") as file:
+    """The SHA-256 of a plain file."""
+    with files.opened(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 

@@ -35,22 +35,22 @@ def after(iteration: int, clocks: Clocks) -> Progress:
     return Progress(iteration, iteration * clocks.steps, iteration * clocks.updates)
 
 
-def iterations(settings: TrainConfig, clocks: Clocks) -> int:
+def iterations(train_cfg: TrainConfig, clocks: Clocks) -> int:
     """Iterations of a whole run: as many as `total_updates` or `total_steps` needs, rounded up.
 
     Raises:
         ConfigError: an update does not take any of the steps that are to be counted.
     """
-    name, total, each, kind = "total_steps", settings.total_steps, clocks.steps, "environment"
-    if settings.total_updates is not None:
-        name, total, each, kind = "total_updates", settings.total_updates, clocks.updates, "gradient"
+    name, total, each, kind = "total_steps", train_cfg.total_steps, clocks.steps, "environment"
+    if train_cfg.total_updates is not None:
+        name, total, each, kind = "total_updates", train_cfg.total_updates, clocks.updates, "gradient"
     if not each:
         raise ConfigError(f"{name}={total}: the algorithm takes no {kind} steps")
     return -(-total // each)
 
 
-def ended(settings: TrainConfig, done: Progress) -> bool:
+def ended(train_cfg: TrainConfig, done: Progress) -> bool:
     """Whether a run that is so far is at its end."""
-    if settings.total_updates is not None:
-        return done.updates >= settings.total_updates
-    return done.steps >= settings.total_steps
+    if train_cfg.total_updates is not None:
+        return done.updates >= train_cfg.total_updates
+    return done.steps >= train_cfg.total_steps

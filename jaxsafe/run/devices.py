@@ -20,15 +20,15 @@ def use_compilation_cache() -> None:
             jax.config.update("jax_compilation_cache_dir", str(folder))
 
 
-def check_devices(settings: TrainConfig) -> None:
-    if jax.process_count() > 1 and settings.devices != jax.device_count():
+def check_devices(train_cfg: TrainConfig) -> None:
+    if jax.process_count() > 1 and train_cfg.devices != jax.device_count():
         raise ConfigError(
-            f"devices={settings.devices}: expected {jax.device_count()}, which the "
+            f"devices={train_cfg.devices}: expected {jax.device_count()}, which the "
             f"{jax.process_count()} processes have together ({jax.default_backend()})"
         )
-    if settings.devices > jax.device_count():
+    if train_cfg.devices > jax.device_count():
         raise ConfigError(
-            f"devices={settings.devices}: JAX sees {jax.device_count()} ({jax.default_backend()})"
+            f"devices={train_cfg.devices}: JAX sees {jax.device_count()} ({jax.default_backend()})"
             + ("; set JAX_NUM_CPU_DEVICES to split the CPU" if jax.default_backend() == "cpu" else "")
         )
 

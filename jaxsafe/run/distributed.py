@@ -53,7 +53,7 @@ class Position(NamedTuple):
 # ---- meeting and leaving ---------------------------------------------------------------------
 
 
-def position(
+def position_from_options(
     coordinator: str | None, num_processes: int | None, process_index: int | None, devices: int
 ) -> Position | None:
     """From the options or, without any and with several devices, from SLURM; None: a lone process.
@@ -106,8 +106,10 @@ def joined(at: Position | None) -> Iterator[None]:
     """
     if at:
         port = meet(at)
-        atexit.register(give_up, 1)  # of an error that nobody expected, its traceback printed by then
-        threading.Thread(target=watch, daemon=True).start()
+        atexit.register(
+            exit_all_if_joined, 1
+        )  # of an error that nobody expected, its traceback printed by then
+        threading.Thread(target=watch_lifelines, daemon=True).start()
         jax.distributed.initialize(
             f"{at.host if ':' not in at.host else f'[{at.host}]'}:{port}",
             at.count,
@@ -118,14 +120,14 @@ def joined(at: Position | None) -> Iterator[None]:
     try:
         yield
     except Exception:
-        if _lifelines:  # the end of another process may be the cause: `watch` says so and ends this one
+        if _lifelines:  # the end of another process may be the cause; then `watch_lifelines` says so
             time.sleep(1.0)
         raise
 
 
 def meet(at: Position) -> int:
     """Connect process 0 with every other; returns the port that it has chosen for `jax.distributed`."""
-    lines, port = welcome(at) if at.index == 0 else find(at)
+    lines, port = meet_as_leader(at) if at.index == 0 else meet_as_follower(at)
     for line in lines.values():
         line.settimeout(None)
         line.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
@@ -136,7 +138,7 @@ def meet(at: Position) -> int:
     return port
 
 
-def welcome(at: Position) -> tuple[dict[int, socket.socket], int]:
+def meet_as_leader(at: Position) -> tuple[dict[int, socket.socket], int]:
     """Process 0's part of `meet`: wait for all others, then tell them the port."""
     lines: dict[int, socket.socket] = {}
     ends = time.monotonic() + PATIENCE
@@ -171,7 +173,7 @@ def welcome(at: Position) -> tuple[dict[int, socket.socket], int]:
     return lines, port
 
 
-def find(at: Position) -> tuple[dict[int, socket.socket], int]:
+def meet_as_follower(at: Position) -> tuple[dict[int, socket.socket], int]:
     """Another process's part of `meet`: reach process 0, which may start later, and wait for all."""
     ends = time.monotonic() + PATIENCE
     while True:
@@ -205,7 +207,7 @@ def read_line(line: socket.socket) -> str:
     return ""
 
 
-def watch() -> None:
+def watch_lifelines() -> None:
     """End this process as soon as another has ended, unless all have left in order."""
     lines = {**_lifelines}
     ready = select.select([*lines.values()], [], [])[0][0]
@@ -219,32 +221,32 @@ def watch() -> None:
         index = next(i for i, line in lines.items() if line is ready)
         line = f"error: process {index} has ended, and so this one; the last checkpoint stays\n"
         os.write(sys.stderr.fileno(), line.encode())  # at once: jax.distributed may notice too
-    end(status[0] if status else 1)
+    exit_all(status[0] if status else 1)
 
 
-def end(status: int) -> NoReturn:
+def exit_all(status: int) -> NoReturn:
     """Leave at once and, where several train together, end the others too."""
-    tell(status)
+    send_status(status)
     os._exit(status)
 
 
-def give_up(status: int) -> None:
-    """`end`, unless this process is alone. For an error, once it is reported."""
+def exit_all_if_joined(status: int) -> None:
+    """`exit_all`, unless this process is alone. For an error, once it is reported."""
     if _lifelines:
-        end(status)
+        exit_all(status)
 
 
-def tell(status: int) -> None:
+def send_status(status: int) -> None:
     for line in _lifelines.values():
         with contextlib.suppress(OSError):
             line.sendall(bytes([status]))
 
 
-def leave() -> None:
+def part() -> None:
     """Part from the other processes when all have come this far; each goes on alone."""
     if _lifelines:
         jax.distributed.shutdown()
-        tell(0)
+        send_status(0)
         _lifelines.clear()
 
 
@@ -256,15 +258,15 @@ def leads() -> bool:
     return jax.process_index() == 0
 
 
-def first(tree: PyTree) -> PyTree:
+def from_process_0(tree: PyTree) -> PyTree:
     """`tree`, of NumPy arrays, as process 0 has it. Everywhere it has the same shapes."""
     return tree if jax.process_count() == 1 else multihost_utils.broadcast_one_to_all(tree)
 
 
-def first_text(text: str) -> str:
-    data = np.zeros(2**14, np.uint8)
-    data[: len(text.encode())] = np.frombuffer(text.encode(), np.uint8)
-    return bytes(first(data)).rstrip(b"\0").decode()
+def text_from_process_0(text: str) -> str:
+    data = np.frombuffer(text.encode(), np.uint8)
+    size = int(from_process_0(np.array(len(data))))
+    return bytes(from_process_0(np.resize(data, size))).decode()
 
 
 def place(tree: PyTree, sharding: Sharding) -> PyTree:

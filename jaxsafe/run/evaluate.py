@@ -1,7 +1,7 @@
 """Fresh episodes of a trained policy, and what is measured of each."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -39,23 +39,27 @@ def episode(
     """
     reset_key, act_key = jax.random.split(key)
     env = player.task
+    summed: Any = Episodes  # of jax.Array while it is traced
 
     def step(now, t):
         state, carry, alive = now
         own_key = jax.random.fold_in(act_key, t) if sampled else None
         action, carry = player.act(carry, state, own_key)
         state = env.step(state, action)
-        reward, cost = alive * state.reward, alive * state.cost
+        # what comes after the end may be anything, NaN included
+        reward, cost, costs = (
+            jnp.where(alive, x, 0.0) for x in (state.reward, state.cost, state.costs)
+        )
         later = discount**t * reward, cost_discount**t * cost
-        sums = Episodes(reward, cost, alive * state.costs, alive, *later)
-        return (state, carry, alive * (1.0 - state.terminated)), sums
+        sums = summed(reward, cost, costs, jnp.float32(alive), *later)
+        return (state, carry, alive & ~state.terminated), sums
 
-    start = env.reset(reset_key), player.begin(), jnp.float32(1)
+    start = env.reset(reset_key), player.begin(), jnp.bool_(True)
     _, sums = jax.lax.scan(step, start, jnp.arange(env.episode_length))
     return jax.tree.map(lambda x: x.sum(0), sums)
 
 
-def player_of(
+def make_evaluation(
     algo: Algorithm, num_episodes: int, seed: int, sampled: bool = False
 ) -> Callable[[PyTree], Episodes]:
     """What plays `num_episodes` fresh episodes with each of S policies: params [S, ...] -> Episodes.
@@ -78,18 +82,20 @@ def run_episodes(
 ) -> Episodes:
     """`num_episodes` fresh episodes for each of the S policies in `params` (leading axis).
 
-    Actions are the mean ones, or `sampled`. See `player_of`.
+    Actions are the mean ones, or `sampled`. See `make_evaluation`.
     """
-    return player_of(algo, num_episodes, seed, sampled)(params)
+    return make_evaluation(algo, num_episodes, seed, sampled)(params)
 
 
-def watcher(algo: Algorithm, num_episodes: int, seed: int) -> Callable[[PyTree], dict[str, np.ndarray]]:
+def make_training_evaluation(
+    algo: Algorithm, num_episodes: int, seed: int
+) -> Callable[[PyTree], dict[str, np.ndarray]]:
     """What evaluates S policies during training: params [S, ...] -> {name of a column: means [S]}.
 
     The programs with mean and with sampled actions run one after the other, as two that call the host
     at once can wait for each other.
     """
-    players = [player_of(algo, num_episodes, seed, sampled) for sampled in (False, True)]
+    players = [make_evaluation(algo, num_episodes, seed, sampled) for sampled in (False, True)]
 
     def evaluate(params: PyTree) -> dict[str, np.ndarray]:
         played = [play(params) for play in players]
@@ -102,7 +108,7 @@ def watcher(algo: Algorithm, num_episodes: int, seed: int) -> Callable[[PyTree],
 def measures(
     episodes: Episodes, cost_names: Sequence[str], limits: Mapping[str, float]
 ) -> dict[str, np.ndarray]:
-    """What is reported of each episode, float or bool [S, N] by name.
+    """What is reported of each episode, float [S, N] by name.
 
     Args:
         episodes: their sums.
@@ -110,15 +116,20 @@ def measures(
         limits: what is held under them; '' is the cost, other names are those of `cost_names`.
     """
     costs = {name: episodes.costs[..., k] for k, name in enumerate(cost_names)}
-    over = {name: (costs[name] if name else episodes.cost) > most for name, most in limits.items()}
-    named = costs if len(costs) > 1 else {}
+    over = {name: above(costs[name] if name else episodes.cost, most) for name, most in limits.items()}
+    shown = costs if len(costs) > 1 else {}
     return {
         "return": episodes.ret,
         "cost": episodes.cost,
-        "violation rate": np.any([*over.values()], axis=0),
-        **{f"cost {name}": x for name, x in named.items()},
+        "violation rate": np.max([*over.values()], axis=0),
+        **{f"cost {name}": x for name, x in shown.items()},
         **{f"{name} over {limits[name]:g}": x for name, x in over.items() if name},
         "discounted return": episodes.discounted_ret,
         "discounted cost": episodes.discounted_cost,
         "episode length": episodes.length,
     }
+
+
+def above(cost: np.ndarray, limit: float) -> np.ndarray:
+    """1 where a cost is above its limit, else 0; NaN where the cost is not known."""
+    return np.where(np.isnan(cost), np.nan, cost > limit)

@@ -1,5 +1,6 @@
-"""Ctrl-C and SIGTERM as a request to stop, seen even while JAX compiles."""
+"""Ctrl-C, SIGTERM and a closed terminal as a request to stop, seen even while JAX compiles."""
 
+import contextlib
 import signal
 import socket
 import threading
@@ -9,10 +10,13 @@ from types import TracebackType
 from jaxsafe.run import distributed
 
 EXIT_STATUS = 130
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class Interrupts:
     """The first signal sets `requested`; the second, or any while `nothing_to_save`, leaves at once.
+
+    A terminal that closes sends SIGHUP, perhaps several times. Under nohup it is not listened to.
 
     Python runs signal handlers between its own instructions only, and one XLA compilation can
     take minutes. So a thread reads the signals from the wakeup socket, which is written at once.
@@ -38,8 +42,9 @@ class Interrupts:
             self.reader, self.writer = socket.socketpair()
             self.writer.setblocking(False)
             self.wakeup = signal.set_wakeup_fd(self.writer.fileno(), warn_on_full_buffer=False)
-            for number in (signal.SIGINT, signal.SIGTERM):
-                self.handlers[number] = signal.signal(number, lambda *_: None)
+            for number in SIGNALS:
+                if signal.getsignal(number) is not signal.SIG_IGN:
+                    self.handlers[number] = signal.signal(number, lambda *_: None)
             threading.Thread(target=self._listen, daemon=True).start()
         return self
 
@@ -60,12 +65,16 @@ class Interrupts:
     def _listen(self) -> None:
         with self.reader:
             while received := self.reader.recv(1):
-                if received[0] not in (signal.SIGINT, signal.SIGTERM):
+                if received[0] not in SIGNALS or (received[0] == signal.SIGHUP and self.requested):
                     continue
                 if self.requested or self.nothing_to_save:
-                    self.say(self.nothing_to_save or "stopped without a last checkpoint")
-                    distributed.end(EXIT_STATUS)
+                    self._try_to_say(self.nothing_to_save or "stopped without a last checkpoint")
+                    distributed.exit_all(EXIT_STATUS)
                 self.requested = True
-                self.say(
+                self._try_to_say(
                     "stopping after this iteration, with a checkpoint; Ctrl-C again leaves at once"
                 )
+
+    def _try_to_say(self, text: str) -> None:
+        with contextlib.suppress(OSError):  # the terminal may be gone
+            self.say(text)

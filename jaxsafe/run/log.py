@@ -1,15 +1,19 @@
 """Where the metrics of training go: metrics.csv, TensorBoard and the progress report."""
 
 import time
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 import jax
 import numpy as np
 
-from jaxsafe.run import clock, run_folder
-from jaxsafe.run.progress import Report
-from jaxsafe.run.spread import Member
+from jaxsafe.learn.metrics import BAD
+from jaxsafe.run import clock, files, run_folder
+from jaxsafe.run.divergence import KINDS, Health, Watch
+from jaxsafe.run.loggers import Callback
+from jaxsafe.run.programs import Member
+from jaxsafe.run.progress import Reporter
 from jaxsafe.types import Clocks
 
 OVERFLOW = "train/overflow"  # steps of an episode in which engine warp ran out of room
@@ -18,7 +22,7 @@ OVERFLOW = "train/overflow"  # steps of an episode in which engine warp ran out 
 SHOWN = {  # what the progress report shows: the first of these that is known
     "ret": ("train/return_estimate", "eval/return"),
     "cost": ("train/cost_estimate", "eval/cost"),
-    "lam": ("train/lam",),
+    "lam": ("train/nu", "train/lam"),  # of CPO nu is the price, and lam the trust region's
 }
 UNKNOWN = np.full(1, np.nan)
 
@@ -36,8 +40,11 @@ class Log:
         members: list[Member],
         iteration: int,
         clocks: Clocks,
-        report: Report,
+        report: Reporter,
+        watch: Watch,
+        callbacks: Sequence[Callback] = (),
     ):
+        self.watch, self.bad, self.callbacks = watch, False, callbacks
         self.seeds, self.clocks, self.warned = [m.seed for m in members], clocks, False
         self.report, self.unit = report, clock.unit(clocks)
         self.swept = {name: np.array([m.swept[name] for m in members]) for name in members[0].swept}
@@ -45,13 +52,13 @@ class Log:
         self.begun = time.perf_counter() - self.csv.seconds
         self.boards = [
             run_folder.Board(
-                folder / "tensorboard" / m.setting.replace(", ", "-") / f"seed{m.seed}",
+                files.make_folder(folder, *board_of(m)),
                 self.unit.at(iteration),
             )
             for m in members
         ]
         self.thread = ThreadPoolExecutor(1)
-        self.writing: Future[tuple[int, dict[str, np.ndarray]]] | None = None
+        self.writing: Future[tuple[clock.Progress, dict[str, np.ndarray], Health]] | None = None
 
     def __enter__(self) -> "Log":
         return self
@@ -62,10 +69,10 @@ class Log:
         for board in self.boards:
             board.close()
 
-    def append(self, iteration: int, metrics: dict[str, jax.Array]) -> None:
+    def append(self, iteration: int, metrics: dict[str, jax.Array], health: Health) -> None:
         """Begin to write the metrics of an iteration, once those of the last one are written."""
         self._finish()
-        self.writing = self.thread.submit(self._write, iteration, metrics)
+        self.writing = self.thread.submit(self._write, iteration, metrics, health)
 
     def sync(self) -> None:
         """Put all that was appended on the disk."""
@@ -75,27 +82,43 @@ class Log:
             board.flush()
 
     def _write(
-        self, iteration: int, metrics: dict[str, jax.Array]
-    ) -> tuple[int, dict[str, np.ndarray]]:
+        self, iteration: int, metrics: dict[str, jax.Array], health: Health
+    ) -> tuple[clock.Progress, dict[str, np.ndarray], Health]:
         values = {k: np.asarray(v, np.float32) for k, v in jax.device_get(metrics).items()}
         shown, seconds = self.unit.at(iteration), time.perf_counter() - self.begun
         at = clock.after(iteration, self.clocks)
         self.csv.append(at, self.seeds, seconds, values | self.swept)
+        self.csv.ended |= bool((values.get("train/episodes", UNKNOWN) > 0).any())
+        drawn = values | ({} if self.csv.ended else estimates(values))
         for s, board in enumerate(self.boards):
-            board.append(shown, {name: float(value[s]) for name, value in values.items()})
-        return shown, values
+            board.append(shown, {name: float(value[s]) for name, value in drawn.items()})
+        return at, values, jax.device_get(health)
 
     def _finish(self) -> None:
         if not self.writing:
             return
         writing, self.writing = self.writing, None
-        shown, values = writing.result()
+        at, values, health = writing.result()
+        shown = self.unit.at(at.iteration)
+        for line in self.watch(f"{shown:,} {self.unit.name}", values, health):
+            if not self.watch.over:  # else the run ends, and says it
+                self.report.line(f"warning: {line}; the others go on")
+        if not self.bad and (values.get(BAD[0], np.zeros(())) > 0).any():
+            self.bad = True
+            kinds = [word for k, word in KINDS.items() if (values[f"train/bad_{k}"] > 0).any()]
+            self.report.line(
+                f"warning: {values[BAD[0]].sum():.0f} worlds had a step that is not finite "
+                f"({', '.join(kinds)}) by {shown:,} {self.unit.name}; such worlds are reset, and the "
+                f"step does not count ({BAD[0]} in metrics.csv)"
+            )
         if not self.warned and (values.get(OVERFLOW, np.zeros(())) > 0).any():  # NaN: nothing ended
             self.warned = True
             self.report.line(
                 f"warning: contacts found no room in some steps ({OVERFLOW} in metrics.csv); "
                 "raise env.contact_room"
             )
+        for callback in self.callbacks:
+            callback(at, dict(values))
         self.report.update(
             shown,
             len(self.seeds),
@@ -104,6 +127,18 @@ class Log:
                 for short, names in SHOWN.items()
             },
         )
+
+
+def estimates(values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """What stands beside the empty charts of return and cost as long as no episode has ended."""
+    found = {name: values.get(run_folder.estimate_of(name)) for name in ("train/return", "train/cost")}
+    return {f"{k} (estimate, no episode ended yet)": x for k, x in found.items() if x is not None}
+
+
+def board_of(member: Member) -> list[str]:
+    """The folders in a run folder that hold a member's file for TensorBoard."""
+    setting = member.setting.replace(", ", "-")
+    return ["tensorboard", *([setting] if setting else []), f"seed{member.seed}"]
 
 
 def mean(values: np.ndarray) -> float:

@@ -7,10 +7,9 @@ from typing import Any
 import jax
 
 from jaxsafe.config import ConfigError
-from jaxsafe.envs.wrap import raw_steps
-from jaxsafe.run import checkpoint, spread
-from jaxsafe.run.settings import TrainConfig
-from jaxsafe.run.spread import Program
+from jaxsafe.run import checkpoint, programs
+from jaxsafe.run.programs import Program
+from jaxsafe.run.settings import Settings, TrainConfig
 from jaxsafe.types import Env
 
 ROOM = 0.8  # of the memory that a program may take by `capacity`
@@ -20,23 +19,36 @@ class TooLarge(ConfigError):
     """What was asked cannot fit the memory."""
 
 
-def check_memory(env: Env, program: Program, settings: TrainConfig) -> None:
-    """Refuse, before anything compiles, a trajectory that cannot fit the device.
+def check_memory(env: Env, settings: Settings) -> None:
+    """Refuse, before anything is built, a trajectory or an evaluation that cannot fit the device.
 
-    A lower bound: observations before and after each step, actions and a few scalars.
+    Lower bounds. Of a trajectory: observations before and after each step, actions and a few scalars.
     """
     limit, what = device_memory()
     step = 4 * (2 * env.obs_size + env.action_size + 8 + len(env.cost_names))  # bytes
-    steps, members = program.clocks.steps // raw_steps(env), len(program.members)  # rows kept of each
-    need = step * steps * members // settings.devices
+    steps = settings.row.make(env, None).clocks(settings.algo).steps
+    members = len(settings.configs) * settings.train.num_seeds
+    need = step * steps * members // settings.train.devices
     if need > limit:
         raise TooLarge(
             f"{steps:,} environment steps an update x {members} seeds needs at least "
             f"{need / 2**30:,.1f} GiB a device, {what} has {limit / 2**30:,.1f}; use fewer num_envs"
         )
+    check_episodes(env, settings.train.eval_episodes, members)
 
 
-def check_state_memory(program: Program, settings: TrainConfig) -> None:
+def check_episodes(env: Env, episodes: int, policies: int) -> None:
+    """Refuse an evaluation whose rewards and costs of each step cannot fit the device."""
+    limit, what = device_memory()
+    need = 4 * (5 + len(env.cost_names)) * env.episode_length * episodes * policies  # bytes
+    if need > limit:
+        raise TooLarge(
+            f"{episodes:,} episodes of {policies} policies need at least {need / 2**30:,.1f} GiB, "
+            f"{what} has {limit / 2**30:,.1f}; evaluate fewer"
+        )
+
+
+def check_state_memory(program: Program, train_cfg: TrainConfig) -> None:
     """Like `check_memory`, for the train state itself, known once it is traced: old and new, but a
     replay only once, as it is written in place. Every device has the whole data set."""
     limit, what = device_memory()
@@ -44,9 +56,9 @@ def check_state_memory(program: Program, settings: TrainConfig) -> None:
     whole = sum(x.size * x.dtype.itemsize for x in checkpoint.as_data(like).values())
     replay = checkpoint.replay_bytes(like)
     data = sum(x.nbytes for x in jax.tree.leaves(program.data))
-    need = (2 * (whole - replay) + replay) / settings.devices + data
+    need = (2 * (whole - replay) + replay) / train_cfg.devices + data
     if need > limit:
-        part = f" ({replay / settings.devices / 2**30:,.1f} GiB of it replay)" if replay else ""
+        part = f" ({replay / train_cfg.devices / 2**30:,.1f} GiB of it replay)" if replay else ""
         part += f" ({data / 2**30:,.1f} GiB of it the data set)" if data else ""
         less = "a smaller algo.replay_size or " if replay > whole / 2 else "fewer num_envs or "
         raise TooLarge(
@@ -61,7 +73,7 @@ def capacity(program: Program) -> int:
         lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=program.sharding),
         jax.eval_shape(program.init, program.start, program.shared()),
     )
-    used: Any = spread.compiled(program, like).memory_analysis()
+    used: Any = programs.compiled(program, like).memory_analysis()
     need = used.temp_size_in_bytes + used.argument_size_in_bytes + used.output_size_in_bytes
     share = ROOM * device_memory()[0] / (need - used.alias_size_in_bytes)  # of the members
     return max(1, int(min(1.0, share) * len(program.members)))

@@ -1,6 +1,6 @@
 """The policies of a run folder: to act with, and to start another run from.
 
-A policy is what acts: networks, normaliser, config. It has a file of its own beside the checkpoints.
+A policy is networks, a normaliser and a config. It has a file of its own beside the checkpoints.
 Nothing in the folder is executed.
 """
 
@@ -14,18 +14,32 @@ import numpy as np
 
 from jaxsafe.config import ConfigError, flat
 from jaxsafe.learn.acting import Player
-from jaxsafe.learn.offline import blank
-from jaxsafe.run import checkpoint, run_folder
-from jaxsafe.run.settings import DEFAULT, REGISTERED, Entries, Settings, load, make_env, settle
-from jaxsafe.run.spread import Program, members
+from jaxsafe.learn.offline import data_set_like
+from jaxsafe.run import checkpoint, files, run_folder
+from jaxsafe.run.programs import Program, members
+from jaxsafe.run.settings import (
+    DEFAULT,
+    NO_EXTRAS,
+    Extras,
+    Settings,
+    check_read_from,
+    load,
+    make_env,
+    settings_from_config,
+)
 from jaxsafe.types import Algorithm, Env, PyTree, Shared
 
-POLICY = ("params", "normaliser")  # the parts of what acts that another run can start from
+ROBOT = "env.robot_base"
+CODE = ("env=MODULE:NAME", "algo=MODULE:NAME", f"{ROBOT}=PATH")  # what a user gives beside a run folder
+POLICY = ("params", "normaliser")  # the parts of a policy's parameters that another run can start from
 
 
-class Opened(NamedTuple):
-    """The policies of a run folder, ready to act. `params` is what acts, with a leading axis over them:
-    every seed of the first setting, then of the next."""
+class RunPolicies(NamedTuple):
+    """The policies of a run folder, ready to act.
+
+    `params` are their parameters, with a leading axis over policies: every seed of the first setting,
+    then of the next.
+    """
 
     folder: Path
     settings: Settings
@@ -46,34 +60,37 @@ class Opened(NamedTuple):
         return Actor(self.settings, self.env, self.algo, params)
 
 
-def open_run(folder: Path, code: Sequence[str] = (), entries: Entries = REGISTERED) -> Opened:
+def open_run(folder: Path, code: Sequence[str] = (), extras: Extras = NO_EXTRAS) -> RunPolicies:
     """The newest policies of a run folder. Executes nothing from it.
 
     Args:
         folder: the run folder.
         code: 'env=module:name' and 'algo=module:name', where the run was trained with the user's code.
-            They are imported.
-        entries: the caller's environment and algorithm, where the run was trained with objects.
+            They are imported. 'env.robot_base=path', where it was trained with the user's robot.
+        extras: the caller's environment and algorithm, where the run was trained with objects.
     Raises:
         ConfigError: no run folder, one without a checkpoint, or one of another environment.
     """
     saved = run_folder.read_config(folder)
-    for text in code:
-        kind, _, name = text.partition("=")
-        if kind not in DEFAULT:
-            raise ConfigError(f"{text}: expected env=MODULE:NAME or algo=MODULE:NAME")
-        if name != saved[kind]["name"]:
-            raise ConfigError(f"{text}: {folder} was trained with {kind}={saved[kind]['name']}")
-        load(kind, name)
-    settings = settle(saved, entries)
+    given = dict(text.split("=", 1) for text in code)
+    for kind, name in given.items():
+        if kind not in (*DEFAULT, ROBOT):
+            raise ConfigError(f"{kind}={name}: expected {' or '.join(CODE)}")
+        there = flat(saved).get(kind if kind == ROBOT else f"{kind}.name")
+        if name != there:
+            raise ConfigError(f"{kind}={name}: {folder} was trained with {kind}={there}")
+        if kind in DEFAULT:
+            load(kind, name)
+    settings = settings_from_config(saved, extras)
+    check_read_from(settings, folder, {*given, "dataset", "init_from"})  # these two are not read here
     if not checkpoint.checkpoints(policy_folder(folder)):
         raise ConfigError(f"{folder} holds no checkpoint")
     env = make_env(settings)
-    return Opened(folder, settings, env, *policy_of(settings, env, folder))
+    return RunPolicies(folder, settings, env, *policy_of(settings, env, folder))
 
 
 class Actor(NamedTuple):
-    """One policy of a run, ready to act. `params` is what acts of that member alone."""
+    """One policy of a run, ready to act, with its parameters."""
 
     settings: Settings
     env: Env
@@ -86,25 +103,25 @@ class Actor(NamedTuple):
 
 
 def policy_of(settings: Settings, env: Env, folder: Path) -> tuple[Algorithm, PyTree]:
-    """The algorithm, and what acts of the newest policy of each member, [S, ...]."""
+    """The algorithm, and the newest parameters of each member's policy, [S, ...]."""
     algo = settings.row.make(env, None)
     offline = not algo.clocks(settings.algo).steps  # shapes alone count, so that no data set is read
-    shared = Shared(np.int32(0), data=blank(env) if offline else ())
+    shared = Shared(np.int32(0), data=data_set_like(env) if offline else ())
 
-    def first(cfg: Any) -> PyTree:
+    def initial_params(cfg: Any) -> PyTree:
         return algo.params(algo.init(jax.random.key(0), cfg, shared))
 
     run = members(settings.configs, settings.train)
     floats = jax.tree.map(lambda *x: np.array(x, np.float32), *[m.algo for m in run])
-    like = jax.eval_shape(first, jax.tree.map(lambda x: x[0], floats))
+    like = jax.eval_shape(initial_params, jax.tree.map(lambda x: x[0], floats))
     arrays = read_policy(folder, len(run))
-    return algo, acting(like, arrays, floats, folder)
+    return algo, policy_params(like, arrays, floats, folder)
 
 
 def policy_folder(folder: Path) -> Path:
     """Where the policies of a run lie: in policy/ or, in older runs, in the checkpoints."""
-    alone = folder / "policy"
-    return alone if checkpoint.checkpoints(alone) else folder / "checkpoints"
+    alone = files.inside(folder, "policy")
+    return alone if checkpoint.checkpoints(alone) else files.inside(folder, "checkpoints")
 
 
 def read_policy(
@@ -117,14 +134,14 @@ def read_policy(
     Rows beyond the run's members are the copies on the other devices of a split one.
     """
     arrays, _ = checkpoint.load(policy_folder(folder), warn)
-    policy = {name: x[:rows] for name, x in arrays.items()}
+    policy = {name: x[:rows] for name, x in arrays.items() if x.ndim}
     if any(len(x) != rows for x in policy.values()):
         raise ConfigError(f"{folder} holds fewer than the {rows} policies of its config.yaml")
     return policy
 
 
-def acting(like: PyTree, policy: dict[str, np.ndarray], configs: PyTree, source: Path) -> PyTree:
-    """What acts of each of S policies, [S, ...].
+def policy_params(like: PyTree, policy: dict[str, np.ndarray], configs: PyTree, source: Path) -> PyTree:
+    """The parameters of S policies, [S, ...].
 
     Args:
         like: of one, without that axis.
@@ -138,9 +155,14 @@ def acting(like: PyTree, policy: dict[str, np.ndarray], configs: PyTree, source:
     like = jax.tree.map(lambda x: jax.ShapeDtypeStruct((rows, *x.shape), x.dtype), like)
     check_policy(like, policy, source)
     arrays = policy | checkpoint.to_arrays({"config": configs})
-    for name in checkpoint.leaf_names(like):
-        if name not in arrays:
-            raise ConfigError(f"the policy of {source} does not fit: {name} is absent")
+    for name, want in checkpoint.as_data(like).items():
+        have = checkpoint.describe(
+            (str(arrays[name].dtype), arrays[name].shape) if name in arrays else None
+        )
+        if have != (expected := checkpoint.describe((str(want.dtype), want.shape))):
+            raise ConfigError(
+                f"the policy of {source} does not fit: {name} is {have}, expected {expected}"
+            )
     return checkpoint.from_arrays(like, arrays)
 
 
@@ -153,10 +175,12 @@ def check_policy(like: PyTree, policy: dict[str, np.ndarray], source: Path, why:
     expected = dict(zip(checkpoint.leaf_names(like), jax.tree.leaves(like), strict=True))
     expected, policy = networks(expected), networks(policy)
     for name in sorted({*expected, *policy}):
-        have, want = (
-            str(list(x[name].shape[1:])) if name in x else "absent" for x in (policy, expected)
-        )
-        if have != want:
+        found = [
+            (x[name].dtype, list(x[name].shape[1:])) if name in x else None for x in (policy, expected)
+        ]
+        if found[0] != found[1]:
+            types = len({x[0] for x in found if x}) > 1
+            have, want = ("absent" if x is None else f"{x[0]} {x[1]}" if types else x[1] for x in found)
             raise ConfigError(
                 f"the policy of {source} does not fit: {name} is {have}, expected {want}{why}"
             )
@@ -174,7 +198,7 @@ def warm_start(
         ConfigError: no run, or one whose networks have other shapes.
     """
     source = Path(settings.train.init_from or "").expanduser()
-    saved = settle(run_folder.read_config(source), settings.entries)
+    saved = settings_from_config(run_folder.read_config(source), settings.extras)
     if not checkpoint.checkpoints(policy_folder(source)):
         raise ConfigError(f"init_from={source} holds no checkpoint")
     first, count = saved.train.seed, saved.train.num_seeds

@@ -1,9 +1,10 @@
 """What a training run says while it runs: a live bar on a terminal, one changing line in a notebook,
 plain lines elsewhere."""
 
+import contextlib
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from types import TracebackType
 
 from rich.console import Console
@@ -23,14 +24,14 @@ def short(value: float) -> str:
     return f"{value:.3g}" if abs(value) < 1e3 else f"{value:.0f}"
 
 
-def count(value: float) -> str:
+def count_text(value: float) -> str:
     for size, unit in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
         if value >= size:
             return f"{value / size:.3g}{unit}"
     return f"{value:.0f}"
 
 
-def clock(seconds: float) -> str:
+def duration_text(seconds: float) -> str:
     if not math.isfinite(seconds):
         return "-"
     minutes, s = divmod(round(seconds), 60)
@@ -38,7 +39,7 @@ def clock(seconds: float) -> str:
     return f"{hours}:{m:02d}:{s:02d}" if hours else f"{m}:{s:02d}"
 
 
-class Report:
+class Reporter:
     """Prints to stdout; `with` it, so that a live bar is taken down whatever happens.
 
     Args:
@@ -60,7 +61,7 @@ class Report:
         self.live: Progress | None = None
         self.width = 0  # of the changing line in a notebook
 
-    def __enter__(self) -> "Report":
+    def __enter__(self) -> "Reporter":
         return self
 
     def __exit__(
@@ -68,9 +69,18 @@ class Report:
     ) -> None:
         self.stop()
 
+    @contextlib.contextmanager
+    def _showing(self) -> Iterator[None]:
+        """Once the terminal is gone, nothing is shown any more."""
+        try:
+            yield
+        except OSError:
+            self.console, self.live = Console(quiet=True), None
+
     def line(self, text: str) -> None:
-        self._end_changing()
-        self.console.print(text, markup=False)
+        with self._showing():
+            self._end_changing()
+            self.console.print(text, markup=False)
 
     def start(self, total: int, done: int, cost_limits: Sequence[float], unit: str = "steps") -> None:
         """Begin to show progress from `done` to `total`, which count in `unit`."""
@@ -101,15 +111,16 @@ class Report:
         rate = (done - self.begun_at) / max(now - self.begun, 1e-9)  # of one seed
         lam = self.last["lam"]  # of algorithms that have one multiplier
         text = (
-            f"{count(done)}/{count(self.total)} {self.unit}  "
-            f"{count(rate * num_members)} {self.unit}/s  "
+            f"{count_text(done)}/{count_text(self.total)} {self.unit}  "
+            f"{count_text(rate * num_members)} {self.unit}/s  "
             f"return {short(self.last['ret'])}  "
             f"cost {short(self.last['cost'])}{self.limits}  "
             f"{f'lam {short(lam)}  ' if math.isfinite(lam) else ''}"
-            f"left {clock((self.total - done) / max(rate, 1e-9))}"
+            f"left {duration_text((self.total - done) / max(rate, 1e-9))}"
         )
         if self.live:
-            self.live.update(self.task, completed=done, text=text)
+            with self._showing():
+                self.live.update(self.task, completed=done, text=text)
         elif self.notebook:
             if now - self.printed >= NOTEBOOK_EVERY or done >= self.total:
                 self.printed, text = now, f"{100 * done / self.total:3.0f}%  {text}"
@@ -125,7 +136,8 @@ class Report:
             self.width = 0
 
     def stop(self) -> None:
-        self._end_changing()
-        if self.live:
-            self.live.stop()
-            self.live = None
+        with self._showing():
+            self._end_changing()
+            if self.live:
+                self.live.stop()
+                self.live = None

@@ -6,15 +6,16 @@ metrics.csv     a row for each iteration and seed, or metrics.csv.xz. A cell wit
                 With several settings: a row for each of them too, and a column for each swept float
 tensorboard/    the same for TensorBoard, a folder for each seed (and setting)
 checkpoints/    train states, to resume from: see jaxsafe.run.checkpoint
-policy/         what acts, alone: all that evaluation, films and init_from read
+policy/         the policies alone: all that evaluation, films and init_from read
 curves.png, video.mp4, evaluation.json   written at the end
 """
 
 import csv
 import datetime
 import importlib.metadata
+import io
+import itertools
 import json
-import lzma
 import math
 import os
 import platform
@@ -28,12 +29,13 @@ from typing import Any
 
 import numpy as np
 import yaml
-from tensorboardX.event_file_writer import EventsWriter
 from tensorboardX.proto import event_pb2, summary_pb2
+from tensorboardX.record_writer import RecordWriter
 
 import jaxsafe
 from jaxsafe.config import ConfigError
-from jaxsafe.run import checkpoint
+from jaxsafe.learn.metrics import BAD
+from jaxsafe.run import checkpoint, files
 from jaxsafe.run.checkpoint import Progress
 from jaxsafe.run.evaluate import COLUMNS
 
@@ -41,39 +43,40 @@ PACKAGES = (
     "jax", "jaxlib", "mujoco", "mujoco-mjx", "warp-lang", "flax", "optax", "orbax-checkpoint", "numpy",
     "brax",
 )  # fmt: skip
+MOST_HEADER = 64 * files.KB  # letters of a table's first line
 INDEX = (*Progress._fields, "seed", "seconds")  # the first columns of metrics.csv
 
 
+# options about the machine and the network, which a file never sets
+COMMAND_ONLY = ("coordinator", "num_processes", "process_index", "logger")
+
+
 def write_config(folder: Path, config: dict[str, Any]) -> None:
-    replace_text(folder / "config.yaml", yaml.safe_dump(config, sort_keys=False))
+    files.write(folder / "config.yaml", yaml.safe_dump(config, sort_keys=False))
 
 
 def read_config(folder: Path) -> dict[str, Any]:
     """The settings of a run, as plain values: nothing in the file is executed.
 
     Raises:
-        ConfigError: no run folder, or its config.yaml is not a mapping of settings.
+        ConfigError: no run folder, its config.yaml is not a mapping of settings, or it says something
+            about the machine or the network.
     """
     path = folder / "config.yaml"
-    if not path.is_file():
+    if not files.there(path):
         raise ConfigError(f"{folder} is not a run folder: it has no config.yaml")
-    try:
-        config = yaml.safe_load(path.read_text())
-    except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
-        raise ConfigError(f"{path} cannot be read: {' '.join(str(error).split())}") from error
+    config = files.read_yaml(path)
     groups = [config.get(g) if isinstance(config, dict) else None for g in ("env", "algo")]
     if not all(isinstance(g, dict) and isinstance(g.get("name"), str) for g in groups):
         raise ConfigError(f"{path} is not the config of a run: it names no env or no algo")
+    for name in COMMAND_ONLY:
+        if name in config:
+            raise ConfigError(f"{path} sets {name}, which only a command may")
     return config
 
 
 def append_versions(folder: Path, device: str, engine: str | None, dataset: str | None = None) -> None:
     """Add this start of the run to versions.json, with the SHA-256 of its data set."""
-    path = folder / "versions.json"
-    try:
-        starts = list(json.loads(path.read_text())) if path.exists() else []
-    except ValueError:
-        starts = []
     now = {
         "time": datetime.datetime.now().astimezone().isoformat(timespec="seconds"),
         # as it was typed: `arguments` adds the ++ that Hydra needs
@@ -87,24 +90,31 @@ def append_versions(folder: Path, device: str, engine: str | None, dataset: str 
         "jaxsafe": jaxsafe.__version__,
         **{name: installed(name) for name in PACKAGES},
     }
-    replace_text(path, json.dumps([*starts, now], indent=1))
+    files.write(folder / "versions.json", json.dumps([*starts(folder), now], indent=1))
+
+
+def starts(folder: Path) -> list[dict[str, Any]]:
+    """What versions.json says of each start; nothing where it cannot be read."""
+    try:
+        found = files.read_json(folder / "versions.json")
+    except ConfigError:
+        return []
+    return [each for each in found if isinstance(each, dict)] if isinstance(found, list) else []
+
+
+def last_start(folder: Path) -> dict[str, Any]:
+    return next(reversed(starts(folder)), {})
 
 
 def trained_by(folder: Path) -> str:
     """The version of jaxsafe that a run was last started with, and its commit."""
-    try:
-        last = json.loads((folder / "versions.json").read_text())[-1]
-        return f"{last['jaxsafe']} ({last['commit']})"
-    except (OSError, ValueError, LookupError, TypeError):
-        return "of an unknown version"
+    last = last_start(folder)
+    return f"{last['jaxsafe']} ({last.get('commit')})" if "jaxsafe" in last else "of an unknown version"
 
 
 def dataset_of(folder: Path) -> str | None:
     """The SHA-256 of the data set that a run was last started with; None where that is not known."""
-    try:
-        return str(json.loads((folder / "versions.json").read_text())[-1]["dataset"] or "") or None
-    except (OSError, ValueError, LookupError, TypeError):
-        return None
+    return str(last_start(folder).get("dataset") or "") or None
 
 
 def installed(package: str) -> str | None:
@@ -134,13 +144,22 @@ def commit() -> str | None:
         return None
 
 
+def estimate_of(name: str) -> str:
+    """The column that estimates train/return, train/cost or train/cost_<name> from every step, whether
+    or not an episode ended."""
+    for metric in ("train/return", "train/cost"):
+        if name.startswith(metric):
+            return f"{metric}_estimate{name.removeprefix(metric)}"
+    return name
+
+
 class Metrics:
     """metrics.csv: appends rows, and on resumption drops those after the checkpoint."""
 
     def __init__(self, folder: Path, names: list[str], iteration: int):
         """Open for appending after `iteration`; later rows and a torn last line are dropped.
 
-        Columns of evaluation may be new, or stay without new values.
+        Columns of evaluation, and those of bad worlds, may be new, or stay without new values.
 
         Raises:
             ConfigError: the file exists with other columns.
@@ -148,12 +167,12 @@ class Metrics:
         self.path, self.names, self.seconds = folder / "metrics.csv", list(names), 0.0
         header = [*INDEX, *self.names]
         kept = []
-        if self.path.exists() and iteration:
-            with self.path.open(newline="") as file:
-                rows = csv.reader(file)
+        if files.there(self.path) and iteration:
+            with files.reading(self.path):
+                rows = csv.reader(io.StringIO(files.read_text(self.path), newline=""))
                 found = next(rows, header)
                 odd = sorted(set(found) ^ set(header))
-                if not all(name in COLUMNS for name in odd):
+                if not all(name in (*COLUMNS, *BAD) for name in odd):
                     raise ConfigError(f"{self.path} has other columns ({', '.join(odd)})")
                 self.names += [name for name in found if name not in header]
                 header = [*INDEX, *self.names]
@@ -162,12 +181,12 @@ class Metrics:
                     for row in rows
                     if len(row) == len(found) and row[0].isdigit() and int(row[0]) <= iteration
                 ]
-            self.seconds = float(kept[-1][INDEX.index("seconds")]) if kept else 0.0
-        part = self.path.with_suffix(".part")
-        with part.open("w", newline="") as file:
+                self.seconds = float(kept[-1][INDEX.index("seconds")]) if kept else 0.0
+        valued = {name for row in kept for name, cell in zip(header, row, strict=True) if cell}
+        self.ended = "train/return" in valued  # whether an episode did so far
+        with files.replacing(self.path) as part, part.open("w", newline="") as file:
             csv.writer(file, lineterminator="\n").writerows([header, *kept])
-        part.replace(self.path)
-        self.file = self.path.open("a", newline="")
+        self.file = files.appending(self.path)
         self.writer = csv.writer(self.file, lineterminator="\n")
 
     def append(self, at: Progress, seeds: list[int], seconds: float, values: Mapping) -> None:
@@ -193,8 +212,12 @@ class Board:
 
     def __init__(self, folder: Path, steps: int):
         """Open for appending after `steps`; TensorBoard drops what older files have beyond."""
-        folder.mkdir(parents=True, exist_ok=True)
-        self.writer = EventsWriter(str(folder / "events"), f".{os.getpid()}.{steps}")
+        host, now = platform.node(), time.time()
+        path = folder / f"events.out.tfevents.{int(now):010d}.{host}.{os.getpid()}.{steps}"
+        with files.replacing(path):  # a new file, whatever is there
+            pass
+        self.writer = RecordWriter(str(path))
+        self._write(0, file_version="brain.Event:2")
         if steps:
             session = event_pb2.SessionLog(status=event_pb2.SessionLog.START)  # type: ignore[attr-defined]
             self._write(steps + 1, session_log=session)
@@ -205,7 +228,7 @@ class Board:
 
     def _write(self, steps: int, **what: Any) -> None:
         event = event_pb2.Event(wall_time=time.time(), step=steps, **what)  # type: ignore[attr-defined]
-        self.writer.write_event(event)
+        self.writer.write(event.SerializeToString())
 
     def flush(self) -> None:
         self.writer.flush()
@@ -218,37 +241,42 @@ def metrics_file(folder: Path) -> Path:
     """metrics.csv, or metrics.csv.xz as long as there is only that."""
     path = folder / "metrics.csv"
     packed = path.with_name("metrics.csv.xz")
-    return packed if packed.is_file() and not path.is_file() else path
+    return packed if files.there(packed) and not files.there(path) else path
 
 
 def read_metrics(folder: Path) -> dict[str, np.ndarray]:
     """metrics.csv as float columns by name (NaN where a cell is empty); empty if there is none."""
     path = metrics_file(folder)
-    return read_table(path) if path.is_file() else {}
+    return read_table(path) if files.there(path) else {}
 
 
 def read_table(path: Path) -> dict[str, np.ndarray]:
     """A .csv or .csv.xz as `read_metrics` gives it. A torn line is left out.
 
     Raises:
-        ConfigError: a cell is no number, or the file cannot be read.
+        ConfigError: a cell is no number, a column that every table has is absent or has an empty cell,
+            or the file cannot be read.
     """
-    try:
-        x = path.read_bytes()
-        text = (lzma.decompress(x) if path.suffix == ".xz" else x).decode()
-        header, *lines = text.splitlines() or [""]
-        names = header.split(",")
-        body = "".join(f"{line}\n" for line in lines if line.count(",") == len(names) - 1)
-        body = body.replace(",,", ",nan,").replace(",,", ",nan,").replace(",\n", ",nan\n")
-        rows = body.split()
+    text = files.read_text(path)
+    with files.reading(path):
+        header, _, body = text.partition("\n")
+        if len(header) > MOST_HEADER:
+            raise ConfigError(f"{path} begins with a line of {len(header):,} letters")
+        names = header.strip().split(",")
+        lines = (line for line in io.StringIO(body) if line.count(",") == len(names) - 1)
+        filled = (line.rstrip("\r\n").replace(",,", ",nan,").replace(",,", ",nan,") for line in lines)
+        rows = (f"{line}nan" if line.endswith(",") else line for line in filled)
+        first = next(rows, None)
         table = (
-            np.loadtxt(rows, delimiter=",", comments=None, ndmin=2)
-            if rows
+            np.loadtxt(itertools.chain([first], rows), delimiter=",", comments=None, ndmin=2)
+            if first
             else np.empty((0, len(names)))
         )
-    except (ValueError, OSError, EOFError, lzma.LZMAError) as error:
-        raise ConfigError(f"{path} cannot be read: {' '.join(str(error).split())}") from error
-    return dict(zip(names, table.T, strict=True))
+        found = dict(zip(names, table.T, strict=True))
+    for name in ("iteration", "steps", "seed"):
+        if len(table) and not np.isfinite(found.get(name, np.nan)).all():
+            raise ConfigError(f"{path} has no column {name}, or an empty cell in it")
+    return found
 
 
 def read_evaluation(folder: Path, setting: str) -> dict[str, np.ndarray]:
@@ -260,14 +288,16 @@ def read_evaluation(folder: Path, setting: str) -> dict[str, np.ndarray]:
         ConfigError: the file cannot be read.
     """
     path = folder / "evaluation.json"
-    if not path.is_file():
+    if not files.there(path):
         return {}
-    try:
-        found = json.loads(path.read_text())
+    found = files.read_json(path)
+    with files.reading(path):
         found = found[setting] if setting else found
-        return {name: np.array(values, float) for name, values in found.get("seeds", {}).items()}
-    except (ValueError, KeyError, TypeError, AttributeError, OSError) as error:
-        raise ConfigError(f"{path} cannot be read: {' '.join(str(error).split())}") from error
+        seeds = {name: np.array(values, float) for name, values in found.get("seeds", {}).items()}
+    for name, values in seeds.items():
+        if values.ndim != 1:
+            raise ConfigError(f"{path}: expected a list of numbers, one a seed, as {name}")
+    return seeds
 
 
 def by_setting(metrics: dict[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
@@ -289,7 +319,7 @@ def setting_name(swept: Mapping[str, Any]) -> str:
     return ", ".join(f"{k}={v:.9g}" if isinstance(v, float) else f"{k}={v}" for k, v in swept.items())
 
 
-def clock_of(metrics: Mapping[str, np.ndarray]) -> str:
+def step_column(metrics: Mapping[str, np.ndarray]) -> str:
     """The column that says how far training is: 'steps' or, where it takes no environment steps,
     'updates'."""
     moves = "updates" not in metrics or not len(metrics["steps"]) or metrics["steps"].max() > 0
@@ -304,17 +334,11 @@ def last_tenth(metrics: dict[str, np.ndarray], name: str) -> np.ndarray:
     return np.array([v.mean() if len(v) else np.nan for v in values])
 
 
-def progress(folder: Path) -> Progress | None:
+def newest_progress(folder: Path) -> Progress | None:
     """How far the newest checkpoint is; None without one."""
-    for path in checkpoint.checkpoints(folder / "checkpoints"):
+    for path in checkpoint.checkpoints(files.inside(folder, "checkpoints")):
         try:
             return checkpoint.read_manifest(path).at
-        except (ValueError, KeyError, TypeError, AttributeError, OSError):
+        except ConfigError:
             continue
     return None
-
-
-def replace_text(path: Path, text: str) -> None:
-    part = path.with_name(path.name + ".part")
-    part.write_text(text)
-    part.replace(path)

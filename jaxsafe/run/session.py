@@ -13,15 +13,24 @@ import numpy as np
 import jaxsafe
 from jaxsafe.config import ConfigError, flat
 from jaxsafe.envs.wrap import innermost
-from jaxsafe.run import checkpoint, clock, dataset, distributed, loop, run_folder
+from jaxsafe.run import checkpoint, clock, dataset, distributed, files, loop, run_folder
 from jaxsafe.run.devices import check_devices, device_name, use_compilation_cache
-from jaxsafe.run.evaluate import watcher
+from jaxsafe.run.evaluate import make_training_evaluation
 from jaxsafe.run.interrupts import Interrupts
+from jaxsafe.run.loggers import Callback, check_logger, wandb_callback
 from jaxsafe.run.memory import check_memory, check_state_memory
 from jaxsafe.run.policies import warm_start
-from jaxsafe.run.progress import Report
-from jaxsafe.run.settings import NOT_COMPARED, Settings, TrainConfig, differences, make_env, settle
-from jaxsafe.run.spread import Program, build
+from jaxsafe.run.programs import Program, build
+from jaxsafe.run.progress import Reporter
+from jaxsafe.run.settings import (
+    NOT_COMPARED,
+    Settings,
+    TrainConfig,
+    differences,
+    make_env,
+    settings_from_config,
+    unusual,
+)
 from jaxsafe.types import Env
 
 
@@ -32,10 +41,11 @@ class Session(NamedTuple):
     folder: Path
     env: Env
     program: Program
-    again: str  # the command that continues it
+    resume_command: str  # the command that continues it
+    callbacks: tuple[Callback, ...] = ()  # called with the metrics of each iteration
 
 
-Finish = Callable[[Session, Report, Interrupts], None]  # what follows training
+Finish = Callable[[Session, Reporter, Interrupts], None]  # what follows training
 
 
 def choose_folder(settings: Settings, job: int | None, say: Callable[[str], None]) -> Path:
@@ -47,17 +57,18 @@ def choose_folder(settings: Settings, job: int | None, say: Callable[[str], None
     train = settings.train
     if isinstance(train.resume, str):
         folder = Path(train.resume).expanduser()
-        compare(settings, folder)
+        check_same_run(settings, folder)
         return folder
     home = Path("runs") / settings.label
     if train.run_dir is None:
         if train.resume:
             for folder in sorted((p.parent for p in home.glob("*/config.yaml")), reverse=True):
-                done = run_folder.progress(folder)
-                if (done is None or not clock.ended(train, done)) and same(settings, folder):
+                done = run_folder.newest_progress(folder)
+                if (done is None or not clock.ended(train, done)) and is_same_run(settings, folder):
                     return folder
             say(f"no unfinished run of this command in {home}: starting one")
         name = f"{datetime.datetime.now():%Y%m%d-%H%M%S}-seed{train.seed}"
+        name += "" if job is None else f"-job{job}"  # jobs may start at the same time
         taken = (home / (f"{name}-{i}" if i else name) for i in range(10**6))
         return next(path for path in taken if not path.exists())
     folder = Path(train.run_dir).expanduser()
@@ -65,9 +76,9 @@ def choose_folder(settings: Settings, job: int | None, say: Callable[[str], None
         folder = folder / str(job)
     if folder.exists() and not folder.is_dir():
         raise ConfigError(f"run_dir={folder} is not a folder")
-    if (folder / "config.yaml").exists() and train.resume:
-        compare(settings, folder)
-    elif checkpoint.checkpoints(folder / "checkpoints"):
+    if files.there(folder / "config.yaml") and train.resume:
+        check_same_run(settings, folder)
+    elif checkpoint.checkpoints(files.inside(folder, "checkpoints")):
         raise ConfigError(
             f"{folder} already holds a run: continue it with resume=true, or choose another run_dir"
         )
@@ -86,15 +97,15 @@ def agree_on_folder(settings: Settings, job: int | None, say: Callable[[str], No
         return choose_folder(settings, job, say)
     mine = flat(settings.plain())
     folder = choose_folder(settings, job, say) if distributed.leads() else ""
-    folder, theirs = json.loads(distributed.first_text(json.dumps([str(folder), mine])))
+    folder, theirs = json.loads(distributed.text_from_process_0(json.dumps([str(folder), mine])))
     for name, (here, there) in differences(mine, theirs).items():
         raise ConfigError(f"{name}={here} in this process, {there} in process 0")
     return Path(folder)
 
 
-def compare(settings: Settings, folder: Path) -> None:
+def check_same_run(settings: Settings, folder: Path) -> None:
     """Raise ConfigError if the run in `folder` has other settings than these."""
-    saved = flat(settle(run_folder.read_config(folder), settings.entries).plain())
+    saved = flat(settings_from_config(run_folder.read_config(folder), settings.extras).plain())
     free = {*NOT_COMPARED}
     if len(settings.configs) * settings.train.num_seeds > 1:
         free.add("devices")  # each member is whole on one of them
@@ -111,9 +122,9 @@ def compare(settings: Settings, folder: Path) -> None:
             )
 
 
-def same(settings: Settings, folder: Path) -> bool:
+def is_same_run(settings: Settings, folder: Path) -> bool:
     try:
-        compare(settings, folder)
+        check_same_run(settings, folder)
     except ConfigError:
         return False
     return True
@@ -128,10 +139,11 @@ def prepare(settings: Settings) -> tuple[Env, Program]:
     train = settings.train
     use_compilation_cache()
     check_devices(train)
+    check_logger(train.logger)
     env = make_env(settings)
+    check_memory(env, settings)
     data = () if train.dataset is None else dataset.read_dataset(train.dataset)
     program = build(env, settings.row.make, settings.configs, train, data)
-    check_memory(env, program, train)
     check_state_memory(program, train)
     return env, program
 
@@ -150,15 +162,19 @@ def about_replay(program: Program, train: TrainConfig) -> str:
     return f"{line}, not kept in checkpoints: a resumed run first fills it anew with its policy"
 
 
-def run(session: Session, report: Report, finish: Finish) -> int:
-    """Train, then `finish`. Returns the exit status: 0, or 130 if the user stopped it."""
-    settings, folder, env, program, again = session
+def run(session: Session, report: Reporter, finish: Finish) -> int:
+    """Train, then `finish`. Returns the exit status: 0, or 130 if the user stopped it.
+
+    Raises:
+        divergence.Diverged: the run learns no more.
+    """
+    settings, folder, env, program, resume_command, callbacks = session
     train, cfg = settings.train, settings.algo
-    hooks = loop.Hooks()
+    hooks = loop.Hooks(about=lambda member: unusual(settings._replace(configs=(member.algo,))))
     if train.eval_every:
         algo = settings.row.make(env, None)
-        hooks = hooks._replace(evaluate=watcher(algo, train.eval_episodes, train.seed))
-    begun = distributed.first(np.array(run_folder.progress(folder) is not None))
+        hooks = hooks._replace(evaluate=make_training_evaluation(algo, train.eval_episodes, train.seed))
+    begun = distributed.from_process_0(np.array(run_folder.newest_progress(folder) is not None))
     if train.init_from is not None and not begun:
         hooks = hooks._replace(adapt=warm_start(settings, program, report.line))
     engine = getattr(innermost(env), "engine", None)  # Safety Gym's environments have one
@@ -170,6 +186,9 @@ def run(session: Session, report: Report, finish: Finish) -> int:
             run_folder.append_versions(folder, device_name(), engine, data)
     except OSError as error:
         raise checkpoint.CheckpointError(f"cannot write to {folder}: {error.strerror}") from error
+    if train.logger == "wandb" and distributed.leads():
+        callbacks += (wandb_callback(folder, settings.plain(), program.members),)
+    hooks = hooks._replace(callbacks=callbacks)
     several = f"{len(settings.configs)} settings x " if len(settings.configs) > 1 else ""
     seeds = f"{train.num_seeds} seed{'s' if train.num_seeds > 1 else ''}"
     seeds += f" x {cfg.num_envs} envs" if program.clocks.steps else ""
@@ -177,22 +196,27 @@ def run(session: Session, report: Report, finish: Finish) -> int:
     if jax.process_count() > 1:
         where += f" in {jax.process_count()} processes"
     where += f", engine {engine}" if engine else ""
-    kernels = ", and a minute of Warp's kernels the first time" * (engine == "warp")
+    kernels = {
+        "warp": ", and a minute of Warp's kernels the first time",
+        "c": ", about a minute at every start of engine c",
+    }.get(engine or "", "")
     report.line(
         f"jaxsafe {jaxsafe.__version__} | {settings.env_name} | {settings.algo_name} | "
         f"{several}{seeds} | {where} | compiling rollout and update{kernels} ..."
     )
     if line := about_replay(program, train):
         report.line(line)
-    outcome = loop.train(program, train, folder, report, again, hooks)
-    distributed.leave()
+    outcome = loop.train(program, train, folder, report, resume_command, hooks)
+    distributed.part()
     if outcome.interrupted:
         return 130
     if not distributed.leads():
         return 0
     with Interrupts(report.line, report.hosted) as stop:
         if not report.hosted:
-            stop.nothing_to_save = f"stopped; the training is saved, and for what is left {again}"
+            stop.nothing_to_save = (
+                f"stopped; the training is saved, and for what is left {resume_command}"
+            )
         finish(session, report, stop)
     report.line(f"run folder: {folder}")
     return 0

@@ -1,25 +1,41 @@
 """What a run is made of: plain values in, checked settings out.
 
-`settle` is the only way from plain values to `Settings`, whether they come from a config.yaml, from the
-command line or from Python. Only this module looks up the names of environments and algorithms. `ask`
-first fills in what its caller left out.
+`settings_from_config` is the only way from plain values to `Settings`, whether they come from a
+config.yaml, from the command line or from Python. `settings_from_options` first fills in what its
+caller left out. Only this module looks up the names of environments and algorithms.
 """
 
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import numpy as np
 
 from jaxsafe import algos, envs
 from jaxsafe.algos import Row
-from jaxsafe.config import ConfigError, flat, from_dict, is_float, nearest
-from jaxsafe.learn.constraints import check_names, own_limits
-from jaxsafe.run import distributed, run_folder
+from jaxsafe.config import (
+    Amount,
+    Bounds,
+    ConfigError,
+    Devices,
+    Period,
+    RunSteps,
+    Seed,
+    check_values,
+    convert,
+    flat,
+    from_dict,
+    is_float,
+    nearest,
+    shown,
+)
+from jaxsafe.envs.safety_gym import scene
+from jaxsafe.learn.constraints import check_cost_names, limits_by_name
+from jaxsafe.run import run_folder
 from jaxsafe.run.compat import COMPAT, overrides
 from jaxsafe.types import Env
 
@@ -34,71 +50,50 @@ ON_RESUME = (
     "eval_episodes",
     "video",
 )  # may change
-NOT_COMPARED = ("run_dir", "resume", *ON_RESUME)
+NOT_COMPARED = ("run_dir", "resume", "logger", *ON_RESUME)
 OFFLINE_UPDATES = 100_000  # total_updates with a data set, unless the user says otherwise
-NAMED = "cost_limits"  # an option of algorithms: floats by name, as {hazards: 10}
-# Bounds of the hyperparameters that have one wherever they occur.
-BOUNDS = {
-    "cost_limit": (0.0, math.inf),
-    "cost_limits": (0.0, math.inf),
-    "horizon": (1, math.inf),
-    "num_envs": (1, math.inf),
-    "minibatches": (1, math.inf),
-    "critic_epochs": (1, math.inf),
-    "discount": (0.0, 1.0),
-    "cost_discount": (0.0, 1.0),
-    "gae_lambda": (0.0, 1.0),
-    "cost_gae_lambda": (0.0, 1.0),
-    "saute_discount": (0.01, 1.0),
-    "budget_init": (0.0, 1.0),
-    "simmer_window": (1, math.inf),
-    "value_coef": (0.0, math.inf),
-    "tau": (0.0, 1.0),
-    "alpha_init": (1e-10, math.inf),
-    "alpha_lr": (0.0, math.inf),
-}
+READ_FROM = ("dataset", "init_from", "env.robot_base")  # options that name a file or folder to read
+MOST_MEMBERS = 2**16  # settings x seeds of one run
+MOST = 10_000  # settings of a sweep
+PATHS = ("run_dir", "resume", "dataset", "init_from")
+COST_LIMITS = "cost_limits"  # an option of algorithms: floats by name, as {hazards: 10}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TrainConfig:
     """The settings beside `env` and `algo`."""
 
-    total_steps: int = 10_000_000  # environment steps of one seed, rounded up to whole updates
+    total_steps: RunSteps = 10_000_000  # environment steps of one seed, rounded up to whole updates
     # gradient steps of one seed, which then end the run; null: total_steps, or 100,000 with a data set
-    total_updates: int | None = None
-    num_envs: int | None = None  # of one seed; null: algo.num_envs
-    num_seeds: int = 1  # trained at once: seed, seed + 1, ...
-    seed: int = 0
-    devices: int = 1  # the seeds are split over them or, for a lone one, its environments
+    total_updates: RunSteps | None = None
+    num_envs: Amount | None = None  # of one seed; null: algo.num_envs
+    num_seeds: Annotated[int, Bounds(1, 2**16)] = 1  # trained at once: seed, seed + 1, ...
+    seed: Seed = 0
+    devices: Devices = 1  # the seeds are split over them or, for a lone one, its environments
     coordinator: str | None = None  # host:port of process 0 where several train one run together
-    num_processes: int | None = None  # of them; under SLURM all three are known
-    process_index: int | None = None  # 0 .. num_processes - 1
+    num_processes: Devices | None = None  # of them; under SLURM all three are known
+    process_index: Period | None = None  # 0 .. num_processes - 1
     preset: str = "fast"  # the algorithm's defaults: fast, published, or one of its published settings
     compat: str = "none"  # whose departures from the papers to follow: none, or omnisafe
     run_dir: str | None = None  # null: runs/<env>-<algo>/<time>-seed<seed>
     resume: bool | str = False  # true: run_dir, or the newest unfinished run like this one; or a folder
     dataset: str | None = None  # an .npz to learn from, for offline algorithms
     init_from: str | None = None  # a run folder whose policy to start from
-    checkpoint_every: float = 60.0  # s between checkpoints
-    checkpoint_iterations: int = 0  # also after this many iterations; 0: by time alone
+    checkpoint_every: Annotated[float, Bounds(0, 1e9)] = 60.0  # s between checkpoints
+    checkpoint_iterations: Period = 0  # also after this many iterations; 0: by time alone
     checkpoint_replay: bool | None = None  # keep the replay, to resume bit for bit; null: up to 2 GB
-    eval_every: int = 0  # evaluate after so many environment steps, or updates without any; 0: never
-    eval_episodes: int = 20  # of an evaluation, for each seed; 0: none, at the end either
+    eval_every: Period = 0  # evaluate after so many environment steps, or updates without any; 0: never
+    # of an evaluation, for each seed; 0: none, at the end either
+    eval_episodes: Annotated[int, Bounds(0, 10**6)] = 20
     video: bool = True  # of the first seed's policy, at the end
+    logger: Literal["none", "wandb"] = "none"  # where metrics go beside the run folder
 
     def __post_init__(self) -> None:
-        for name in ("total_steps", "total_updates", "num_envs", "num_seeds", "devices"):
-            if (value := getattr(self, name)) is not None and value < 1:
-                raise ConfigError(f"{name}={value}: expected at least 1")
-        for name in (
-            "seed",
-            "checkpoint_every",
-            "checkpoint_iterations",
-            "eval_every",
-            "eval_episodes",
-        ):
-            if not (value := getattr(self, name)) >= 0:
-                raise ConfigError(f"{name}={value}: expected at least 0")
+        check_values(self)
+        for name in PATHS:
+            value = getattr(self, name)
+            if isinstance(value, str) and (not value or "\0" in value):
+                raise ConfigError(f"{name}={value!r}: expected a path")
         if self.eval_every and not self.eval_episodes:
             raise ConfigError(f"eval_every={self.eval_every}: expected eval_episodes of at least 1")
         if self.seed + self.num_seeds > 2**31:
@@ -110,20 +105,21 @@ class EnvEntry(NamedTuple):
 
     defaults: dict[str, Any]  # every option, as plain values
     make: Callable[..., Env]  # make(**options): those that differ from the defaults
+    check: Callable[..., object]  # check(**options) refuses what `make` would, and builds nothing
 
 
-class Entries(NamedTuple):
+class Extras(NamedTuple):
     """Environments and algorithms by name, beside the registered ones: a caller's own objects."""
 
     envs: Mapping[str, EnvEntry] = {}
     algos: Mapping[str, Row] = {}
 
 
-REGISTERED = Entries()  # nothing beside them
+NO_EXTRAS = Extras()  # nothing beside them
 
 
 class Settings(NamedTuple):
-    """Everything a run is made of, checked, with the entries that its names were resolved to."""
+    """Everything a run is made of, checked, with the extras that its names were resolved to."""
 
     env_name: str
     env: EnvEntry
@@ -144,9 +140,9 @@ class Settings(NamedTuple):
         return self.configs[0]
 
     @property
-    def entries(self) -> Entries:
-        """What another run folder with the same names is settled with."""
-        return Entries({self.env_name: self.env}, {self.algo_name: self.row})
+    def extras(self) -> Extras:
+        """What another run folder with the same names is resolved with."""
+        return Extras({self.env_name: self.env}, {self.algo_name: self.row})
 
     def plain(self) -> dict[str, Any]:
         """As config.yaml has it: a float in which the settings differ is a list of one a setting."""
@@ -156,7 +152,7 @@ class Settings(NamedTuple):
             {
                 "env": {"name": self.env_name, **self.env_options},
                 "algo": {"name": self.algo_name, **algo},
-                **{k: v for k, v in train.items() if k not in distributed.OPTIONS},
+                **{k: v for k, v in train.items() if k not in run_folder.COMMAND_ONLY},
             }
         )
 
@@ -164,76 +160,91 @@ class Settings(NamedTuple):
 # ---- from plain values to settings -----------------------------------------------------------
 
 
-def settle(config: dict[str, Any], entries: Entries = REGISTERED) -> Settings:
+def settings_from_config(config: dict[str, Any], extras: Extras = NO_EXTRAS) -> Settings:
     """Plain values as checked settings.
 
     Args:
         config: as config.yaml has it: {'env': {'name': ...}, 'algo': {'name': ...}, 'seed': 0, ...}.
             An option that is missing has the default of the code, whatever the preset.
-        entries: environments and algorithms beside the registered ones.
+        extras: environments and algorithms beside the registered ones.
     Raises:
         ConfigError: an unknown name, a wrong type, or a value out of bounds.
     """
     top, groups = parted(config)
     env, algo = groups["env"], groups["algo"]
-    env_name, entry = find_env(env.pop("name"), entries)
-    algo_name = algo.pop("name")
-    row = find_algo(algo_name, entries)
+    env_name, entry = find_env(env.pop("name", None), extras)
+    algo_name = algo.pop("name", None)
+    row = find_algo(algo_name, extras)
     train = from_dict(TrainConfig, top)
     if train.dataset is not None and train.total_updates is None:
         train = dataclasses.replace(train, total_updates=OFFLINE_UPDATES)
     if train.num_envs is not None:
         if "num_envs" not in {f.name for f in dataclasses.fields(row.config)}:
             raise ConfigError(f"num_envs={train.num_envs}: {algo_name} trains without environments")
+        default = algo_options(row, train.preset, train.compat)["num_envs"]
+        if algo.get("num_envs", default) != default:
+            check_agreement({"num_envs": train.num_envs, "algo.num_envs": algo["num_envs"]})
         algo["num_envs"] = train.num_envs
     for name in env:
         if name not in entry.defaults:
             raise ConfigError(f"unknown option env.{name}{nearest(name, entry.defaults)}")
     configs = tuple(from_dict(row.config, one, "algo.") for one in settings_in(algo, row.config))
-    for cfg in configs:
-        check_bounds(cfg)
+    if (members := len(configs) * train.num_seeds) > MOST_MEMBERS:
+        raise ConfigError(
+            f"num_seeds={train.num_seeds}: expected at most {MOST_MEMBERS:,} settings x seeds in a "
+            f"run, not {members:,}"
+        )
     options = to_plain({**entry.defaults, **env})
+    entry.check(**changed_options(options, entry))
     return Settings(env_name, entry, options, algo_name, row, configs, train)
 
 
-def ask(given: dict[str, Any], entries: Entries = REGISTERED) -> Settings:
+def settings_from_options(given: dict[str, Any], extras: Extras = NO_EXTRAS) -> Settings:
     """Settings from the options that somebody gives, which are checked by name.
 
     Args:
-        given: as of `settle`, with any option left out. NumPy's numbers, arrays, tuples and paths are
-            taken as the plain values that they stand for. What is left out has the defaults of the
-            preset and of compat or, where `resume` is a folder, the settings of the run in it.
-        entries: as of `settle`.
+        given: as of `settings_from_config`, with any option left out. NumPy's numbers, arrays, tuples
+            and paths are taken as the plain values that they stand for. What is left out has the
+            defaults of the preset and of compat or, where `resume` is a folder, the settings of the
+            run in it.
+        extras: as of `settings_from_config`.
     Raises:
-        ConfigError: as of `settle`, with the nearest valid name.
+        ConfigError: as of `settings_from_config`, with the nearest valid name.
     """
     top, groups = parted(to_plain(given))
-    base = defaults_of(top, {kind: group.get("name") for kind, group in groups.items()}, entries)
+    names = {kind: group.get("name") for kind, group in groups.items()}
+    base = defaults_of(top, names, extras, flat({**top, **groups}))
     for group in groups.values():
         group.pop("name", None)  # `base` has it, as it is registered
-    for name in flat({**top, **groups}):
+    for name in (given := flat({**top, **groups})):
         check_option(name, base)
-    return settle(merged(base, {**top, **groups}), entries)
+    check_agreement(given)
+    return settings_from_config(merged(base, {**top, **groups}), extras)
 
 
 def defaults_of(
-    top: dict[str, Any], names: Mapping[str, str | None], entries: Entries = REGISTERED
+    top: dict[str, Any],
+    names: Mapping[str, str | None],
+    extras: Extras = NO_EXTRAS,
+    given: Collection[str] = (),
 ) -> dict[str, Any]:
     """Every option with its default, as config.yaml has it.
 
     Args:
         top: the options beside env and algo that are given.
         names: of 'env' and 'algo'; None is the default one.
+        extras: as of `settings_from_config`.
+        given: the names of all options that the user gives, as `flat` has them.
     Raises:
         ConfigError: an unknown name, preset or compat, or no run in `resume`.
     """
     if isinstance(resume := top.get("resume"), str):
-        return resumed(Path(resume).expanduser(), names, entries)
+        return resumed(Path(resume).expanduser(), names, extras, given)
     base = {**dataclasses.asdict(TrainConfig()), **top}
     preset, compat = str(base["preset"]), check_compat(str(base["compat"]))
-    env_name, entry = find_env(names["env"] or DEFAULT["env"], entries)
+    env_name, entry = find_env(names["env"] or DEFAULT["env"], extras)
     algo_name = names["algo"] or DEFAULT["algo"]
-    row = find_algo(algo_name, entries)
+    row = find_algo(algo_name, extras)
     check_preset(algo_name, row, preset)
     return dataclasses.asdict(TrainConfig()) | {
         "env": {"name": env_name, **entry.defaults},
@@ -242,39 +253,71 @@ def defaults_of(
 
 
 def resumed(
-    folder: Path, names: Mapping[str, str | None], entries: Entries = REGISTERED
+    folder: Path,
+    names: Mapping[str, str | None],
+    extras: Extras = NO_EXTRAS,
+    given: Collection[str] = (),
 ) -> dict[str, Any]:
     """Every option of the run in `folder`, which must be of this environment and algorithm."""
-    saved = run_folder.read_config(folder)
-    top, groups = parted(saved)
-    env_name, entry = find_env(groups["env"]["name"], entries)
-    row = find_algo(groups["algo"]["name"], entries)
-    given = names["env"] and find_env(names["env"], entries)[0]
+    saved = settings_from_config(run_folder.read_config(folder), extras)
+    asked = names["env"] and find_env(names["env"], extras)[0]
     for kind, name, there in (
-        ("env", given, env_name),
-        ("algo", names["algo"], groups["algo"]["name"]),
+        ("env", asked, saved.env_name),
+        ("algo", names["algo"], saved.algo_name),
     ):
         if name not in (None, there):
             raise ConfigError(f"{kind}={name}: {folder} was trained with {there}")
-    return {
-        **dataclasses.asdict(TrainConfig()),
-        **top,
-        "env": {**entry.defaults, **groups["env"], "name": env_name},
-        "algo": {**algo_options(row), **groups["algo"]},
-    }
+    begun = run_folder.newest_progress(folder) is not None  # then it starts from no other run
+    check_read_from(saved, folder, {*given, "init_from"} if begun else given)
+    return dataclasses.asdict(TrainConfig()) | saved.plain()
 
 
-def find_env(name: str, entries: Entries = REGISTERED) -> tuple[str, EnvEntry]:
+def check_read_from(saved: Settings, folder: Path, given: Collection[str]) -> None:
+    """Raise ConfigError where the config of a run folder names a file or folder to read. It is read
+    only if the user gives the option, too.
+
+    Args:
+        saved: the run's settings.
+        folder: where they were read.
+        given: the names of the options that the user gives.
+    """
+    for name, path in files_named(saved).items():
+        if name not in given:
+            raise ConfigError(
+                f"{folder} names {name}={path}, which is not read because a file names it; if you "
+                f"trust it, add {name}={path}"
+            )
+
+
+def files_named(settings: Settings) -> dict[str, Any]:
+    """The options that name a file or folder to read, beside our own robots."""
+    plain = flat(settings.plain())
+    robot = plain.get("env.robot_base")
+    if robot == settings.env.defaults.get("robot_base") or scene.built_in(str(robot)):
+        plain["env.robot_base"] = None
+    return {name: plain[name] for name in READ_FROM if plain.get(name) is not None}
+
+
+def yours(settings: Settings) -> dict[str, Any]:
+    """The options that name the user's code and files. A command that continues the run gives them
+    again. Only a fresh run reads `init_from`."""
+    names = {"env": settings.env_name, "algo": settings.algo_name}
+    named = {k: v for k, v in files_named(settings).items() if k != "init_from"}
+    return {kind: name for kind, name in names.items() if ":" in name} | named
+
+
+def find_env(name: str, extras: Extras = NO_EXTRAS) -> tuple[str, EnvEntry]:
     """The name under which an environment is registered, and its entry."""
-    if name in entries.envs:
-        return name, entries.envs[name]
+    if convert(name, str, "env") in extras.envs:
+        return name, extras.envs[name]
     name = envs.canonical(name)
-    return name, EnvEntry(to_plain(envs.env_defaults(name)), functools.partial(envs.make, name))
+    make, check = functools.partial(envs.make, name), functools.partial(envs.check_options, name)
+    return name, EnvEntry(to_plain(envs.env_defaults(name)), make, check)
 
 
-def find_algo(name: str, entries: Entries = REGISTERED) -> Row:
-    known = {**algos.ALGOS, **entries.algos}
-    if name in known:
+def find_algo(name: str, extras: Extras = NO_EXTRAS) -> Row:
+    known = {**algos.ALGOS, **extras.algos}
+    if convert(name, str, "algo") in known:
         return known[name]
     if ":" in name:
         raise ConfigError(
@@ -304,10 +347,13 @@ def presets(row: Row) -> dict[str, Mapping[str, Any]]:
     return {name: dict(options) for name, options in ({"fast": {}} | named | {**row.published}).items()}
 
 
+def changed_options(options: dict[str, Any], entry: EnvEntry) -> dict[str, Any]:
+    return {k: v for k, v in options.items() if v != entry.defaults[k]}
+
+
 def make_env(settings: Settings) -> Env:
-    options, defaults = settings.env_options, settings.env.defaults
-    env = settings.env.make(**{k: v for k, v in options.items() if v != defaults[k]})
-    check_names(own_limits(settings.algo), env)
+    env = settings.env.make(**changed_options(settings.env_options, settings.env))
+    check_cost_names(limits_by_name(settings.algo), env)
     return env
 
 
@@ -328,11 +374,11 @@ def check_option(name: str, known: dict[str, Any]) -> None:
         raise ConfigError(f"unknown option {name}{nearest(head, groups)}")
     options = {**groups[head], **flat(groups[head])}
     whose = options.pop("name")
-    named = head == "algo" and option.startswith(f"{NAMED}.") and option.count(".") == 1
-    if (NAMED if named else option) in options:
+    named = head == "algo" and option.startswith(f"{COST_LIMITS}.") and option.count(".") == 1
+    if (COST_LIMITS if named else option) in options:
         return
-    takers = [n for n, row in algos.ALGOS.items() if NAMED in algo_options(row)]
-    if head == "algo" and (named or option == NAMED) and takers:
+    takers = [n for n, row in algos.ALGOS.items() if COST_LIMITS in algo_options(row)]
+    if head == "algo" and (named or option == COST_LIMITS) and takers:
         raise ConfigError(
             f"{name}: {whose} takes one limit, algo.cost_limit; several are for {', '.join(takers)}"
         )
@@ -340,15 +386,13 @@ def check_option(name: str, known: dict[str, Any]) -> None:
     raise ConfigError(f"unknown option {name} of {whose}{hint}")
 
 
-def check_bounds(cfg: Any) -> None:
-    for name, value in flat(dataclasses.asdict(cfg)).items():
-        field = name.partition(".")[0]
-        low, high = BOUNDS.get(field, (-math.inf, math.inf))
-        if isinstance(value, int | float) and not low <= value <= high:  # NaN is in no interval
-            expected = f"at least {low:g}" if high == math.inf else f"between {low:g} and {high:g}"
-            raise ConfigError(
-                f"algo.{name}={value}: expected {expected if field in BOUNDS else 'a number'}"
-            )
+def check_agreement(given: Mapping[str, Any]) -> None:
+    """Refuse two values for the number that `num_envs` and `algo.num_envs` both set."""
+    values = [given[name] for name in ("num_envs", "algo.num_envs") if given.get(name) is not None]
+    if len(values) > 1 and values[0] != values[1]:
+        raise ConfigError(
+            f"num_envs={shown(values[0])} and algo.num_envs={shown(values[1])}: they are one number"
+        )
 
 
 def check_compat(name: str) -> str:
@@ -379,11 +423,26 @@ def settings_in(algo: dict[str, Any], kind: type) -> list[dict[str, Any]]:
             + ", ".join(f"{n} of algo.{name}" for name, n in lengths.items())
         )
     rows = list(zip(*lists.values(), strict=True)) or [()]
-    for row in rows:
-        if rows.count(row) > 1:
-            same = ", ".join(f"algo.{name}={v}" for name, v in zip(lists, row, strict=True))
-            raise ConfigError(f"{same} occurs twice")
+    if (row := repeated(rows)) is not None:
+        same = ", ".join(f"algo.{name}={v}" for name, v in zip(lists, row, strict=True))
+        raise ConfigError(f"{same} occurs twice")
     return [replaced(algo, dict(zip(lists, row, strict=True))) for row in rows]
+
+
+def repeated(values: Iterable[Any]) -> Any:
+    """The first value that was there before; None if all differ. 5 and 5.0 are the same."""
+
+    def key(value: Any) -> Any:
+        if isinstance(value, list | tuple):
+            return tuple(map(key, value))
+        return value if isinstance(value, int | float) else repr(value)
+
+    known = set()
+    for value in values:
+        if (found := key(value)) in known:
+            return value
+        known.add(found)
+    return None
 
 
 def replaced(options: dict[str, Any], new: dict[str, Any], where: str = "") -> dict[str, Any]:
@@ -450,6 +509,9 @@ def merged(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any]:
 
 def parted(config: dict[str, Any]) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
     """The options beside 'env' and 'algo', and a copy of those two groups; a missing one is empty."""
+    for kind in DEFAULT:
+        if not isinstance(config.get(kind) or {}, Mapping):
+            raise ConfigError(f"{kind}={shown(config[kind])}: expected options by name")
     groups = {kind: dict(config.get(kind) or {}) for kind in DEFAULT}
     return {k: v for k, v in config.items() if k not in DEFAULT}, groups
 
@@ -458,6 +520,27 @@ def differences(a: dict[str, Any], b: dict[str, Any]) -> dict[str, tuple[Any, An
     """The names that have not the same value in both, with both values."""
     pairs = {name: (a.get(name), b.get(name)) for name in {**a, **b}}
     return {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
+
+
+def unusual(settings: Settings, most: int = 4) -> str:
+    """The settings of environment and algorithm that are not the defaults, the most unusual first."""
+    names = {"env": {"name": settings.env_name}, "algo": {"name": settings.algo_name}}
+    chosen = {"preset": settings.train.preset, "compat": settings.train.compat}
+    usual = flat(settings_from_options({**names, **chosen}, settings.extras).plain())
+    other = differences(flat(settings.plain()), usual)
+    other = {k: pair for k, pair in other.items() if k.startswith(("env.", "algo."))}
+
+    def oddness(name: str) -> float:
+        """How many times a number is larger or smaller than usual, as a logarithm."""
+        here, there = other[name]
+        if not all(isinstance(x, int | float) and x for x in other[name]):
+            return 0.0
+        return abs(math.log(abs(here / there))) if math.isfinite(here) else math.inf
+
+    ranked = sorted(other, key=oddness, reverse=True)
+    told = [f"{k}={as_text(other[k][0])} (default {as_text(other[k][1])})" for k in ranked[:most]]
+    more = [f"and {len(ranked) - most} more"] if len(ranked) > most else []
+    return f"unusual: {', '.join([*told, *more])}" if told else "all its settings are the defaults"
 
 
 def as_text(value: Any) -> str:

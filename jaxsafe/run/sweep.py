@@ -13,6 +13,7 @@ too many, of seeds.
 import hashlib
 import itertools
 import json
+import math
 import re
 import shutil
 from collections.abc import Callable
@@ -22,27 +23,30 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from jaxsafe.config import ConfigError, flat, is_float, one_line
-from jaxsafe.run import checkpoint, clock, distributed, memory, run_folder, session
+from jaxsafe.config import Amount, ConfigError, convert, flat, is_float
+from jaxsafe.run import checkpoint, clock, distributed, files, memory, run_folder, session
+from jaxsafe.run.divergence import Diverged
 from jaxsafe.run.interrupts import Interrupts
 from jaxsafe.run.policies import warm_start
-from jaxsafe.run.progress import Report
+from jaxsafe.run.programs import Program
+from jaxsafe.run.progress import Reporter
 from jaxsafe.run.session import Finish, Session
 from jaxsafe.run.settings import (
     DEFAULT,
+    MOST,
+    NO_EXTRAS,
     NOT_COMPARED,
-    REGISTERED,
-    Entries,
+    Extras,
     Settings,
     as_text,
-    ask,
     differences,
     find_algo,
     make_env,
     merged,
     nested,
+    repeated,
+    settings_from_options,
 )
-from jaxsafe.run.spread import Program
 
 
 class Sweep(NamedTuple):
@@ -64,13 +68,13 @@ class After(NamedTuple):
 # ---- from options to groups ------------------------------------------------------------------
 
 
-def plan(given: dict[str, Any], several: dict[str, list[Any]], entries: Entries = REGISTERED) -> Sweep:
+def plan(given: dict[str, Any], several: dict[str, list[Any]], extras: Extras = NO_EXTRAS) -> Sweep:
     """The groups of a sweep, every one of them checked.
 
     Args:
-        given: the options with one value, as `settings.ask` takes them, and `max_parallel`.
+        given: the options with one value, as `settings_from_options` takes them, and `max_parallel`.
         several: those with several values, by name: 'env', 'seed', 'algo.clip'.
-        entries: environments and algorithms beside the registered ones.
+        extras: environments and algorithms beside the registered ones.
     Raises:
         ConfigError: an option that no run could use, or nothing to sweep.
     """
@@ -84,20 +88,20 @@ def plan(given: dict[str, Any], several: dict[str, list[Any]], entries: Entries 
     for name in ("max_parallel", "run_dir"):
         if name in several:
             raise ConfigError(f"{name}: expected one value")
-    if most is not None and (isinstance(most, bool) or not isinstance(most, int) or most < 1):
-        raise ConfigError(f"max_parallel={most}: expected a whole number of at least 1")
+    most = convert(most, Amount | None, "max_parallel")
     if not several:
-        ask(given, entries)  # what is wrong with an option comes first
+        settings_from_options(given, extras)  # what is wrong with an option comes first
         raise ConfigError(
             "nothing to sweep: give an option several values, as in algo.cost_limit=5,10,25, "
-            "or train one setting with scripts/train.py"
+            "or train one setting with the command train"
         )
     for name, values in several.items():
-        for value in values:
-            if values.count(value) > 1:
-                raise ConfigError(f"{name}={as_text(value)} occurs twice")
+        if (value := repeated(values)) is not None:
+            raise ConfigError(f"{name}={as_text(value)} occurs twice")
+    if (count := math.prod(map(len, several.values()))) > MOST:
+        raise ConfigError(f"{count:,} settings: expected at most {MOST:,} in a sweep")
     first = several.get("algo") or [given.get("algo", {}).get("name", DEFAULT["algo"])]
-    kind = find_algo(first[0], entries).config
+    kind = find_algo(first[0], extras).config
     floats = {k: v for k, v in several.items() if k.startswith("algo.") and is_float(kind, k[5:])}
     grid = list(zip(*itertools.product(*floats.values()), strict=True))
     side_by_side = {name: list(values) for name, values in zip(floats, grid, strict=True)}
@@ -105,7 +109,7 @@ def plan(given: dict[str, Any], several: dict[str, list[Any]], entries: Entries 
     groups = {}
     for i, values in enumerate(itertools.product(*apart.values())):
         chosen = dict(zip(apart, values, strict=True))
-        settings = ask(merged(given, nested(side_by_side | chosen)), entries)
+        settings = settings_from_options(merged(given, nested(side_by_side | chosen)), extras)
         settings.row.make(make_env(settings)).clocks(settings.algo)  # refuses sizes that do not fit
         rest = [f"{k}={as_text(v)}" for k, v in chosen.items() if k not in DEFAULT]
         name = "-".join([f"{i:03d}", settings.label, *rest])
@@ -115,14 +119,14 @@ def plan(given: dict[str, Any], several: dict[str, list[Any]], entries: Entries 
     return Sweep(swept, groups, where, most)
 
 
-def identity(settings: Settings) -> dict[str, Any]:
+def compared_settings(settings: Settings) -> dict[str, Any]:
     """What a sweep's folder must agree on."""
     return {k: v for k, v in flat(settings.plain()).items() if k not in NOT_COMPARED}
 
 
 def default_folder(groups: dict[str, Settings]) -> Path:
     first = next(iter(groups.values()))
-    text = json.dumps([identity(s) for s in groups.values()], sort_keys=True)
+    text = json.dumps([compared_settings(s) for s in groups.values()], sort_keys=True)
     digest = hashlib.sha256(text.encode()).hexdigest()[:8]
     return Path("runs") / f"sweep-{first.label}-{digest}"
 
@@ -136,8 +140,8 @@ def open_folder(sweep: Sweep) -> dict[str, int]:
     Raises:
         ConfigError: the folder holds something else.
     """
-    asked = {name: identity(settings) for name, settings in sweep.groups.items()}
-    if not (sweep.folder / "sweep.yaml").exists():
+    asked = {name: compared_settings(settings) for name, settings in sweep.groups.items()}
+    if not files.there(sweep.folder / "sweep.yaml"):
         if sweep.folder.exists() and (not sweep.folder.is_dir() or any(sweep.folder.iterdir())):
             raise ConfigError(f"run_dir={sweep.folder} holds something else than a sweep")
         return {}
@@ -153,23 +157,25 @@ def open_folder(sweep: Sweep) -> dict[str, int]:
 
 def read_folder(folder: Path) -> dict[str, Any]:
     path = folder / "sweep.yaml"
-    if not path.is_file():
+    if not files.there(path):
         raise ConfigError(f"{folder} is not a sweep's folder: it has no sweep.yaml")
-    try:
-        saved = yaml.safe_load(path.read_text())
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path} cannot be read: {one_line(error)}") from error
-    if not isinstance(saved, dict) or not {"swept", "groups", "parallel"} <= saved.keys():
+    saved = files.read_yaml(path)
+    kinds = {"swept": list, "groups": dict, "parallel": dict}
+    if not isinstance(saved, dict) or not all(
+        isinstance(saved.get(k), kind) for k, kind in kinds.items()
+    ):
         raise ConfigError(f"{path} does not describe a sweep")
+    if not all(isinstance(name, str) for name in saved["swept"]):
+        raise ConfigError(f"{path}: expected the names of options as swept")
     return saved
 
 
 def write_folder(sweep: Sweep, parallel: dict[str, int]) -> None:
-    asked = {name: identity(settings) for name, settings in sweep.groups.items()}
+    asked = {name: compared_settings(settings) for name, settings in sweep.groups.items()}
     saved = {"swept": sweep.swept, "parallel": parallel, "groups": asked}
     try:
         sweep.folder.mkdir(parents=True, exist_ok=True)
-        run_folder.replace_text(sweep.folder / "sweep.yaml", yaml.safe_dump(saved, sort_keys=False))
+        files.write(sweep.folder / "sweep.yaml", yaml.safe_dump(saved, sort_keys=False))
     except OSError as error:
         raise checkpoint.CheckpointError(f"cannot write to {sweep.folder}: {error.strerror}") from error
 
@@ -218,18 +224,20 @@ def fitting(settings: Settings, most: int | None) -> tuple[int, Program]:
         return (held if held < len(program.members) else parallel), program
 
 
-def train(sweep: Sweep, again: str, report: Report, after: After) -> int:
+def train(sweep: Sweep, resume_command: str, report: Reporter, after: After) -> int:
     """Train every group that is not finished.
 
     Args:
         sweep: from `plan`.
-        again: the command that continues it.
+        resume_command: the command that continues it.
         report: where progress goes.
         after: what follows the training of each run folder.
     Returns:
         The exit status: 0, or 130 if the user stopped it.
+    Raises:
+        Diverged: a run did, after the others were trained.
     """
-    known = open_folder(sweep)
+    known, diverged = open_folder(sweep), []
     sizes = [len(s.configs) for s in sweep.groups.values()]
     report.line(
         f"sweep: {sum(sizes)} settings in {len(sizes)} group{'s' * (len(sizes) > 1)}, in {sweep.folder}"
@@ -237,12 +245,14 @@ def train(sweep: Sweep, again: str, report: Report, after: After) -> int:
     for name, settings in sweep.groups.items():
         members = len(settings.configs) * settings.train.num_seeds
         programs: dict[int, Program] = {}  # by the number of their members
-        begun = list(sweep.folder.glob(f"{name}*"))
-        if not any(checkpoint.checkpoints(f / "checkpoints") for f in begun):
+        begun = [files.inside(sweep.folder, f.name) for f in sweep.folder.glob(f"{name}*")]
+        if not any(checkpoint.checkpoints(files.inside(f, "checkpoints")) for f in begun):
             for leftover in begun:  # stopped before a first checkpoint, perhaps in other parts
                 shutil.rmtree(leftover)
             with Interrupts(report.line, report.hosted) as stop:
-                stop.nothing_to_save = f"stopped before the first update; {again}"
+                stop.nothing_to_save = f"stopped before the first update; {resume_command}"
+                if not sweep.max_parallel:
+                    report.line(f"{name}: compiling, to see how many members fit the memory ...")
                 known[name], program = fitting(settings, sweep.max_parallel)
             programs[len(program.members)] = program
             write_folder(sweep, known)
@@ -252,7 +262,8 @@ def train(sweep: Sweep, again: str, report: Report, after: After) -> int:
         if len(pieces) > 1:
             report.line(f"{name}: {members} members in {len(pieces)} parts, one after the other")
         for i, piece in enumerate(pieces):
-            folder = sweep.folder / (name if len(pieces) == 1 else f"{name}.part{i:03d}")
+            part = name if len(pieces) == 1 else f"{name}.part{i:03d}"
+            folder = files.inside(sweep.folder, part)
             if finished(piece, folder):
                 report.line(f"finished already: {folder}")
                 continue
@@ -261,14 +272,23 @@ def train(sweep: Sweep, again: str, report: Report, after: After) -> int:
             # what differs between parts of one size is data, so they share what is compiled
             same = programs.setdefault(len(program.members), program)
             program = program._replace(init=same.init, update=same.update)
-            status = session.run(Session(piece, folder, env, program, again), report, after.finish)
+            try:
+                status = session.run(
+                    Session(piece, folder, env, program, resume_command), report, after.finish
+                )
+            except Diverged as error:
+                diverged.append(f"{folder.name}: {error}")
+                report.line(f"warning: {diverged[-1]}; the sweep goes on")
+                status = 0
             after.summarise(sweep.folder)
             if status:
                 return status
+    if diverged:
+        raise Diverged(f"{len(diverged)} run folders diverged, the first is {diverged[0]}")
     return 0
 
 
 def finished(settings: Settings, folder: Path) -> bool:
-    done, train = run_folder.progress(folder), settings.train
-    evaluated = (folder / "evaluation.json").exists() or not train.eval_episodes
+    done, train = run_folder.newest_progress(folder), settings.train
+    evaluated = files.there(folder / "evaluation.json") or not train.eval_episodes
     return done is not None and clock.ended(train, done) and evaluated

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import rich.console
-from tasks import FAST
-from toys import FIRST, Corridor
+from compiling import FAST
+from toys import START, Corridor
 
 import jaxsafe
 from jaxsafe import algos, api
@@ -25,9 +25,9 @@ from jaxsafe.learn.steps import adam_epochs
 from jaxsafe.learn.surrogates import clipped
 from jaxsafe.learn.treatments import penalty
 from jaxsafe.report.evaluation import evaluate
-from jaxsafe.run import checkpoint, progress, run_folder, spread, sweep
+from jaxsafe.run import checkpoint, programs, progress, run_folder, sweep
 from jaxsafe.run.arguments import compose
-from jaxsafe.run.settings import Settings, ask, nested, to_plain
+from jaxsafe.run.settings import Settings, nested, settings_from_options, to_plain
 
 TINY: dict[str, Any] = {
     "num_envs": 4, "horizon": 8, "minibatches": 2, "epochs": 1, "critic_epochs": 1, "hidden": (4, 4),
@@ -47,13 +47,13 @@ PRICED = algos.Row(
 
 @pytest.fixture(scope="module", autouse=True)
 def compiled_quickly():
-    def quick(program: spread.Program, ts: Any) -> Any:
+    def quick(program: programs.Program, ts: Any) -> Any:
         return (
-            jax.jit(program.update, donate_argnums=0, compiler_options=FAST).lower(ts, FIRST).compile()
+            jax.jit(program.update, donate_argnums=0, compiler_options=FAST).lower(ts, START).compile()
         )
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(spread, "compiled", quick)
+        patch.setattr(programs, "compiled", quick)
         yield
 
 
@@ -145,7 +145,7 @@ SAME: dict[str, tuple[tuple[Any, Any, dict[str, Any]], list[str]]] = {
 
 def asked(env: Any, algo: Any, **options: Any) -> Settings:
     choice = api.chosen(env, algo)
-    return ask(nested(choice.given | api.named(choice, options)), choice.entries)
+    return settings_from_options(nested(choice.given | api.full_names(choice, options)), choice.extras)
 
 
 @pytest.mark.parametrize("case", SAME)
@@ -183,13 +183,13 @@ def test_a_value_of_python_is_the_plain_value_that_it_stands_for(value, expected
         ((None, None, {"total_step": 5}), "did you mean 'total_steps'?"),
         ((None, "cpo", {"epochs": 5}), "unknown option algo.epochs of cpo"),
         ((None, None, {"env.hazard_num": 5}), "did you mean 'hazards_num'?"),
-        ((None, None, {"total_steps": -1}), "expected at least 1"),
+        ((None, None, {"total_steps": -1}), "expected a whole number between 1 and"),
         ((None, None, {"cost_limit": "wide"}), "expected a number"),
-        ((None, None, {"cost_limit": float("nan")}), "expected at least 0"),
+        ((None, None, {"cost_limit": float("nan")}), "expected a number between 0 and"),
         ((None, None, {"clip": object()}), "expected a number, a string"),
-        ((None, None, {"num_envs": 1e9}), "GiB"),
+        ((None, None, {"num_envs": 1e7}), "GiB"),
         ((None, None, {"resume": "nowhere"}), "not a run folder"),
-        ((None, None, {"num_processes": 2}), "several processes are for scripts/train.py"),
+        ((None, None, {"num_processes": 2}), "several processes are for the command line"),
         ((Corridor(), None, {"env.dt": 0.1}), "env.dt=0.1: this Corridor has another value"),
         ((object(),), "object (object) is no Env"),
         (("nowhere:Corridor",), "no module 'nowhere'"),
@@ -270,11 +270,11 @@ def signals(monkeypatch):
 
     sent = []
 
-    def update(self: progress.Report, *_: Any, **__: Any) -> None:
+    def update(self: progress.Reporter, *_: Any, **__: Any) -> None:
         if not sent:
             sent.append(signal.raise_signal(signal.SIGINT))
 
-    monkeypatch.setattr(progress.Report, "update", update)
+    monkeypatch.setattr(progress.Reporter, "update", update)
 
 
 def test_an_interrupted_run_is_saved_and_continues(signals, run, capsys):
@@ -296,10 +296,10 @@ def test_an_interrupted_run_is_saved_and_continues(signals, run, capsys):
 
 
 def test_an_interrupt_with_nothing_to_save_leaves_the_program_running(monkeypatch):
-    def compiling(program: spread.Program, ts: Any) -> Any:
+    def compiling(program: programs.Program, ts: Any) -> Any:
         signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(spread, "compiled", compiling)
+    monkeypatch.setattr(programs, "compiled", compiling)
     with pytest.raises(KeyboardInterrupt, match="stopped before the first update; nothing to save"):
         jaxsafe.train(Corridor(), run_dir="run", **TINY)
 
@@ -309,7 +309,7 @@ def test_an_interrupt_with_nothing_to_save_leaves_the_program_running(monkeypatc
 
 def planned(env: Any, algo: Any = None, **options: Any) -> sweep.Sweep:
     choice = api.chosen(env, algo)
-    return sweep.plan(*api.asked_for(choice, options), choice.entries)
+    return sweep.plan(*api.asked_for(choice, options), choice.extras)
 
 
 def test_a_sweep_takes_lists_for_values_and_tuples_for_lists():
@@ -355,7 +355,7 @@ def test_a_sweep_has_a_row_a_setting_and_opens_its_runs():
 def test_a_notebook_has_one_line_that_changes(monkeypatch, capsys):
     monkeypatch.setattr(rich.console, "_is_jupyter", lambda: True)
     monkeypatch.setattr(progress, "NOTEBOOK_EVERY", 0.0)
-    with progress.Report() as report:
+    with progress.Reporter() as report:
         report.line("first")
         report.start(100, 0, [25.0])
         for steps in (50, 100):

@@ -12,8 +12,10 @@ from shell import typed
 
 from jaxsafe import algos, envs
 from jaxsafe.config import ConfigError
-from jaxsafe.report import group, plots, read, results, scores, stats, tables
+from jaxsafe.report import comparison_tables, group, plots, read, scores, stats, tables
+from jaxsafe.report.evaluation import as_json
 from jaxsafe.report.published import beside, read_published
+from jaxsafe.report.stats import Estimate
 from jaxsafe.run import run_folder
 from jaxsafe.run.checkpoint import Progress
 
@@ -51,7 +53,7 @@ def write(
     return folder
 
 
-def runs_in(*paths: Path) -> list[read.Run]:
+def runs_in(*paths: Path) -> list[read.SettingRun]:
     return read.read(paths)
 
 
@@ -95,7 +97,10 @@ def test_costs_under_limits_of_their_own_violate_when_one_of_them_does():
 
 def test_evaluations_of_each_seed_join_in_where_the_run_has_them(tmp_path):
     a, b = write(tmp_path / "a"), write(tmp_path / "b", seeds=(2, 3))
-    (a / "evaluation.json").write_text(json.dumps({"seeds": {"return": [5.0, 7.0]}}))
+    rows = as_json({"return": Estimate(6.0, 5.0, float("nan"))})
+    assert rows == {"return": {"mean": 6.0, "low": 5.0, "high": None}}
+    (a / "evaluation.json").write_text(json.dumps(rows | {"seeds": {"return": [5.0, 7.0]}}))
+    # as earlier versions wrote it
     (b / "evaluation.json").write_text(json.dumps({"return": [5.0, 4.0, 6.0]}))
     (both,) = compared(a, b)
     np.testing.assert_array_equal(both.values("final return"), [5, 7, np.nan, np.nan])
@@ -134,11 +139,13 @@ def test_seeds_of_one_setting_are_pooled_and_other_settings_stand_apart(tmp_path
 
 def test_settings_of_an_algorithm_are_told_apart_by_what_differs(tmp_path):
     for limit in (100, 5, 20):
-        write(tmp_path / f"{limit}", cost_limit=float(limit))
+        write(tmp_path / f"{limit}", cost_limit=float(limit), costs=(29.0, 31.0))
     groups = compared(tmp_path)
     assert [g.name for g in groups] == [f"ppo_lag, algo.cost_limit={x}" for x in (5, 20, 100)]
     assert [g.held for g in groups] == ["no", "unclear", "yes"]
-    assert "**" not in str(results.results(groups, "return", {}).rows)  # of other limits, none is best
+    assert "**" not in str(
+        comparison_tables.results(groups, "return", {}).rows
+    )  # of other limits, none is best
 
 
 def test_settings_side_by_side_in_one_run_are_groups_of_their_own(tmp_path):
@@ -154,7 +161,7 @@ def test_averaging_over_a_field_is_asked_for_and_said(tmp_path):
     write(tmp_path / "b", dual_lr=0.2)
     (both,) = compared(tmp_path, by=("algo.name",))
     assert len(both.returns) == 4
-    assert results.notes([both]) == ["averaged over algo.dual_lr (0.1, 0.2)"]
+    assert comparison_tables.notes([both]) == ["averaged over algo.dual_lr (0.1, 0.2)"]
 
 
 def test_tasks_stand_apart_and_only_those_of_every_setting_are_compared(tmp_path):
@@ -166,16 +173,16 @@ def test_tasks_stand_apart_and_only_those_of_every_setting_are_compared(tmp_path
     assert len(groups) == 4
     s = group.suite(groups)
     assert s.tasks == ["point_goal1"]
-    pairs = results.improvements(s)
+    pairs = comparison_tables.improvements(s)
     assert pairs["cpo", "ppo_lag", "return"].mean == 3 / 4  # 10 beats 0, 20 beats both
     assert pairs["cpo", "ppo_lag", "cost"].mean == 1
-    assert results.notes(groups) == [
+    assert comparison_tables.notes(groups) == [
         f"unfinished: {tmp_path / '4'}, at 200 of 400 steps",
         "not in comparisons across tasks, as a setting lacks them: car_goal1, point_run",
         "without normalised scores, as there are no published ones: point_run",
     ]
     cpo = group.suite([g for g in groups if g.algo == "cpo" and g.env != "point_run"])
-    found = results.aggregates(cpo)["cpo", "normalised return", "mean"]
+    found = comparison_tables.aggregates(cpo)["cpo", "normalised return", "mean"]
     assert found.mean == pytest.approx((6 / 25.49 + 15 / 25.179) / 2)
 
 
@@ -190,15 +197,15 @@ def test_published_figures_stand_below_and_what_lies_beyond_their_spread_is_mark
     path.write_text(
         f"{HEADER}point_goal1,cpo,Peer,12,2.9,30,20,25\npoint_goal1,ppo_lag,Peer,1,2,3,4,10\n"
     )
-    table = results.results(compared(tmp_path), "return", read_published(path))
+    table = comparison_tables.results(compared(tmp_path), "return", read_published(path))
     assert table.header == ["", "car_push1", "point_goal1"]
     assert table.rows == [
-        ["`cpo`", "**1.50 [1.00, 2.00]**", "**15.00 [10.00, 20.00]** ↑"],
+        ["`cpo`", "**1.50 [-4.85, 7.85]**", "**15.00 [-48.53, 78.53]** ↑"],
         ["Peer", "-", "12.00 ± 2.90"],
         ["`ppo_lag`", "-", "30.00"],  # published with another limit; the cost is over ours
     ]
-    cost = results.results(compared(tmp_path), "cost", read_published(path))
-    assert cost.rows[0][2] == "15.00 [10.00, 20.00]" and cost.rows[1][2] == "30.00 ± 20.00"
+    cost = comparison_tables.results(compared(tmp_path), "cost", read_published(path))
+    assert cost.rows[0][2] == "15.00 [-48.53, 78.53]" and cost.rows[1][2] == "30.00 ± 20.00"
 
 
 def test_published_figures_stand_beside_runs_of_the_same_rules_alone(tmp_path):
@@ -257,7 +264,10 @@ def test_one_command_writes_every_table_and_figure_the_same_each_time(tmp_path, 
     rows = list(csv.DictReader(io.StringIO((out / "results.csv").read_text())))
     (one,) = [r for r in rows if r["task"] == "car_goal1" and r["algo.name"] == "cpo"
               and (r["metric"], r["statistic"]) == ("return", "mean")]  # fmt: skip
-    assert [float(one[k]) for k in ("seeds", "value", "low", "high")] == [2, 2, 1, 3]
+    width = 12.7062047  # t of one degree of freedom, and a standard error of 1
+    np.testing.assert_allclose(
+        [float(one[k]) for k in ("seeds", "value", "low", "high")], [2, 2, 2 - width, 2 + width]
+    )
     assert "P(better than ppo_lag)" in {r["statistic"] for r in rows}
     assert typed("plot", *arguments, "--by", "algo.name") == 0
     assert {p.name: p.read_bytes() for p in out.iterdir()} == first
@@ -267,7 +277,7 @@ def test_a_committed_study_is_read_like_the_runs_that_it_was_made_of():
     groups = compared(RESULTS / "goal")
     known = {(g.env, g.name): g for g in groups}
     cpo = known["point_goal1", "cpo"]
-    assert tables.cell(cpo.ret, ".2f") == "19.00 [17.38, 20.50]" and len(cpo.costs) == 5
+    assert tables.cell(cpo.ret, ".2f") == "19.00 [16.45, 21.55]" and len(cpo.costs) == 5
 
 
 BAD = {

@@ -52,7 +52,7 @@ def test_a_run_counts_gradient_steps_and_needs_no_data_to_be_evaluated(whole, da
     table = run_folder.read_metrics(whole)
     assert table["updates"][::2].tolist() == [10.0 * (i + 1) for i in range(40)]
     assert not table["steps"].any() and table["train/actor_loss"][-1] < table["train/actor_loss"][0]
-    assert run_folder.progress(whole) == (40, 0, 400)
+    assert run_folder.newest_progress(whole) == (40, 0, 400)
     config = run_folder.read_config(whole)
     assert (config["dataset"], config["total_updates"]) == (str(data), 400)
     assert run_folder.dataset_of(whole) == dataset.sha256(str(data))
@@ -78,7 +78,7 @@ def test_killed_and_resumed_it_ends_bit_for_bit_as_if_uninterrupted(whole, data,
     wait_for(lambda: len(checkpoint.checkpoints(run / "checkpoints")) == 2, process)
     process.kill()
     process.communicate()
-    reached = run_folder.progress(run)
+    reached = run_folder.newest_progress(run)
     assert reached is not None and 0 < reached.iteration < 40, "killed too late to test anything"
     shutil.copy(data, moved)
     assert typed("train", *args, f"dataset={moved}", "resume=true") == 0
@@ -92,7 +92,7 @@ def test_another_data_set_is_refused_on_resumption(whole, data, tmp_path, capsys
     args = (f"resume={whole}", TOY, f"dataset={other}")
     assert typed("train", *args) == 2
     assert f"dataset={other} is not the file that {whole} was trained with" in capsys.readouterr().err
-    assert not session.same(compose([*BC, f"dataset={other}"]), whole)
+    assert not session.is_same_run(compose([*BC, f"dataset={other}"]), whole)
 
 
 def test_a_comparison_holds_runs_without_training_episodes(whole):
@@ -132,9 +132,15 @@ def test_a_data_set_has_100_000_updates_unless_told_otherwise(data):
         (["algo=bc", "dataset=nowhere.npz"], "dataset=nowhere.npz: there is no such file"),
         (["algo=ppo_lag", "dataset=DATA"], "this algorithm learns from no data set"),
         (["algo=bc", "dataset=DATA", "num_envs=4"], "num_envs=4: bc trains without environments"),
-        (["algo=bc", "dataset=DATA", "env=toys:Clock"], "observations have 4 numbers, those of the"),
-        (["algo=bc", "dataset=DATA", "algo.updates=0"], "updates=0: expected at least 1"),
-        (["algo=bc", "dataset=DATA", "total_updates=0"], "total_updates=0: expected at least 1"),
+        (["algo=bc", "dataset=DATA", "env=toys:Ticker"], "observations have 4 numbers, those of the"),
+        (
+            ["algo=bc", "dataset=DATA", "algo.updates=0"],
+            "updates=0: expected a whole number",
+        ),
+        (
+            ["algo=bc", "dataset=DATA", "total_updates=0"],
+            "total_updates=0: expected a whole number",
+        ),
     ],
 )
 def test_what_cannot_work_is_one_line(tmp_path, data, capsys, options, message):

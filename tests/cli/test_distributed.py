@@ -55,7 +55,7 @@ def wait_for_rows(run: Path, processes: list[subprocess.Popen]) -> None:
 
 
 def reached(run: Path) -> int:
-    done = run_folder.progress(run)
+    done = run_folder.newest_progress(run)
     assert done is not None
     return done.steps
 
@@ -140,7 +140,7 @@ def test_what_one_cannot_do_ends_both_with_one_line(tmp_path):
 )
 def test_options_that_name_no_process_are_refused(options, problem):
     with pytest.raises(ConfigError, match=problem):
-        distributed.position(*options, devices=2)
+        distributed.position_from_options(*options, devices=2)
 
 
 def test_a_process_without_the_others_gives_up_in_one_line_that_says_what_to_check(monkeypatch):
@@ -168,9 +168,13 @@ def test_slurm_says_where_a_task_stands(monkeypatch):
     assert distributed.slurm_position({"SLURM_JOB_ID": "1"}) is None
     for name, value in SLURM.items():
         monkeypatch.setenv(name, value)
-    assert distributed.position(None, None, None, devices=1) is None  # each task its own run
-    assert distributed.position(None, 1, None, devices=8) is None
-    assert distributed.position(None, None, None, devices=8) == Position("gpu07", 61441, 8, 5, None)
+    assert (
+        distributed.position_from_options(None, None, None, devices=1) is None
+    )  # each task its own run
+    assert distributed.position_from_options(None, 1, None, devices=8) is None
+    assert distributed.position_from_options(None, None, None, devices=8) == Position(
+        "gpu07", 61441, 8, 5, None
+    )
 
 
 def test_more_devices_than_the_processes_have_are_refused(monkeypatch):

@@ -103,7 +103,7 @@ def test_curves_show_evaluations_as_points_on_dashed_lines(watched, monkeypatch)
 @pytest.mark.parametrize(
     "options, message",
     [
-        (["eval_every=-1"], "eval_every=-1: expected at least 0"),
+        (["eval_every=-1"], "eval_every=-1: expected a whole number between 0 and"),
         (["eval_every=10", "eval_episodes=0"], "eval_every=10: expected eval_episodes of at least 1"),
     ],
 )

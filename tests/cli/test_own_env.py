@@ -8,7 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 import pytest
 import shell
-from toys import Clock, Corridor
+from toys import Corridor, Ticker
 
 from jaxsafe import algos, envs
 from jaxsafe.config import ConfigError
@@ -44,7 +44,7 @@ def test_a_layout_without_room_is_refused_though_nothing_is_overridden():
     envs.register(
         "full", TASKS["goal1"] | ROBOTS["point"] | {"hazards_num": 90, "hazards_keepout": 0.5}
     )
-    with pytest.raises(ConfigError, match="no valid layout"):
+    with pytest.raises(ConfigError, match="do not fit into the area"):
         envs.make("full")
 
 
@@ -60,7 +60,7 @@ def test_an_object_or_what_makes_one_is_registered_too():
     assert made("halls", half_width=1).half_width == 1.0
 
     def clock(life: int = 3, label=object()):  # noqa: B008
-        return Clock(lives=(life, life))
+        return Ticker(lives=(life, life))
 
     envs.register("clock", clock)
     assert envs.env_defaults("clock")["life"] == 3 and len(envs.env_defaults("clock")) == 2
@@ -127,7 +127,7 @@ def test_a_member_that_is_missing_or_odd_is_one_line():
         check_env(Corridor(episode_length=float("inf")), "odd")  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="cost_names is 'wall', expected a tuple"):
         check_env(Corridor(cost_names="wall"), "odd")  # type: ignore[arg-type]
-    assert check_env(Clock(), "clock") == Clock()
+    assert check_env(Ticker(), "clock") == Ticker()
 
 
 # On the command line -------------------------------------------------------------------------

@@ -15,7 +15,7 @@ import pytest
 
 from jaxsafe.commands import study as command
 from jaxsafe.config import ConfigError
-from jaxsafe.report import condensed, plots, studies
+from jaxsafe.report import plots, studies, study_files
 from jaxsafe.report.read import read, read_one
 from jaxsafe.run import run_folder
 from jaxsafe.run.checkpoint import Progress
@@ -81,7 +81,7 @@ def test_figures_and_curves_of_a_study_are_those_of_its_runs(toy, tmp_path):
         "minutes"
     }
     edges = np.linspace(0, run.steps, 51)
-    for name in condensed.CURVES:
+    for name in study_files.CURVES:
         here, there = (plots.stretches(r.table, name, edges) for r in (same, run))
         np.testing.assert_allclose(here, there, rtol=2e-3, err_msg=name)
 
@@ -116,7 +116,7 @@ def test_rows_say_what_a_run_was_made_with_and_how_it_ended(toy, tmp_path):
         trained(tmp_path / str(i), toy.command(toy.runs[i]), steps, nonfinite)
         (run,) = read_one(tmp_path / str(i))
         studies.add(toy, toy.runs[i], run, studies.origin_of(tmp_path / str(i)))
-    rows = condensed.read(toy.folder).rows
+    rows = study_files.read(toy.folder).rows
     assert [row["state"] for row in rows] == ["done", "diverged", "unfinished", "unfinished"]
     assert [row["settings"] for row in rows] == ["", "", "algo.dual_lr=0.2", "algo.dual_lr=0.2"]
     first = rows[0]
@@ -134,14 +134,14 @@ def test_rows_say_what_a_run_was_made_with_and_how_it_ended(toy, tmp_path):
 def test_a_study_whose_files_do_not_belong_together_is_refused(toy, tmp_path):
     trained(tmp_path / "run", toy.command(toy.runs[0]))
     (run,) = read_one(tmp_path / "run")
-    studies.add(toy, toy.runs[0], run, condensed.Origin())
+    studies.add(toy, toy.runs[0], run, study_files.Origin())
     table = toy.folder / "final.csv"
     table.write_text(table.read_text().replace("algo=cpo", "algo=pcpo"))
     with pytest.raises(ConfigError, match="lacks rows of final"):
-        condensed.read(toy.folder)
+        study_files.read(toy.folder)
     (toy.folder / "curves.npz").write_bytes(b"PK no more")
     with pytest.raises(ConfigError, match="cannot be read"):
-        condensed.read(toy.folder)
+        study_files.read(toy.folder)
 
 
 # ---- the command -----------------------------------------------------------------------------
@@ -167,6 +167,12 @@ def test_an_interrupted_study_continues_with_what_is_left(toy, tmp_path, monkeyp
         capsys.readouterr().out
         == "point_goal1-cpo: done\npoint_goal1-ppo_lag-algo.dual_lr=0.2: to do\n"
     )
+    assert call(monkeypatch, *arguments, "--commands") == 0
+    (line,) = capsys.readouterr().out.splitlines()
+    folder = runs / "toy" / "point_goal1-ppo_lag-algo.dual_lr=0.2"
+    assert line.startswith("python scripts/train.py ") and line.endswith(
+        f" run_dir={folder} resume=true"
+    )
     shutil.rmtree(runs / "toy" / asked[1])
     assert call(monkeypatch, *arguments, train=train) == 0
     assert asked == ["point_goal1-cpo", *["point_goal1-ppo_lag-algo.dual_lr=0.2"] * 2]
@@ -189,7 +195,7 @@ def test_an_interrupted_study_continues_with_what_is_left(toy, tmp_path, monkeyp
 def test_a_page_keeps_the_words_around_its_tables(toy, tmp_path):
     trained(tmp_path / "run", toy.command(toy.runs[0]))
     (run,) = read_one(tmp_path / "run")
-    studies.add(toy, toy.runs[0], run, condensed.Origin())
+    studies.add(toy, toy.runs[0], run, study_files.Origin())
     page = toy.folder / "README.md"
     page.write_text("# Mine\n\nbefore\n\n<!-- measured: matrix -->\nold\n<!-- end -->\n\nafter\n")
     studies.write_page(toy)
@@ -210,7 +216,7 @@ def test_failed_runs_are_kept_and_tried_again_last(toy, tmp_path, monkeypatch, c
     arguments = (toy.folder, "--runs", tmp_path / "runs")
     assert call(monkeypatch, *arguments, train=train) == 1
     assert "point_goal1-cpo: failed, see" in capsys.readouterr().out
-    assert {row["state"] for row in condensed.read(toy.folder).rows} == {"failed"}
+    assert {row["state"] for row in study_files.read(toy.folder).rows} == {"failed"}
     assert call(monkeypatch, *arguments, train=train) == 1
     assert asked == [*asked[:2], *asked[1::-1]] and asked[0] == "point_goal1-cpo"
 
@@ -264,11 +270,11 @@ def test_real_training_is_stopped_and_continued(tmp_path):
         assert process.poll() is None
         time.sleep(0.05)
     process.send_signal(signal.SIGINT)
-    assert process.wait() == 130 and not condensed.there(folder)
+    assert process.wait() == 130 and not study_files.there(folder)
     done = subprocess.run(words, env=environ, text=True, capture_output=True)
     assert done.returncode == 0 and "left to do: nothing" in done.stdout, done.stdout + done.stderr
     assert "resuming at" in (runs / "toy" / "ppo.log").read_text()
-    rows = condensed.read(folder).rows
+    rows = study_files.read(folder).rows
     assert [(row["algo"], row["state"], row["steps"]) for row in rows] == [
         ("ppo", "done", "64000"),
         ("cpo", "done", "64000"),

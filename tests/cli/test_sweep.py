@@ -11,24 +11,24 @@ import jax
 import numpy as np
 import pytest
 import shell
-from tasks import FAST
-from toys import FIRST, Corridor
+from compiling import FAST
+from toys import START, Corridor
 
 from jaxsafe import algos
 from jaxsafe.config import ConfigError, float_fields
-from jaxsafe.learn.offline import OfflineConfig, blank
+from jaxsafe.learn.offline import OfflineConfig, data_set_like
 from jaxsafe.report import plots
 from jaxsafe.report.evaluation import evaluate
 from jaxsafe.report.finish import finish
 from jaxsafe.report.sweep_summary import rows_of, summarise
-from jaxsafe.run import arguments, checkpoint, loop, memory, run_folder, session, spread, sweep
+from jaxsafe.run import arguments, checkpoint, loop, memory, programs, run_folder, session, sweep
 from jaxsafe.run.arguments import compose
 from jaxsafe.run.evaluate import run_episodes
 from jaxsafe.run.policies import open_run
-from jaxsafe.run.progress import Report
+from jaxsafe.run.programs import build, members
+from jaxsafe.run.progress import Reporter
 from jaxsafe.run.session import Session
-from jaxsafe.run.settings import TrainConfig, settle
-from jaxsafe.run.spread import build, members
+from jaxsafe.run.settings import TrainConfig, settings_from_config
 
 SMALL = [
     "env=toys:Corridor", "env.half_width=0.01", "algo=ppo_lag", "num_envs=4", "algo.horizon=8",
@@ -45,14 +45,14 @@ def planned(*texts: str) -> sweep.Sweep:
 
 def train(folder: Path, *texts: str) -> None:
     asked = planned(*SMALL, *texts, f"run_dir={folder}")
-    assert sweep.train(asked, "again", Report(), sweep.After(finish, summarise)) == 0
+    assert sweep.train(asked, "again", Reporter(), sweep.After(finish, summarise)) == 0
 
 
 def tables(folder: Path) -> dict[tuple, dict[str, np.ndarray]]:
     """metrics.csv of each setting and seed of a sweep, wherever it was trained."""
     found = {}
     for path in sorted(folder.glob("*/config.yaml")):
-        saved = settle(run_folder.read_config(path.parent))
+        saved = settings_from_config(run_folder.read_config(path.parent))
         parts = run_folder.by_setting(run_folder.read_metrics(path.parent)).values()
         for cfg, part in zip(saved.configs, parts, strict=True):
             for seed in saved.train.seed + np.arange(saved.train.num_seeds):
@@ -77,11 +77,11 @@ def compiled_quickly():
     def compiled(update: Any) -> Any:
         return jax.jit(update, donate_argnums=0, compiler_options=FAST)
 
-    def quick(program: spread.Program, ts: Any) -> Any:
-        return compiled(program.update).lower(ts, FIRST).compile()
+    def quick(program: programs.Program, ts: Any) -> Any:
+        return compiled(program.update).lower(ts, START).compile()
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(spread, "compiled", quick)
+        patch.setattr(programs, "compiled", quick)
         yield
 
 
@@ -127,7 +127,7 @@ def test_a_grid_over_named_limits_is_side_by_side_too():
     assert run[2].setting == "algo.clip=0.1, algo.cost_limits.hazards=10"
     plain = settings.plain()
     assert plain["algo"]["cost_limits"] == {"hazards": [5.0, 10.0, 5.0, 10.0], "vases_contact": 25.0}
-    assert settle(plain)._replace(env=settings.env) == settings
+    assert settings_from_config(plain)._replace(env=settings.env) == settings
     one = compose(
         ["env=point_goal2", "algo.cost_limits.hazards=5", "algo.cost_limits={vases_contact: 3}"]
     )
@@ -146,12 +146,13 @@ def test_a_sweep_over_a_named_limit_from_training_to_summary(tmp_path, capsys):
     assert (tight > loose).all()
     rows = rows_of(folder)
     assert [r.limits for r in rows] == [{"wall": 0.5}, {"wall": 50.0}]
-    assert [r.held for r in rows] == ["no", "yes"]
+    assert rows[0].held != "yes" and rows[1].held == "yes"  # two seeds may leave it unclear
     text = (folder / "summary.md").read_text().splitlines()
     assert text[0] == (
         "| algo.cost_limits.wall | seeds | steps | return | cost | cost wall | limit | limit held |"
     )
-    assert text[2].startswith("| 0.5 | 2 | 192 |") and text[2].endswith("| wall 0.5 | no |")
+    assert text[2].startswith("| 0.5 | 2 | 192 |")
+    assert text[2].endswith(f"| wall 0.5 | {rows[0].held} |")
     with (folder / "summary.csv").open() as file:
         assert [row["cost_limit_wall"] for row in csv.DictReader(file)] == ["0.5", "50.0"]
     found = evaluate(open_run(run), 2, 0)
@@ -199,7 +200,7 @@ def test_every_float_of_every_algorithm_may_differ_between_members(name):
     offline = issubclass(kind, OfflineConfig)
     cfg = kind(hidden=(4,)) if offline else kind(num_envs=256, horizon=4, hidden=(4,))
     other = replace(cfg, **{field: 0.25 for field in float_fields(kind)})
-    data = blank(Corridor()) if offline else ()
+    data = data_set_like(Corridor()) if offline else ()
     train = TrainConfig(num_seeds=2, total_updates=1)
     program = build(Corridor(), algos.ALGOS[name].make, (cfg, other), train, data)
     ts = jax.eval_shape(program.init, program.start, program.shared())
@@ -211,7 +212,7 @@ def test_a_member_is_the_lone_run_of_its_setting_and_seed(finished, tmp_path):
     lone = ["algo.cost_limit=0.5", "algo.dual_lr=1", "seed=1", f"run_dir={tmp_path / 'lone'}"]
     settings = compose([*SMALL, *lone])
     lone_run = Session(settings, tmp_path / "lone", *session.prepare(settings), "again")
-    assert session.run(lone_run, Report(), finish) == 0
+    assert session.run(lone_run, Reporter(), finish) == 0
     together, alone = tables(finished), tables(tmp_path)
     assert len(together) == 8 and [*alone] == [(0.5, 1.0, 1)]
     assert_close({member: together[member] for member in alone}, alone)
@@ -251,7 +252,7 @@ def test_an_interrupted_sweep_goes_on_and_ends_bit_for_bit_as_if_uninterrupted(t
         patch.setattr(checkpoint, "save", killed)
         train(tmp_path / "sweep", *args)
     first, second = sorted((tmp_path / "sweep").glob("0*"))
-    assert [run_folder.progress(f) for f in (first, second)] == [(6, 192, 24), (2, 64, 8)]
+    assert [run_folder.newest_progress(f) for f in (first, second)] == [(6, 192, 24), (2, 64, 8)]
     train(tmp_path / "sweep", *GRID, "checkpoint_iterations=2")  # the parts are remembered
     starts = [len(json.loads((f / "versions.json").read_text())) for f in (first, second)]
     assert starts == [1, 2]
@@ -269,8 +270,8 @@ def test_the_memory_decides_how_many_members_run_at_once(monkeypatch):
     (settings,) = asked.groups.values()
     parallel, program = sweep.fitting(settings, None)
     assert parallel == len(program.members) == 8
-    like = jax.eval_shape(program.init, program.start, FIRST)
-    used = spread.compiled(program, like).memory_analysis()
+    like = jax.eval_shape(program.init, program.start, START)
+    used = programs.compiled(program, like).memory_analysis()
     need = used.temp_size_in_bytes + used.output_size_in_bytes  # arguments are reused for the output
     monkeypatch.setattr(memory, "device_memory", lambda: (need * 0.5 / memory.ROOM, "this machine"))
     assert 3 <= memory.capacity(program) <= 4
@@ -333,21 +334,22 @@ def test_the_summary_is_the_last_tenth_of_training_over_the_seeds_of_each_settin
     plain: Any = settings.plain() | {"num_seeds": 2}
     three = plain | {"algo": plain["algo"] | {"cost_limit": [2.0, 4.0, 8.0]}}
     table = [(0, 2.0, 1.0, 1.0), (1, 2.0, 3.0, 3.0), (0, 4.0, 5.0, 3.0), (1, 4.0, 5.0, 7.0)]
-    write(tmp_path / f"{name}.part0", three, [*table, (0, 8.0, 0.0, 9.0), (1, 8.0, 0.0, 10.0)])
+    write(tmp_path / f"{name}.part0", three, [*table, (0, 8.0, 0.0, 9.45), (1, 8.0, 0.0, 9.55)])
     for seed in range(2):  # a setting whose seeds were trained apart
         alone = plain | {"algo": plain["algo"] | {"cost_limit": 16.0}, "seed": seed, "num_seeds": 1}
         write(tmp_path / f"{name}.part{seed + 1}", alone, [(seed, None, 1.0, np.nan)])
     assert summarise(tmp_path) == (
         "| algo.cost_limit | seeds | steps | return | cost | limit | limit held |\n"
         "| --- | ---: | ---: | ---: | ---: | ---: | ---: |\n"
-        "| 2 | 2 | 200 | 2 [1, 3] | 2 [1, 3] | 2 | yes |\n"
-        "| 4 | 2 | 200 | 5 | 5 [3, 7] | 4 | unclear |\n"
-        "| 8 | 2 | 200 | 0 | 9.5 [9, 10] | 8 | no |\n"
+        "| 2 | 2 | 200 | 2 [-10.71, 14.71] | 2 [-10.71, 14.71] | 2 | yes |\n"
+        "| 4 | 2 | 200 | 5 | 5 [-20.41, 30.41] | 4 | unclear |\n"
+        "| 8 | 2 | 200 | 0 | 9.5 [8.865, 10.14] | 8 | no |\n"
         "| 16 | 2 | 200 | 1 | - | 16 | - |\n"
     )
     with (tmp_path / "summary.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert [float(rows[1][k]) for k in ("cost", "cost_low", "cost_high", "cost_limit")] == [5, 3, 7, 4]
+    found = [float(rows[1][k]) for k in ("cost", "cost_low", "cost_high", "cost_limit")]
+    np.testing.assert_allclose(found, [5, 5 - 25.4124095, 5 + 25.4124095, 4])
     assert (tmp_path / "summary.png").stat().st_size > 10_000
 
 
@@ -366,9 +368,9 @@ def test_curves_of_settings_side_by_side_have_their_own_limits(tmp_path, monkeyp
 
 BAD = {
     "algo.cost_limt=5,10": "did you mean 'cost_limit'?",
-    "algo.cost_limit=5,wide": "algo.cost_limit='wide': expected a number",
+    "algo.cost_limit=5,wide": "algo.cost_limit='wide': expected a",
     "algo.epochs=5,1.5": "algo.epochs=1.5: expected a whole number",
-    "algo.cost_limit=5,-1": "algo.cost_limit=-1.0: expected at least 0",
+    "algo.cost_limit=5,-1": "algo.cost_limit=-1: expected a number between 0 and",
     "algo.cost_limit=5,": "cannot read 'algo.cost_limit=5,'",
     "algo.cost_limit=5,5": "algo.cost_limit=5 occurs twice",
     "algo.cost_limit=5,5.0": "occurs twice",
@@ -376,8 +378,8 @@ BAD = {
     "algo.cost_limit=5": "nothing to sweep",
     "algo.hidden=[8,8]": "nothing to sweep",
     "env=point_goal2 algo.cost_limits.hazard=5,10": "unknown cost 'hazard'; did you mean 'hazards'?",
-    "env=point_goal2 algo.cost_limits.hazards=5,-1": "algo.cost_limits.hazards=-1.0: expected at least",
-    "env=point_goal2 algo.cost_limits.hazards=5,wide": "expected names with a number each",
+    "env=point_goal2 algo.cost_limits.hazards=5,-1": "algo.cost_limits.hazards=-1: expected",
+    "env=point_goal2 algo.cost_limits.hazards=5,wide": "algo.cost_limits.hazards='wide': expected a",
     "env=point_goal2 algo=p3o algo.cost_limits.hazards=5,10": "p3o takes one limit, algo.cost_limit;",
     "algo.cost_limit.hazards=5,10": "did you mean 'cost_limits'?",
     "algo=ppo_lag,cop": "did you mean 'cpo'?",

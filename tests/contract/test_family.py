@@ -1,5 +1,6 @@
 """What single algorithms add: surrogates, projections and penalties, by hand or by oracle."""
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -124,7 +125,8 @@ def problem(cfg):
 @pytest.mark.parametrize("excess, price", [(-1.0, 0.0), (1.0, 3.0)])
 def test_the_penalty_is_felt_beyond_the_limit_alone(excess, price, omnisafe):
     sizes: dict[str, Any] = {"hidden": (8,), "minibatches": 1, "epochs": 1, "kappa": 3.0, "lr": 1e-3}
-    cfg = p3o.P3OConfig(**sizes, per_step=not omnisafe, clip_cost=not omnisafe)
+    ours = not omnisafe
+    cfg = p3o.P3OConfig(**sizes, per_step=ours, clip_cost=ours, centre_cost=ours)
     of_cost = plain if omnisafe else pessimistic
     actor, batch = problem(cfg)
 
@@ -140,7 +142,7 @@ def test_the_penalty_is_felt_beyond_the_limit_alone(excess, price, omnisafe):
         return reward - price * of_cost(dist, batch, batch.adv_c, cfg)[0], {}
 
     pair = Pair(objective(clipped, "adv_r"), objective(p3o.surrogate_c, "adv_c"))
-    state, told = adam_epochs.init(actor, cfg), context(cfg, excess=excess, length=10.0)
+    state, told = adam_epochs.init(actor, cfg), context(cfg, violation=excess, episode_length=10.0)
     after, _, metrics = p3o.update(actor, state, pair, batch, told)
     cost = p3o.surrogate_c(policy(after, batch.obs, cfg), batch, batch.adv_c, cfg)[0]
     violation = 1.0 if omnisafe else 1.0 / 10  # per episode, or per step of an episode of 10
@@ -149,6 +151,25 @@ def test_the_penalty_is_felt_beyond_the_limit_alone(excess, price, omnisafe):
     same, _, _ = adam_epochs.update(actor, state, mixed, batch, told)
     for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(same), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("noise", [-1.0, 1.0])
+@pytest.mark.parametrize("violation, penalty", [(-0.2, 0.0), (0.2, 3.0 * 0.2)])
+def test_the_mean_of_a_minibatchs_cost_advantages_is_not_a_violation(violation, penalty, noise):
+    """At the policy that acted, whatever states a minibatch happens to hold."""
+    cfg = p3o.P3OConfig(hidden=(8,), kappa=3.0)
+    actor, batch = problem(cfg)
+    batch = dataclasses.replace(batch, adv_c=batch.adv_c + noise)
+
+    def of_reward(actor, batch):
+        return jnp.zeros(()), {}
+
+    def of_cost(actor, batch):
+        return p3o.surrogate_c(policy(actor, batch.obs, cfg), batch, batch.adv_c, cfg)
+
+    told = context(cfg, violation=violation)
+    _, metrics = p3o.penalised(Pair(of_reward, of_cost), told)(actor, batch)
+    np.testing.assert_allclose(metrics["train/penalty"], penalty, atol=1e-5)
 
 
 def test_cups_projection_is_a_step_down_the_papers_loss():

@@ -4,6 +4,7 @@ import ast
 import shutil
 import subprocess
 import sys
+import tarfile
 import zipfile
 from pathlib import Path
 
@@ -76,24 +77,40 @@ def test_the_links_into_the_package_exist_and_are_relative():
         assert link.is_symlink() and link.readlink() == Path("..") / name
 
 
-def test_the_wheel_holds_every_module_and_asset(tmp_path):
-    source, out = tmp_path / "source", tmp_path / "out"
-    source.mkdir()
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
-        if (ROOT / name).exists():
-            shutil.copy(ROOT / name, source)
-    (source / "README.md").touch()
-    for name in ("jaxsafe", "envs", "algos"):
-        shutil.copytree(
-            ROOT / name, source / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__")
-        )
-    code = f"from setuptools.build_meta import build_wheel; build_wheel({str(out)!r})"
+def build(kind: str, source: Path, out: Path) -> Path:
+    """The 'wheel' or 'sdist' of a folder with our sources."""
     pytest.importorskip("setuptools", minversion="77")
+    code = f"from setuptools.build_meta import build_{kind}; build_{kind}({str(out)!r})"
     done = subprocess.run([sys.executable, "-c", code], cwd=source, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    (wheel,) = out.glob("*.whl")
-    names = set(zipfile.ZipFile(wheel).namelist())
+    (built,) = out.iterdir()
+    return built
+
+
+def test_the_sdist_and_its_wheel_hold_every_module_and_asset_and_no_tests(tmp_path):
+    source, out = tmp_path / "source", tmp_path / "out"
+    source.mkdir()
+    for name in (
+        "pyproject.toml",
+        "MANIFEST.in",
+        "README.md",
+        "LICENSE",
+        "CHANGELOG.md",
+        "CITATION.cff",
+    ):
+        shutil.copy(ROOT / name, source)
+    for name in ("jaxsafe", "envs", "algos", "tests"):
+        ignored = shutil.ignore_patterns("__pycache__", "data")
+        shutil.copytree(ROOT / name, source / name, symlinks=True, ignore=ignored)
+    with tarfile.open(build("sdist", source, out / "sdist")) as archive:
+        archive.extractall(tmp_path, filter="data")
+    (unpacked,) = tmp_path.glob("jaxsafe-*")
+    assert not (unpacked / "tests").exists() and (unpacked / "CHANGELOG.md").exists()
+    wheel = zipfile.ZipFile(build("wheel", unpacked, out / "wheel"))
+    names = set(wheel.namelist())
     marker = ROOT / "jaxsafe" / "py.typed"
     for path in [*MODULES, marker, *(ROOT / "envs").rglob("*.xml"), *(ROOT / "envs").rglob("*.cu")]:
         inside = path.relative_to(ROOT).as_posix()
         assert (inside if inside.startswith("jaxsafe/") else f"jaxsafe/{inside}") in names
+    (entries,) = (name for name in names if name.endswith("entry_points.txt"))
+    assert b"jaxsafe = jaxsafe.commands.jaxsafe:main" in wheel.read(entries)

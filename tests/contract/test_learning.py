@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import FAST
 from learners import on_policy_names, options_of
-from tasks import FAST
-from toys import FIRST, Lever
+from toys import START, Lever
 
 from jaxsafe.algos import ALGOS
 from jaxsafe.run import evaluate
@@ -34,8 +34,8 @@ def train(name, iterations=100, options=None, **swept):
     cfg = ALGOS[name].config(**settings)
 
     def run(key, swept):
-        ts = algo.init(key, dataclasses.replace(cfg, **swept), FIRST)
-        return jax.lax.scan(lambda ts, _: algo.update(ts, FIRST), ts, None, iterations)
+        ts = algo.init(key, dataclasses.replace(cfg, **swept), START)
+        return jax.lax.scan(lambda ts, _: algo.update(ts, START), ts, None, iterations)
 
     keys = jax.random.split(jax.random.key(0), max(map(len, swept.values()), default=2))
     return algo, *jax.jit(jax.vmap(run), compiler_options=FAST)(keys, swept)
@@ -75,7 +75,7 @@ def test_an_adaptive_price_holds_the_limit_on_average(name):
 def test_a_budget_or_an_early_end_holds_the_limit_in_every_episode(name):
     """Up to 1 in 50: the policy is a smooth function, and is paid to come near the limit."""
     algo, ts, metrics = train(name)
-    whole = evaluate.run_episodes(algo, ts, 200, seed=0)
+    whole = evaluate.run_episodes(algo, jax.vmap(algo.params)(ts), 200, seed=0)
     assert (whole.length == 10).all()
     assert (whole.cost > LIMIT).mean() < 0.02
     assert (whole.ret.mean(1) > 0.9 * BEST).all()

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from learners import learner, members, on_policy_names, others_slowly, row
+from learners import compiled, member, members, on_policy_names, others_slowly
 
 ONE_OF_EACH_STEP = ["cpo", "ppo_simmer_pid", "trpo_pid"]
 OTHERS = [name for name in on_policy_names() if name not in [*ONE_OF_EACH_STEP, "cup"]]
@@ -23,16 +23,16 @@ def assert_trees_close(a, b, tolerance):
 def test_seeds_and_cost_limits_side_by_side_are_the_lone_ones(name):
     seeds, limits = [0, 1, 2], jnp.array([25.0, 1.0, 5.0])
     together = members(name, seeds, cost_limit=limits)
-    lone = [row(members(name, [i], cost_limit=limits[i : i + 1]), 0) for i in seeds]
+    lone = [member(members(name, [i], cost_limit=limits[i : i + 1]), 0) for i in seeds]
     # sums are ordered differently, and unfinished conjugate gradients amplify that some hundredfold;
     # z has a scale of its own, so trpo_saute's are the worst conditioned
     for tolerance in (1e-6, 3e-4 if name == "trpo_saute" else 1e-4):
-        together, metrics = learner(name).together(together)
+        together, metrics = compiled(name).together(together)
         for i in seeds:
-            lone[i], alone = learner(name).update(lone[i])
-            rate = row(metrics, i)["train/cost_rate"]
+            lone[i], alone = compiled(name).update(lone[i])
+            rate = member(metrics, i)["train/cost_rate"]
             np.testing.assert_allclose(rate, alone["train/cost_rate"], rtol=1e-5, atol=2e-5)
-            assert_trees_close(row(together.params, i), lone[i].params, tolerance)
+            assert_trees_close(member(together.params, i), lone[i].params, tolerance)
     assert together.config.cost_limit.tolist() == limits.tolist()
 
 
@@ -40,8 +40,8 @@ SHARDED = """
 import sys; sys.path.insert(0, sys.argv[1])
 import jax, jax.numpy as jnp, numpy as np
 from jax.sharding import AxisType, PartitionSpec as P
-from tasks import FAST
-from toys import FIRST, Corridor, updated
+from compiling import FAST
+from toys import START, Corridor, updated
 from jaxsafe.algos import ALGOS
 from jaxsafe.learn.on_policy import scaled_signals
 
@@ -59,7 +59,7 @@ for name in sys.argv[2:]:
     sizes = dict(num_envs=4, horizon=10, minibatches=2, hidden=(4,), critic_epochs=2)
     cfg = entry.config(**sizes, reward_normalize=True, trunk=trunk)
     keys = jnp.stack([jax.random.key(0)] * 2)
-    ts = split(lambda key: algo.init(key, cfg, FIRST))(keys)
+    ts = split(lambda key: algo.init(key, cfg, START))(keys)
     update = split(updated(algo))
     for _ in range(2):
         ts, metrics = update(ts)

@@ -4,8 +4,8 @@ import dataclasses
 
 import jax.numpy as jnp
 import numpy as np
-from learners import begin, learner
-from toys import Clock
+from learners import begin, compiled
+from toys import Ticker
 
 from jaxsafe.learn.on_policy import scaled_signals
 from jaxsafe.learn.returns import Window
@@ -32,9 +32,9 @@ def test_what_the_learner_sees_is_normalised_by_all_batches_up_to_this_one():
 
 
 def test_the_constraint_and_the_metrics_see_rewards_and_costs_as_they_are():
-    env = Clock(episode_length=5)
+    env = Ticker(episode_length=5)
     runs = [
-        learner("pdo", env).update(begin("pdo", env, **FIVE_STEPS | normalised, cost_limit=9.0))
+        compiled("pdo", env).update(begin("pdo", env, **FIVE_STEPS | normalised, cost_limit=9.0))
         for normalised in ({}, {"reward_normalize": True, "cost_normalize": True})
     ]
     for ts, m in runs:
@@ -46,8 +46,8 @@ def test_the_constraint_and_the_metrics_see_rewards_and_costs_as_they_are():
 
 
 def test_the_constraint_sees_the_mean_cost_of_the_window():
-    env = Clock(episode_length=5)
-    ts, update = begin("crpo", env, cost_window=3, cost_limit=6.0), learner("crpo", env).update
+    env = Ticker(episode_length=5)
+    ts, update = begin("crpo", env, cost_window=3, cost_limit=6.0), compiled("crpo", env).update
     seen = []
     for _ in range(4):  # an episode costs 10: above the limit of 6, and its tolerance of 2
         ts, metrics = update(ts)
@@ -67,8 +67,8 @@ def test_the_constraint_sees_the_mean_cost_of_the_window():
 
 
 def test_metrics_are_of_the_episodes_that_ended_and_of_none_there_is_no_mean():
-    env = Clock(episode_length=9, lives=(3, 3))
-    ts, m = learner("ppo", env).update(begin("ppo", env, stagger=False, horizon=6))
+    env = Ticker(episode_length=9, lives=(3, 3))
+    ts, m = compiled("ppo", env).update(begin("ppo", env, stagger=False, horizon=6))
     expected = {"episodes": 16, "return": 3, "cost": 6, "cost_a": 1.5, "cost_b": 4.5, "ticks": 3}
     expected |= {"episode_length": 3, "cost_rate": 2}
     for name, x in expected.items():
@@ -80,6 +80,6 @@ def test_metrics_are_of_the_episodes_that_ended_and_of_none_there_is_no_mean():
     state = ts.rollout.state
     state = dataclasses.replace(state, obs=state.obs.at[:, 2].set(99.0))  # none ends in 6 steps
     endless = dataclasses.replace(ts, rollout=dataclasses.replace(ts.rollout, state=state))
-    _, m = learner("ppo", env).update(endless)
+    _, m = compiled("ppo", env).update(endless)
     assert m["train/episodes"] == 0 and jnp.isnan(m["train/return"]) and jnp.isnan(m["train/ticks"])
     assert m["train/cost_estimate"] == 2 * 9

@@ -13,15 +13,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tasks import FAST
-from toys import FIRST, Clock, Corridor, Lever
+from compiling import FAST
+from toys import START, Corridor, Lever, Ticker
 
 from jaxsafe.algos import ALGOS, sac
 from jaxsafe.config import ConfigError
 from jaxsafe.learn.acting import Player
-from jaxsafe.learn.learner import Fit, Turn
-from jaxsafe.learn.off_policy import OffPolicyConfig, walked
+from jaxsafe.learn.learner import GradientStep
+from jaxsafe.learn.next_step_rollout import collect_records
+from jaxsafe.learn.off_policy import OffPolicyConfig
 from jaxsafe.learn.replay import Transitions
+from jaxsafe.learn.steps import Trainable
 from jaxsafe.nn.critics import q_values
 from jaxsafe.types import Env, Shared, State
 
@@ -43,8 +45,8 @@ def build(name, env: Env = Corridor(), **settings):  # noqa: B008
     """The algorithm, and its update compiled as the training loop does, which uses up its argument."""
     algo = ALGOS[name].make(env)
     cfg = ALGOS[name].config(**TINY | settings)
-    like = jax.eval_shape(lambda key: algo.init(key, cfg, FIRST), jax.random.key(0))
-    return algo, jax.jit(algo.update, donate_argnums=0).lower(like, FIRST).compile(FAST)
+    like = jax.eval_shape(lambda key: algo.init(key, cfg, START), jax.random.key(0))
+    return algo, jax.jit(algo.update, donate_argnums=0).lower(like, START).compile(FAST)
 
 
 @cache
@@ -53,12 +55,12 @@ def together(name):
     algo, cfg = ALGOS[name].make(Corridor()), ALGOS[name].config(**TINY)
 
     def init(key, discount):
-        return algo.init(key, dataclasses.replace(cfg, discount=discount), FIRST)
+        return algo.init(key, dataclasses.replace(cfg, discount=discount), START)
 
     keys, discounts = jax.random.split(jax.random.key(3), 4), jnp.array([0.99, 0.9, 0.99, 0.5])
     ts = jax.jit(jax.vmap(init), compiler_options=FAST)(keys, discounts)
     update = jax.jit(jax.vmap(algo.update, in_axes=(0, None)), donate_argnums=0)
-    return ts, update.lower(ts, FIRST).compile(FAST)
+    return ts, update.lower(ts, START).compile(FAST)
 
 
 def copy(tree):
@@ -67,7 +69,7 @@ def copy(tree):
 
 def start(name, seed=0, env: Env = Corridor(), **settings):  # noqa: B008
     algo, cfg = ALGOS[name].make(env), ALGOS[name].config(**TINY | settings)
-    return jax.jit(lambda key: algo.init(key, cfg, FIRST), compiler_options=FAST)(jax.random.key(seed))
+    return jax.jit(lambda key: algo.init(key, cfg, START), compiler_options=FAST)(jax.random.key(seed))
 
 
 def at(iteration, since=0):
@@ -159,18 +161,19 @@ def test_the_compiled_update_writes_into_the_ring_in_place(name, members):
 @pytest.mark.parametrize("name", NAMES)
 def test_a_world_that_is_not_finite_costs_the_others_nothing_and_is_counted(name):
     ts, update = start(name), build(name)[1]
-    rollout = ts.walk.rollout
+    rollout = ts.stepping.rollout
     state = dataclasses.replace(
         rollout.state,
         physics=rollout.state.physics.at[0].set(jnp.nan),
         obs=rollout.state.obs.at[0].set(jnp.nan),
     )
-    walk = dataclasses.replace(ts.walk, rollout=dataclasses.replace(rollout, state=state))
-    before = dataclasses.replace(ts, walk=walk)
+    rollout = dataclasses.replace(rollout, state=state)
+    before = dataclasses.replace(ts, stepping=dataclasses.replace(ts.stepping, rollout=rollout))
     ts = copy(before)
     for iteration in range(2):
         ts, metrics = update(ts, at(iteration))
-    assert metrics["train/nonfinite"] > 0 and jnp.isnan(ts.replay.obs[:, 0]).any()
+        assert metrics["train/bad_worlds"] == (iteration == 0)  # it is reset
+    assert metrics["train/nonfinite"] > 0 and jnp.isnan(ts.replay.reward[:, 0]).any()
     assert jnp.isfinite(metrics["train/critic_loss"])
     learned = (ts.params, ts.opt_state, ts.normaliser, ts.episode_length)
     assert all(jnp.isfinite(x).all() for x in jax.tree.leaves(learned))
@@ -199,8 +202,8 @@ def test_published_settings_build(name):
     algo = ALGOS[name].make(Corridor())
     for settings in ALGOS[name].published.values():
         cfg = ALGOS[name].config(**settings)
-        before = jax.eval_shape(lambda key, cfg=cfg: algo.init(key, cfg, FIRST), jax.random.key(0))
-        after, _ = jax.eval_shape(algo.update, before, FIRST)
+        before = jax.eval_shape(lambda key, cfg=cfg: algo.init(key, cfg, START), jax.random.key(0))
+        after, _ = jax.eval_shape(algo.update, before, START)
         assert jax.tree.structure(before) == jax.tree.structure(after)
 
 
@@ -210,10 +213,10 @@ def test_published_settings_build(name):
         ({"batch_size": 24}, r"replay_ratio=4.*replay_ratio=3 or batch_size=32"),
         ({"batch_size": 96}, r"replay_ratio=6 or batch_size=64 or learn_every=3"),
         ({"learn_every": 4}, r"learn_every=4: expected a divisor of horizon=6; the nearest is 3"),
-        ({"replay_ratio": 0}, "replay_ratio=0: expected at least 1"),
+        ({"replay_ratio": 0}, "replay_ratio=0: expected a whole number between 1 and"),
         ({"replay_size": 1, "batch_size": 64}, "replay_size=1 holds 6 steps of 8 environments"),
         ({"n_step": 18}, "more than n_step=18 steps"),
-        ({"learning_starts": -1}, "learning_starts=-1: expected at least 0"),
+        ({"learning_starts": -1}, "learning_starts=-1: expected a whole number between 0 and"),
     ],
 )
 def test_sizes_that_do_not_fit_are_refused_with_the_nearest_that_do(settings, message):
@@ -229,7 +232,7 @@ def test_the_clocks_count_environment_steps_and_gradient_steps():
 
 
 @dataclass(frozen=True)
-class Sized(Clock):
+class Sized(Ticker):
     """As large as point_goal1 to a replay."""
 
     obs_size: int = 60
@@ -244,7 +247,7 @@ class Sized(Clock):
 def test_a_million_transitions_of_point_goal1_take_little_room():
     algo, cfg = ALGOS["sac"].make(Sized()), ALGOS["sac"].config(num_envs=1000, replay_size=1_000_000)
     cfg = dataclasses.replace(cfg, batch_size=4000)
-    ts = jax.eval_shape(lambda key: algo.init(key, cfg, FIRST), jax.random.key(0))
+    ts = jax.eval_shape(lambda key: algo.init(key, cfg, START), jax.random.key(0))
     transitions = ts.replay.reward.size
     size = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(ts.replay))
     assert abs(transitions - 1_000_000) <= 16 * 1000
@@ -255,12 +258,12 @@ def test_a_million_transitions_of_point_goal1_take_little_room():
 
 
 def test_the_last_observation_of_an_episode_has_a_row_and_the_next_row_is_a_reset():
-    env = Clock(episode_length=4, lives=(2, 6))  # terminates after 2 to 4 steps, or is out of time
+    env = Ticker(episode_length=4, lives=(2, 6))  # terminates after 2 to 4 steps, or is out of time
     ts = start("sac", env=env, num_envs=5, horizon=40, learn_every=40, replay_ratio=1, batch_size=200,
                replay_size=400, stagger=False)  # fmt: skip
     keys = jax.random.split(jax.random.key(1), 40)
     act = lambda obs, key: jnp.zeros((5, 1))  # noqa: E731
-    _, (rows, steps) = jax.jit(lambda walk: walked(env, act, walk, keys))(ts.walk)
+    _, (rows, steps) = jax.jit(lambda x: collect_records(env, act, x, keys))(ts.stepping)
     name, clock, life = np.moveaxis(np.asarray(rows.obs), -1, 0)
     last = np.asarray(rows.terminated | rows.truncated)
     assert rows.first[0].all() and (np.asarray(rows.first[1:]) == last[:-1]).all()
@@ -276,9 +279,9 @@ def test_the_last_observation_of_an_episode_has_a_row_and_the_next_row_is_a_rese
 
 
 def test_metrics_are_of_the_episodes_that_ended():
-    env = Clock(episode_length=5, lives=(3, 3))
+    env = Ticker(episode_length=5, lives=(3, 3))
     sizes = {"horizon": 16, "learn_every": 16, "stagger": False, "replay_size": 8 * 32}
-    _, m = build("sac", env, **sizes)[1](start("sac", env=env, **sizes), FIRST)
+    _, m = build("sac", env, **sizes)[1](start("sac", env=env, **sizes), START)
     expected = {"episodes": 4 * 8, "return": 3, "cost": 6, "cost_a": 1.5, "cost_b": 4.5, "ticks": 3}
     expected |= {"episode_length": 3, "cost_rate": 2}  # per step: a reset is none
     for name, x in expected.items():
@@ -399,7 +402,7 @@ def test_two_gradient_steps_are_those_of_the_paper():
         hand["target_r"] = {
             k: 0.9 * old["target_r"][k] + 0.1 * hand["critic_r"][k] for k in old["target_r"]
         }
-        fit, metrics = step(fit, Turn(jnp.int32(count - 1), jnp.float32(1), key))
+        fit, metrics = step(fit, GradientStep(jnp.int32(count - 1), jnp.float32(1), key))
         np.testing.assert_allclose(metrics["train/critic_loss"], critic_loss, rtol=1e-5)
         np.testing.assert_allclose(fit.params["log_alpha"], log_alpha, atol=1e-6)
         for name, expected in hand.items():
@@ -424,12 +427,15 @@ def test_a_delayed_policy_and_its_targets_move_at_every_second_step():
         lambda fit, turn: learner.step(fit, batch, turn, cfg, None)[0], compiler_options=FAST
     )
     for count in range(4):
-        before, fit = fit, step(fit, Turn(jnp.int32(count), jnp.float32(1), jax.random.key(count)))
+        before, fit = (
+            fit,
+            step(fit, GradientStep(jnp.int32(count), jnp.float32(1), jax.random.key(count))),
+        )
         due = count % 2 == 1
         for name in ("actor", "target_r", "log_alpha"):
             assert any(differ(before.params[name], fit.params[name])) == due
         assert any(differ(before.params["critic_r"], fit.params["critic_r"]))
-    assert isinstance(fit, Fit)
+    assert isinstance(fit, Trainable)
 
 
 @dataclass(frozen=True)
@@ -488,7 +494,7 @@ def test_without_a_constraint_all_the_reward_is_taken_and_the_cost_paid(name):
     algo, cfg = ALGOS[name].make(Lever()), ALGOS[name].config(**ALGOS[name].lever)
 
     def train(key):
-        ts = algo.init(key, cfg, FIRST)
+        ts = algo.init(key, cfg, START)
         return jax.lax.scan(lambda ts, i: algo.update(ts, Shared(i)), ts, jnp.arange(50))[1]
 
     metrics = jax.jit(jax.vmap(train), compiler_options=FAST)(jax.random.split(jax.random.key(0), 2))
@@ -503,8 +509,8 @@ DEVICES = """
 import sys; sys.path.insert(0, sys.argv[1])
 import jax, jax.numpy as jnp, numpy as np
 from jax.sharding import AxisType, PartitionSpec as P
-from tasks import FAST
-from toys import FIRST, Lever
+from compiling import FAST
+from toys import START, Lever
 from jaxsafe.algos import ALGOS
 from jaxsafe.types import Shared
 
@@ -526,7 +532,7 @@ def training(name, axis_name, num_envs, updates):
         learning_starts=256, discount=0.9, lr=3e-3, critic_lr=3e-3, alpha_init=0.1, alpha_lr=3e-3,
     )
     def train(key):
-        ts = algo.init(key, cfg, FIRST)
+        ts = algo.init(key, cfg, START)
         return jax.lax.scan(lambda ts, i: algo.update(ts, Shared(i)), ts, jnp.arange(updates))
     return train
 

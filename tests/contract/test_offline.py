@@ -6,13 +6,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tasks import FAST
+from compiling import FAST
 from toys import Corridor
 
 from jaxsafe.algos import ALGOS, bc
 from jaxsafe.config import ConfigError
-from jaxsafe.learn.learner import Fit, Turn
-from jaxsafe.learn.offline import DataSet, OfflineConfig, blank, data_of, taken
+from jaxsafe.learn.learner import GradientStep
+from jaxsafe.learn.offline import DataSet, OfflineConfig, batch_at, data_of, data_set_like
+from jaxsafe.learn.steps import Trainable
 from jaxsafe.types import Shared
 
 NAMES = [name for name, row in ALGOS.items() if issubclass(row.config, OfflineConfig)]
@@ -73,13 +74,13 @@ def test_the_data_set_is_one_of_the_environment(name):
     algo, ts = start(name)
     with pytest.raises(ConfigError, match="give dataset=PATH"):
         jax.eval_shape(algo.update, ts, Shared(np.int32(0)))
-    good = blank(Corridor())
+    good = data_set_like(Corridor())
     assert data_of(Shared(0, data=good), Corridor()) is good
     wide = good._replace(action=np.zeros((1, 3), np.float32))
     with pytest.raises(ConfigError, match="actions have 3 numbers, those of the environment 2"):
         data_of(Shared(0, data=wide), Corridor())
     for wrong in ("updates", "batch_size"):
-        with pytest.raises(ConfigError, match=f"{wrong}=0: expected at least 1"):
+        with pytest.raises(ConfigError, match=f"{wrong}=0: expected a whole number between 1 and"):
             algo.clocks(ALGOS[name].config(**{wrong: 0}))
 
 
@@ -98,10 +99,10 @@ def test_a_gradient_step_of_bc_by_hand():
     fit: Any = learner.init(jax.random.key(0), 4, 2, cfg)
     data = linear_data()._replace(action=np.float32(3.0) * linear_data().action)  # clipped to [-1, 1]
     rows = np.array([0, 3, 5])
-    batch = taken(data, jnp.array(rows), cfg, ())
-    turn = Turn(jnp.int32(0), jnp.ones(()), jax.random.key(1))
-    new, metrics = learner.step(fit, batch, turn, cfg, None)
-    assert isinstance(new, Fit)
+    batch = batch_at(data, jnp.array(rows), cfg, ())
+    at = GradientStep(jnp.int32(0), jnp.ones(()), jax.random.key(1))
+    new, metrics = learner.step(fit, batch, at, cfg, None)
+    assert isinstance(new, Trainable)
     (bias, weights), (new_bias, new_weights) = (jax.tree.leaves(f.params["actor"]) for f in (fit, new))
     obs, wanted = data.obs[rows], np.clip(data.action[rows], -1, 1)
     mu = np.tanh(obs @ np.asarray(weights) + np.asarray(bias))

@@ -6,13 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tasks import FAST
-from toys import FIRST, Clock, Recall, updated
+from compiling import FAST
+from toys import START, Recall, Ticker, updated
 
 from jaxsafe.algos import ALGOS
 from jaxsafe.config import ConfigError
-from jaxsafe.learn.acting import Player, begun_anew
-from jaxsafe.nn.networks import net_of, read, remember
+from jaxsafe.learn.acting import Player, reset_carry
+from jaxsafe.nn.networks import apply_to_rollout, net_of, recurrent_step
 from jaxsafe.nn.recurrent import Sequences, unroll
 from jaxsafe.run import evaluate
 
@@ -31,8 +31,8 @@ def trained():
     algo, cfg = learner(**FIRST_ORDER)
 
     def train(key):
-        ts = algo.init(key, cfg, FIRST)
-        return jax.lax.scan(lambda ts, _: algo.update(ts, FIRST), ts, None, 60)[0]
+        ts = algo.init(key, cfg, START)
+        return jax.lax.scan(lambda ts, _: algo.update(ts, START), ts, None, 60)[0]
 
     keys = jax.random.split(jax.random.key(0), 2)
     return algo, jax.jit(jax.vmap(train), compiler_options=FAST)(keys)
@@ -54,13 +54,13 @@ def test_a_player_forgets_at_the_start_of_an_episode(trained):
     answers = [player.act(player.act(player.begin(), first)[1], blank)[0] for first in (left, right)]
     assert answers[0] < 0 < answers[1]
     carry = jnp.stack([player.act(player.begin(), left)[1]] * 2)
-    anew = begun_anew(algo.policy, params, carry, jnp.array([True, False]))
+    anew = reset_carry(algo.policy, params, carry, jnp.array([True, False]))
     assert not anew[0].any() and (anew[1] == carry[1]).all()
 
 
 def test_an_unrolled_network_is_one_step_after_another_with_forgetting():
     algo, cfg = learner()
-    actor = algo.init(jax.random.key(0), cfg, FIRST).params["actor"]
+    actor = algo.init(jax.random.key(0), cfg, START).params["actor"]
     obs = jax.random.normal(jax.random.key(1), (3, 5, 2))  # [B, T, O]
     first = jnp.array([[1, 0, 0, 0, 0], [0, 0, 1, 0, 0], [0, 0, 0, 1, 1]], bool)
     start = jax.random.normal(jax.random.key(2), (3, 16))
@@ -69,7 +69,7 @@ def test_an_unrolled_network_is_one_step_after_another_with_forgetting():
         carry = start[b]
         for t in range(5):
             carry = jnp.where(first[b, t], 0.0, carry)
-            carry, dist, value = remember(actor, carry, obs[b, t], cfg)
+            carry, dist, value = recurrent_step(actor, carry, obs[b, t], cfg)
             np.testing.assert_allclose(h[b, t], carry, rtol=1e-5, atol=1e-6)
             here = jnp.concatenate([dist.mean, value])
             np.testing.assert_allclose(out[b, t], here, rtol=1e-5, atol=1e-6)
@@ -77,12 +77,12 @@ def test_an_unrolled_network_is_one_step_after_another_with_forgetting():
 
 def test_the_value_after_a_step_is_that_of_the_next_unless_the_episode_ended():
     algo, cfg = learner()
-    params = algo.init(jax.random.key(0), cfg, FIRST).params
+    params = algo.init(jax.random.key(0), cfg, START).params
     obs = jax.random.normal(jax.random.key(1), (4, 2, 2))  # [T, N, O]
     last = jax.random.normal(jax.random.key(2), (4, 2, 2))
     first = jnp.zeros((4, 2), bool).at[2, 1].set(True)  # environment 1 ends with its step 1
     next_obs = last.at[:3, 0].set(obs[1:, 0]).at[0, 1].set(obs[1, 1]).at[2, 1].set(obs[3, 1])
-    found = read(params, obs, next_obs, first, jnp.zeros((2, 16)), cfg)
+    found = apply_to_rollout(params, obs, next_obs, first, jnp.zeros((2, 16)), cfg)
     np.testing.assert_allclose(found.next_value[:3, 0], found.value[1:, 0], rtol=1e-5, atol=1e-6)
     for t in (0, 2):
         pair = found.next_value[t, 1], found.value[t + 1, 1]
@@ -91,8 +91,8 @@ def test_the_value_after_a_step_is_that_of_the_next_unless_the_episode_ended():
 
 
 def test_costs_of_several_names_and_a_price_work_with_a_memory():
-    algo, cfg = learner("ppo_lag", Clock(), cost_limits={"a": 1.0, "b": 2.0}, hidden=(8,))
-    ts = algo.init(jax.random.key(0), cfg, FIRST)
+    algo, cfg = learner("ppo_lag", Ticker(), cost_limits={"a": 1.0, "b": 2.0}, hidden=(8,))
+    ts = algo.init(jax.random.key(0), cfg, START)
     after, metrics = jax.jit(updated(algo), compiler_options=FAST)(ts)
     assert after.dual.lam.shape == (2,) and metrics["train/nonfinite"] == 0
     assert after.rollout.carry.shape == (64, 8) and "train/value_loss_c_a" in metrics
@@ -101,7 +101,7 @@ def test_costs_of_several_names_and_a_price_work_with_a_memory():
 def test_what_has_no_recurrent_step_refuses_one_and_minibatches_are_of_environments():
     with pytest.raises(ConfigError, match="trunk=gru: expected separate"):
         algo, cfg = learner("trpo")
-        algo.init(jax.random.key(0), cfg, FIRST)
+        algo.init(jax.random.key(0), cfg, START)
     with pytest.raises(ConfigError, match="expected a divisor of num_envs = 64; the nearest is 4"):
         algo, cfg = learner(minibatches=6)
-        algo.init(jax.random.key(0), cfg, FIRST)
+        algo.init(jax.random.key(0), cfg, START)

@@ -7,8 +7,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from tasks import FAST
-from toys import FIRST, Clock, Lever
+from compiling import FAST
+from toys import START, Lever, Ticker
 
 from jaxsafe.algos import ALGOS
 from jaxsafe.learn.normalise import normalise
@@ -104,14 +104,14 @@ def test_the_joint_objective_by_hand():
 
 
 def test_each_value_on_a_shared_trunk_learns_its_own_cost():
-    algo = ALGOS["ppo_lag"].make(Clock())
+    algo = ALGOS["ppo_lag"].make(Ticker())
     cfg = ALGOS["ppo_lag"].config(
         num_envs=8, horizon=25, minibatches=2, hidden=(8,), trunk="shared", lr=1e-2, target_kl=1.0,
         cost_limits={"b": 1.0, "a": 20.0}, discount=0.0, cost_discount=0.0,
     )  # fmt: skip
 
     def train(key):
-        return jax.lax.scan(lambda ts, _: algo.update(ts, FIRST), algo.init(key, cfg, FIRST), None, 20)
+        return jax.lax.scan(lambda ts, _: algo.update(ts, START), algo.init(key, cfg, START), None, 20)
 
     seeds = jax.random.split(jax.random.key(0), 2)
     ts, metrics = jax.jit(jax.vmap(train), compiler_options=FAST)(seeds)
@@ -134,7 +134,7 @@ def test_a_policy_on_a_shared_trunk_learns_what_the_limit_allows():
 
     def train(key):
         return jax.lax.scan(
-            lambda ts, _: algo.update(ts, FIRST), algo.init(key, cfg, FIRST), None, 100
+            lambda ts, _: algo.update(ts, START), algo.init(key, cfg, START), None, 100
         )[1]
 
     metrics = jax.jit(jax.vmap(train), compiler_options=FAST)(jax.random.split(jax.random.key(0), 2))

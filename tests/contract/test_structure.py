@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 from learners import TINY, begin, by_adam, covering, every_option, on_policy_names, options_of
-from toys import FIRST, Clock, Corridor
+from toys import START, Corridor, Ticker
 
 from jaxsafe.algos import ALGOS
 from jaxsafe.config import ConfigError
@@ -17,8 +17,8 @@ NAMES = on_policy_names()
 def shapes(name, env: Any = Corridor(), **options):  # noqa: B008
     """The train state before and after an update, and its metrics, as shapes."""
     algo, cfg = ALGOS[name].make(env), ALGOS[name].config(**TINY | options)
-    before = jax.eval_shape(lambda: algo.init(jax.random.key(0), cfg, FIRST))
-    return before, *jax.eval_shape(algo.update, before, FIRST)
+    before = jax.eval_shape(lambda: algo.init(jax.random.key(0), cfg, START))
+    return before, *jax.eval_shape(algo.update, before, START)
 
 
 def kinds(tree):
@@ -43,11 +43,14 @@ def test_an_update_with_every_option_at_once_keeps_the_structure(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_algorithms_by_adam_share_a_trunk_and_the_others_say_that_they_do_not(name):
+    algo, cfg = ALGOS[name].make(Ticker()), ALGOS[name].config(**TINY, trunk="shared")
     if not by_adam(name):
-        with pytest.raises(ConfigError, match="trunk=shared: expected separate"):
-            shapes(name, Clock(), trunk="shared")
+        for build in (algo.clocks, lambda cfg: algo.init(jax.random.key(0), cfg, START)):
+            with pytest.raises(ConfigError, match="trunk=shared: expected separate"):
+                build(cfg)
         return
-    before, after, metrics = shapes(name, Clock(), trunk="shared")
+    assert algo.clocks(cfg).updates == cfg.POLICY_STEPS * cfg.epochs * cfg.minibatches
+    before, after, metrics = shapes(name, Ticker(), trunk="shared")
     assert jax.tree.structure(before) == jax.tree.structure(after)
     assert [*before.params] == ["actor"] and before.opt_state["critics"] == ()
     assert before.params["actor"]["mean"]["params"]["Dense_1"]["bias"].shape == (1 + 2,)
@@ -59,7 +62,7 @@ def test_published_settings_build(name):
     algo = ALGOS[name].make(Corridor())
     for settings in ALGOS[name].published.values():
         cfg = ALGOS[name].config(**settings)
-        jax.eval_shape(lambda cfg=cfg: algo.init(jax.random.key(0), cfg, FIRST))
+        jax.eval_shape(lambda cfg=cfg: algo.init(jax.random.key(0), cfg, START))
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from learners import begin, covering, every_option, learner, members, numbers, others_slowly, row
+from learners import begin, compiled, covering, every_option, member, members, numbers, others_slowly
 
 from jaxsafe.types import Metrics, PyTree
 
@@ -25,7 +25,7 @@ class Update(NamedTuple):
 @cache
 def first_update(name: str) -> Update:
     before = members(name, [0, 1, 2], **LIMITS)
-    return Update(before, *learner(name).together(before))
+    return Update(before, *compiled(name).together(before))
 
 
 def same(a: Any, b: Any) -> None:
@@ -34,13 +34,19 @@ def same(a: Any, b: Any) -> None:
 
 
 def broken(ts: PyTree, *where: int) -> PyTree:
-    """`ts` with a state that is not finite in one environment: of a lone member, or of member i."""
+    """`ts` with a world that is not finite: of a lone member, or of member i."""
     state = ts.rollout.state
     at = (*where, 0)
     state = dataclasses.replace(
         state, physics=state.physics.at[at].set(jnp.nan), obs=state.obs.at[at].set(jnp.nan)
     )
     return dataclasses.replace(ts, rollout=dataclasses.replace(ts.rollout, state=state))
+
+
+def senseless(ts: PyTree, *where: int) -> PyTree:
+    """`ts` whose advantages will not be finite: of a lone member, or of member i."""
+    discounts = {k: getattr(ts.config, k).at[where].set(jnp.nan) for k in ("discount", "cost_discount")}
+    return dataclasses.replace(ts, config=dataclasses.replace(ts.config, **discounts))
 
 
 @pytest.mark.parametrize("name", COMPILED)
@@ -56,25 +62,41 @@ def test_an_update_moves_every_parameter_and_stays_finite(name):
 
 @pytest.mark.parametrize("name", COMPILED)
 def test_the_same_key_gives_the_same_run(name):
-    same(first_update(name)[1:], learner(name).together(members(name, [0, 1, 2], **LIMITS)))
+    same(first_update(name)[1:], compiled(name).together(members(name, [0, 1, 2], **LIMITS)))
 
 
 @pytest.mark.parametrize("name", COMPILED)
 def test_a_batch_that_is_not_finite_changes_nothing_that_is_learned_and_is_counted(name):
     ts = first_update(name).after
-    whole, _ = learner(name).together(ts)
-    after, metrics = learner(name).together(broken(ts, 1))
+    whole, _ = compiled(name).together(ts)
+    after, metrics = compiled(name).together(senseless(ts, 1))
     assert metrics["train/nonfinite"][1] > 0
     for field in ("params", "dual", "normaliser", "episode_length"):
-        same(row(getattr(ts, field), 1), row(getattr(after, field), 1))
+        same(member(getattr(ts, field), 1), member(getattr(after, field), 1))
     for other in (0, 2):  # the members beside it learn on
         assert metrics["train/nonfinite"][other] == 0
-        same(row(whole, other), row(after, other))
+        same(member(whole, other), member(after, other))
+
+
+@pytest.mark.parametrize("name", COMPILED)
+def test_a_world_that_is_not_finite_is_reset_and_counted_and_the_others_are_learned_from(name):
+    ts = first_update(name).after
+    whole, _ = compiled(name).together(ts)
+    after, metrics = compiled(name).together(broken(ts, 1))
+    assert metrics["train/nonfinite"].tolist() == [0, 0, 0]
+    assert metrics["train/bad_worlds"].tolist() == metrics["train/bad_obs"].tolist() == [0, 1, 0]
+    learned = [member(getattr(after, k), 1) for k in ("params", "dual", "normaliser", "episode_length")]
+    assert all(np.isfinite(x).all() for x in numbers(learned))
+    assert all(np.isfinite(x).all() for x in numbers(after.rollout.state))
+    old, new = (jax.tree.leaves(member(x.params, 1)) for x in (ts, after))
+    assert all((a != b).any() for a, b in zip(old, new, strict=True))
+    for other in (0, 2):
+        same(member(whole, other), member(after, other))
 
 
 @pytest.mark.parametrize("name", COMPILED)
 def test_acting_normalises_and_is_the_mean_without_a_key(name):
-    algo, ts = learner(name).algo, row(first_update(name).after, 0)
+    algo, ts = compiled(name).algo, member(first_update(name).after, 0)
     size = ts.rollout.state.obs.shape[-1]  # with what an augmentation appends
     obs = jax.random.normal(jax.random.key(1), (500, size))
 
@@ -95,7 +117,7 @@ def test_acting_normalises_and_is_the_mean_without_a_key(name):
 def test_an_entropy_bonus_raises_the_entropy_and_a_malus_lowers_it(name):
     coefs = jnp.array([-100.0, 0.0, 100.0])
     ts = members(name, [0, 0, 0], cost_limit=jnp.full(3, 25.0), entropy_coef=coefs)
-    low, none, high = map(float, learner(name).together(ts)[1]["train/entropy"])
+    low, none, high = map(float, compiled(name).together(ts)[1]["train/entropy"])
     assert low < none - 1e-3 < none + 1e-3 < high  # by steps of 3e-4, or within 0.02 nats
 
 
@@ -105,11 +127,11 @@ ESTIMATORS = {"cpo": "plain", "focops": "vtrace", "ppo_saute": "gae_rtg"}
 @pytest.mark.parametrize("name", others_slowly([*ESTIMATORS]))
 def test_two_updates_with_every_option_at_once_are_finite(name):
     ts = begin(name, **every_option(name, ESTIMATORS.get(name, "vtrace")))
-    ts, _ = learner(name).update(ts)
-    ts, metrics = learner(name).update(ts)
+    ts, _ = compiled(name).update(ts)
+    ts, metrics = compiled(name).update(ts)
     assert all(jnp.isfinite(x).all() for x in jax.tree.leaves((ts.params, ts.signals, metrics)))
     assert metrics["train/nonfinite"] == 0 and ts.signals.count == 2 * 8 * 25
-    after, metrics = learner(name).update(broken(ts))  # leaves the statistics of rewards alone, too
+    after, metrics = compiled(name).update(senseless(ts))  # leaves the statistics of rewards alone, too
     assert metrics["train/nonfinite"] > 0
     same(ts.signals, after.signals)
 

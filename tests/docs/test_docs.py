@@ -48,49 +48,42 @@ def test_the_python_of_a_page_runs(page, capsys):
     assert capsys.readouterr().out
 
 
-def test_the_list_of_pages_has_every_page_once():
-    found = [page for entry in hooks.listed(DOCS) for names in entry.values() for page in
-             ([names] if isinstance(names, str) else names)]  # fmt: skip
+def test_the_menu_has_every_page_once_by_a_short_title():
+    entries = [entry for section in hooks.listed(DOCS) for pages in section.values() for entry in pages]
+    found = [page for entry in entries for page in entry.values()]
     assert sorted(found) == sorted(str(page.relative_to(DOCS)) for page in PAGES)
+    titles = [title for entry in entries for title in entry]
+    assert max(map(len, titles)) <= 40 and "CPO" in titles
 
 
-def test_pages_take_in_the_readme_and_show_a_link_on_github():
-    marks = [mark for page in PAGES for mark in hooks.MARK.finditer(page.read_text())]
-    assert len(marks) >= 7
-    assert all(re.match(r"\[.*\]\((\.\./)+README\.md(#[\w-]+)?\) <!--", mark[0]) for mark in marks)
-    for page in PAGES:
-        text = hooks.composed(page.read_text(), f"docs/{page.relative_to(DOCS)}", DOCS)
-        assert "<!-- readme:" not in text
-    sweep = hooks.composed((DOCS / "howto/sweep.md").read_text(), "docs/howto/sweep.md", DOCS)
-    assert "python scripts/sweep.py --summary SWEEP" in sweep and "## Environments" not in sweep
-    own = hooks.composed(
-        (DOCS / "howto/own_algorithm.md").read_text(), "docs/howto/own_algorithm.md", DOCS
-    )
-    assert "class PenaltyConfig(PPOConfig):" in own and "cost_limits" not in own
-    with pytest.raises(KeyError, match="Sweeep"):
-        hooks.section("# a\n\ntext\n\n## Sweep\n", "Sweeep")
+def test_the_site_loads_nothing_from_elsewhere():
+    named = re.findall(r"assets/[\w./]+", (ROOT / "mkdocs.yml").read_text())
+    assert "assets/katex/katex.min.js" in named and all((DOCS / name).exists() for name in named)
+    style = (DOCS / "assets/katex/katex.min.css").read_text()
+    fonts = re.findall(r"url\(([^)]+)\)", style)
+    assert fonts and all((DOCS / "assets/katex" / font).exists() for font in fonts)
+    assert (DOCS / "assets/katex/LICENSE").exists()
 
 
 @pytest.mark.parametrize(
     "link, expected",
     [
-        ("[a](docs/fidelity.md)", "[a](../fidelity.md)"),
-        ("[a](docs/results/README.md#x)", "[a](../results/README.md#x)"),
-        ("[a](docs/results)", "[a](../results/README.md)"),
-        ("[a](envs/safety_gym/suite.py)", "[a](../source/envs/safety_gym/suite.py.txt)"),
-        ("[a](scripts)", "[a](../source/scripts.txt)"),
-        ("[a](docs/pages.py)", "[a](../source/docs/pages.py.txt)"),
-        ('<img src="docs/images/car_push2.png" width="270">',
+        ("[a](../fidelity.md)", "[a](../fidelity.md)"),
+        ("[a](../results/README.md#x)", "[a](../results/README.md#x)"),
+        ("[a](../results)", "[a](../results/README.md)"),
+        ("[a](../../envs/safety_gym/suite.py)", "[a](../source/envs/safety_gym/suite.py.txt)"),
+        ("[a](../../scripts)", "[a](../source/scripts.txt)"),
+        ("[a](../pages.py)", "[a](../source/docs/pages.py.txt)"),
+        ('<img src="../images/car_push2.png" width="270">',
          '<img src="../images/car_push2.png" width="270">'),
-        ("[a](#sweep)", "[a](sweep.md)"),
-        ("[a](#several-gpus-and-hosts)", "[a](#several-gpus-and-hosts)"),
-        ("[a](#contributing-citing)", "[a](../source/README.md.txt)"),
+        ("[a](#sweep)", "[a](#sweep)"),
         ("[a](https://example.org/x)", "[a](https://example.org/x)"),
-        ("```text\n[a](envs/safety_gym/suite.py)\n```", "```text\n[a](envs/safety_gym/suite.py)\n```"),
+        ("```text\n[a](../../envs/safety_gym/suite.py)\n```",
+         "```text\n[a](../../envs/safety_gym/suite.py)\n```"),
     ],
 )  # fmt: skip
-def test_links_of_the_readme_work_on_a_page(link, expected):
-    assert hooks.relinked(link, "README.md", "docs/howto/several_gpus.md", DOCS) == expected
+def test_links_to_files_beside_the_site_lead_to_copies_of_them(link, expected):
+    assert hooks.relinked(link, "docs/howto/several_gpus.md") == expected
 
 
 def test_a_table_replaces_what_stands_between_its_marks_alone():
@@ -104,7 +97,7 @@ def test_a_table_replaces_what_stands_between_its_marks_alone():
 
 def test_files_that_pages_link_to_are_there():
     found = hooks.sources(DOCS)
-    assert {"algos/cpo.py", "CONTRIBUTING.md"} - found == {"CONTRIBUTING.md"}
+    assert {"algos/cpo.py", "CONTRIBUTING.md"} <= found
     assert all((ROOT / path).exists() for path in found)
 
 

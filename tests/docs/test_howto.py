@@ -96,6 +96,8 @@ def test_the_commands_of_a_page_run(page):
 @pytest.mark.slow  # needs playground
 @pytest.mark.parametrize("page", PAGES, indirect=True, ids=named)
 def test_the_python_that_takes_minutes_runs_too(page):
+    if "mujoco_playground" in page.read_text():
+        pytest.importorskip("mujoco_playground")
     names: dict = {}
     for slow, kind, text in blocks(page):
         if kind == "python" and not FILE.match(text):

@@ -24,7 +24,7 @@ def test_the_pages_of_algorithms_and_environments_are_those_of_the_code():
         assert path.read_text() == text, f"{path.name}: run python docs/pages.py"
 
 
-def test_the_tables_of_the_readme_and_the_docs_are_those_of_the_code():
+def test_the_tables_of_the_docs_are_those_of_the_code():
     tables = script("tables")
     for path, made in tables.TABLES.items():
         assert path.read_text().count("<!-- table:") == len(made)
@@ -48,3 +48,8 @@ def test_every_link_of_the_readme_leads_somewhere():
     for path in re.findall(r"\]\(([^)#]+)\)|src=\"([^\"]+)\"", (ROOT / "README.md").read_text()):
         target = "".join(path)
         assert target.startswith("https://") or (ROOT / target).exists(), target
+
+
+def test_the_readme_is_one_screen_with_a_small_moving_picture():
+    assert len((ROOT / "README.md").read_text()) < 5_000
+    assert (ROOT / "docs/images/policy.gif").stat().st_size < 2_000_000

@@ -9,14 +9,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import FAST
 from scipy.stats import chisquare, ks_2samp, kstest
-from tasks import FAST, HERE, change, moved, put, task
+from tasks import ROBOT_AT_ORIGIN, change, put, task, with_qpos
 
 from jaxsafe import envs
 from jaxsafe.config import ConfigError
 from jaxsafe.envs.safety_gym import layout as layouts
 from jaxsafe.envs.safety_gym.arena import World
-from jaxsafe.envs.safety_gym.config import defaults, read
+from jaxsafe.envs.safety_gym.config import config_from_plain, defaults
 
 DATA = Path(__file__).parent.parent / "data"
 RECORDED = ("point_goal2", "car_push2", "doggo_button2")
@@ -196,7 +197,7 @@ def test_placements_are_chosen_by_their_shrunken_areas():
         ({"hazards_placements": ((0.0, 0.0, 0.36, 1.0),)}, "no room for hazards"),
         ({"placements_extents": (1.0, -1.0, -1.0, 1.0)}, "min < max"),
         ({"vases_placements": ((0.0, 1.0, 1.0, 1.0),)}, "min < max"),
-        ({"hazards_num": -1}, "expected 0 or more"),
+        ({"hazards_num": -1}, "expected a whole number between 0 and 200"),
     ],
 )
 def test_a_layout_without_room_is_refused_when_made(options, says):
@@ -207,7 +208,7 @@ def test_a_layout_without_room_is_refused_when_made(options, says):
 SAME_PLACE = {"hazards_num": 2, "hazards_locations": ((0.0, 0.0), (0.0, 0.0))}
 
 
-@pytest.mark.parametrize("options", [SAME_PLACE, {"hazards_num": 100}])
+@pytest.mark.parametrize("options", [SAME_PLACE, {"hazards_num": 65}])
 def test_a_layout_that_nobody_finds_is_refused_when_made(options):
     start = time.process_time()
     with pytest.raises(ConfigError, match=r"env: no valid layout in 10,000 tries: fewer or smaller"):
@@ -217,7 +218,7 @@ def test_a_layout_that_nobody_finds_is_refused_when_made(options):
 
 def test_a_config_without_a_layout_is_refused_when_made():
     with pytest.raises(ConfigError, match="no valid layout"):
-        envs.make(read(defaults(**envs.ENVS["point_goal1"]) | SAME_PLACE), engine="c")
+        envs.make(config_from_plain(defaults(**envs.ENVS["point_goal1"]) | SAME_PLACE), engine="c")
 
 
 def test_only_changed_options_are_tried(monkeypatch):
@@ -227,7 +228,7 @@ def test_only_changed_options_are_tried(monkeypatch):
 
 @pytest.mark.parametrize("name", sorted(n for n in envs.ENVS if n.startswith("car")))
 def test_every_registered_layout_is_found(name):
-    assert layouts.feasible(layouts.placement(read(defaults(**envs.ENVS[name]))))
+    assert layouts.feasible(layouts.placement(config_from_plain(defaults(**envs.ENVS[name]))))
 
 
 @pytest.mark.parametrize("lanes", [1, 8])
@@ -260,7 +261,7 @@ def test_a_layout_is_found_exactly_where_there_is_room():
     line = {"hazards_num": 2, "hazards_locations": ((0.6, 0.0), (1.4, 0.0)), "hazards_keepout": 0.4}
     line |= {"robot_locations": ((-1.0, 0.0),), "task": "none"}
     for margin, room in ((-0.01, True), (0.01, False)):
-        place = layouts.placement(read(defaults(**line, placements_margin=margin)))
+        place = layouts.placement(config_from_plain(defaults(**line, placements_margin=margin)))
         assert layouts.feasible(place) == room
         assert layouts.sample_layout(place, jax.random.key(0))[1] == room
 
@@ -268,9 +269,9 @@ def test_a_layout_is_found_exactly_where_there_is_room():
 def test_a_new_goal_is_clear_of_where_things_are_now():
     """Goal keepout 0.305: 0.705 m from the robot (0.4), 0.455 m from a vase (0.15), as they are."""
     t = task("point_goal1")
-    begun = moved(t.begin(256), slice(0, 2), [0.2, -0.3])
+    begun = with_qpos(t.begin(256), slice(0, 2), [0.2, -0.3])
     vase = t.env.scene.qpos_slice("vases").start
-    begun = moved(begun, slice(vase, vase + 2), [-0.6, 0.4])
+    begun = with_qpos(begun, slice(vase, vase + 2), [-0.6, 0.4])
     state = t.idle(put(t, begun, "goal", [0.25, -0.3]))
     assert state.info["goal_met"].all() and not state.terminated.any()
     xy = np.asarray(state.physics.layout)
@@ -282,10 +283,10 @@ def test_a_new_goal_is_clear_of_where_things_are_now():
 
 
 def test_a_goal_without_room_ends_the_episode_or_stays():
-    crowd = {"goal_locations": ((0.6, 0.0),), **HERE, "robot_keepout": 0.2}
+    crowd = {"goal_locations": ((0.6, 0.0),), **ROBOT_AT_ORIGIN, "robot_keepout": 0.2}
     for ends in (True, False):
         t = task("point_goal0", **crowd, terminate_resample_failure=ends)
-        state = moved(t.begin(), slice(0, 2), [0.55, 0.0])
+        state = with_qpos(t.begin(), slice(0, 2), [0.55, 0.0])
         after = t.idle(state)
         np.testing.assert_array_equal(after.info["goal_met"], 1)
         np.testing.assert_array_equal(after.terminated, ends)

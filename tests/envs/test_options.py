@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from tasks import FAST, HERE, change, task
+from compiling import FAST
+from tasks import ROBOT_AT_ORIGIN, change, task
 
 from jaxsafe import envs
 from jaxsafe.config import ConfigError
@@ -20,7 +21,7 @@ native: Any = mujoco  # its functions are not known to type checkers
 
 # Point at the origin in a goal and a hazard, touching a vase, a pillar, a gremlin and a button.
 AMID: dict[str, Any] = {
-    **HERE,
+    **ROBOT_AT_ORIGIN,
     "goal_locations": ((0.1, 0.0),),
     **{f"constrain_{k}": True for k in ("hazards", "vases", "pillars", "gremlins", "buttons")},
     **{f"{k}_keepout": 0.0 for k in ("goal", "hazards", "vases", "pillars", "gremlins", "buttons")},
@@ -40,7 +41,12 @@ BASES: dict[str, tuple[str, dict[str, Any]]] = {
     "button": ("point_button0", {}),
     "pressed": (
         "point_button0",
-        {**HERE, "buttons_num": 1, "buttons_locations": ((0.19, 0.0),), "buttons_keepout": 0.0},
+        {
+            **ROBOT_AT_ORIGIN,
+            "buttons_num": 1,
+            "buttons_locations": ((0.19, 0.0),),
+            "buttons_keepout": 0.0,
+        },
     ),
     "run": ("point_run", {}),
     "rise": ("doggo_run", {"task": "z"}),
@@ -282,16 +288,16 @@ def test_all_of_amid_costs():
         ({"observe_freejoint": True}, "no free joint"),
         ({"observe_vision": True}, "vision is not available"),
         ({"reward_orientation": True, "reward_orientation_body": "robt"}, "did you mean 'robot'"),
-        ({"frameskip_binom_p": 1.5}, "expected 0 to 1"),
-        ({"frameskip_binom_n": 0}, "expected at least 1"),
-        ({"num_steps": 0}, "expected at least 1"),
-        ({"action_noise": -1.0}, "expected 0 or more"),
-        ({"goal_size": 0.0}, "env.goal_size=0.0: expected above 0"),
-        ({"lidar_max_dist": 0.0}, "expected above 0, or null"),
+        ({"frameskip_binom_p": 1.5}, "expected a number between 0 and 1"),
+        ({"frameskip_binom_n": 0}, "expected a whole number between 1 and"),
+        ({"num_steps": 0}, "expected a whole number between 1 and"),
+        ({"action_noise": -1.0}, "expected a number between 0 and"),
+        ({"goal_size": 0.0}, "env.goal_size=0.0: expected a number between 0.0001 and"),
+        ({"lidar_max_dist": 0.0}, "expected a number between 0.0001 and"),
         ({"task": "button"}, "needs at least 1"),
         ({"task": "x"}, "no goal to observe"),
         ({"engine": "jacks"}, "env.engine='jacks'; did you mean 'jax'"),
-        ({"engine": 3}, "env.engine=3: expected a string"),
+        ({"engine": 3}, "env.engine=3; valid: auto, c, jax, warp"),
     ],
     ids=lambda x: None if isinstance(x, str) else ",".join(f"{k}={v}" for k, v in x.items()),
 )

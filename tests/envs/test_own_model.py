@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from tasks import FAST
+from compiling import FAST
 
 import jaxsafe
 from jaxsafe.config import ConfigError

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tasks import HERE, change, moved, put, task
+from tasks import ROBOT_AT_ORIGIN, change, put, task, with_qpos
 
 from jaxsafe.envs import make
 from jaxsafe.envs.safety_gym import sensing
@@ -82,8 +82,8 @@ def test_a_box_at_rest_has_to_come_closer_than_the_goal_is_wide():
     rows = t.env.scene.qpos_slice("box").start
     distance = jnp.array([0.3, 0.2980, 0.2966, 0.1])
     box = jnp.stack([-0.3 + distance, jnp.full(4, -0.3)], 1)
-    state = moved(t.begin(), slice(rows, rows + 2), box)
-    state = moved(state, slice(rows + 3, rows + 7), [1.0, 0, 0, 0])
+    state = with_qpos(t.begin(), slice(rows, rows + 2), box)
+    state = with_qpos(state, slice(rows + 3, rows + 7), [1.0, 0, 0, 0])
     np.testing.assert_array_equal(t.idle(state).info["goal_met"], [0, 0, 1, 1])
 
 
@@ -107,7 +107,7 @@ def test_after_a_success_progress_counts_from_the_new_goal():
 
 
 BUTTONS = {
-    **HERE,
+    **ROBOT_AT_ORIGIN,
     **BARE,
     "buttons_num": 2,
     "buttons_keepout": 0.0,
@@ -118,7 +118,7 @@ BUTTONS = {
 def pressing(t, state, button):
     """The robot, at rest, against a button."""
     x = jnp.array([0.41, -0.41])[button]  # sphere of 0.1 m against one of 0.1 m at 0.6
-    state = moved(state, slice(0, 3), jnp.stack([x, 0 * x, 0 * x], 1))
+    state = with_qpos(state, slice(0, 3), jnp.stack([x, 0 * x, 0 * x], 1))
     return change(state, {"qvel": jnp.zeros_like(state.physics.physics.qvel)})
 
 
@@ -157,7 +157,7 @@ def test_the_button_may_be_drawn_again_and_scores_again_at_once():
 
 
 def test_hazards_cost_their_depth_and_the_rim_is_free():
-    t = task("point_goal1", **HERE, vases_num=0, hazards_num=2, constrain_indicator=False)
+    t = task("point_goal1", **ROBOT_AT_ORIGIN, vases_num=0, hazards_num=2, constrain_indicator=False)
     state = put(t, t.begin(), "hazard0", [[0.2, 0.0], [0.15, 0.0], [0.0, 0.05], [0.21, 0.0]])
     state = put(t, state, "hazard1", [[9.0, 0.0], [0.0, -0.1], [9.0, 0.0], [0.0, 0.2]])
     np.testing.assert_allclose(t.idle(state).cost, [0, 0.05 + 0.1, 0.15, 0], atol=1e-6)
@@ -165,11 +165,11 @@ def test_hazards_cost_their_depth_and_the_rim_is_free():
 
 
 def test_every_cost_and_their_sum_are_indicators():
-    t = task("point_goal2", **HERE, hazards_num=2, vases_num=2, hazards_cost=7.0)
+    t = task("point_goal2", **ROBOT_AT_ORIGIN, hazards_num=2, vases_num=2, hazards_cost=7.0)
     state = put(t, t.begin(), "hazard0", [0.01, 0.0])
     state = put(t, state, "hazard1", [0.0, 0.02])
     vases = t.env.scene.qpos_slice("vases").start
-    state = moved(state, slice(vases, vases + 2), [0.19, 0.0])
+    state = with_qpos(state, slice(vases, vases + 2), [0.19, 0.0])
     after = t.idle(state)
     np.testing.assert_array_equal(after.costs[:, t.env.cost_names.index("hazards")], 1)
     np.testing.assert_array_equal(after.costs[:, t.env.cost_names.index("vases_contact")], 1)
@@ -177,10 +177,10 @@ def test_every_cost_and_their_sum_are_indicators():
 
 
 def test_a_vase_costs_while_it_slides_untouched():
-    t = task("point_goal2", **HERE, hazards_num=0, vases_num=1)
+    t = task("point_goal2", **ROBOT_AT_ORIGIN, hazards_num=0, vases_num=1)
     rows = t.env.scene.qvel_slice("vases").start
     vase = t.env.scene.qpos_slice("vases").start
-    state = moved(t.begin(), slice(vase, vase + 2), [1.5, 1.5])
+    state = with_qpos(t.begin(), slice(vase, vase + 2), [1.5, 1.5])
     qvel = state.physics.physics.qvel.at[:, rows].set(jnp.array([0.0, 0.5, 1.0, 2.0]))
     after = t.idle(change(state, {"qvel": qvel}))
     np.testing.assert_array_equal(after.costs[:, t.env.cost_names.index("vases_contact")], 0)
@@ -191,9 +191,9 @@ def test_a_vase_costs_while_it_slides_untouched():
 
 
 def test_the_vase_of_level_one_is_free():
-    t = task("point_goal1", **HERE, hazards_num=0)
+    t = task("point_goal1", **ROBOT_AT_ORIGIN, hazards_num=0)
     vase = t.env.scene.qpos_slice("vases").start
-    before = moved(t.begin(), slice(vase, vase + 2), [0.19, 0.0])
+    before = with_qpos(t.begin(), slice(vase, vase + 2), [0.19, 0.0])
     after = t.step(before, jnp.ones((4, 2)))
     assert (np.abs(after.physics.physics.qpos[:, vase] - 0.19) > 1e-3).all()
     np.testing.assert_array_equal(after.cost, 0)
@@ -201,7 +201,7 @@ def test_the_vase_of_level_one_is_free():
 
 def test_nothing_keeps_a_robot_inside():
     t = task("point_goal0", robot_rot=0.0)
-    state = moved(t.begin(), slice(0, 1), [1.0])
+    state = with_qpos(t.begin(), slice(0, 1), [1.0])
     for _ in range(60):
         state = t.step(state, jnp.array([[1.0, 0.0]] * 4))
     assert (state.physics.physics.qpos[:, 0] > 1.2).all()
@@ -279,7 +279,7 @@ def test_a_compass_is_a_little_shorter_than_one():
 def test_natural_lidar_measures_to_the_surface_and_never_sees_the_circle():
     """A pillar of radius 0.2 at 1 m reads exp(-0.8); group 6, the circle's, is not a MuJoCo group."""
     options = {
-        **HERE,
+        **ROBOT_AT_ORIGIN,
         **BARE,
         "pillars_num": 1,
         "pillars_locations": ((1.0, 0.0),),
@@ -302,7 +302,7 @@ def test_circle_pays_for_speed_along_the_circle():
     """0.1 (v x - u y) / r / (1 + |r - 1.5|), with x, y and r of the centre of mass."""
     t = task("point_circle", robot_rot=0.0)
     model = t.env.scene.model
-    state = moved(t.begin(), slice(0, 3), [1.0, 0.0, 0.0])
+    state = with_qpos(t.begin(), slice(0, 3), [1.0, 0.0, 0.0])
     state = change(state, {"qvel": jnp.array([[0.3, 0.4, 0.0]] * 4)})
     after = t.idle(state)
     qpos, qvel = (

@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from toys import reflex
 
 from jaxsafe import envs
 from jaxsafe.config import ConfigError
 from jaxsafe.envs.view import render
-from jaxsafe.learn.acting import reflex
 
 WIDTH, HEIGHT = 320, 240
 

@@ -6,14 +6,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tasks import HERE, change, task
+from tasks import ROBOT_AT_ORIGIN, change, task
 
 from jaxsafe import envs
 from jaxsafe.config import ConfigError
 
 THEIRS: dict[str, Any] = {"rules": "safety_gymnasium"}
 TOUCHED: dict[str, Any] = {  # Point at the origin, which touches button 0
-    **HERE,
+    **ROBOT_AT_ORIGIN,
     "constrain_buttons": True,
     "buttons_num": 2,
     "buttons_keepout": 0.0,

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tasks import HERE, Task, change, moved, task
+from tasks import ROBOT_AT_ORIGIN, Task, change, task, with_qpos
 
 from jaxsafe import envs
 from jaxsafe.config import ConfigError
@@ -39,12 +39,12 @@ def beside_the_robot(t: Task, vase: int):
     places[vase] = [0.25, 0.0]
     for i, xy in enumerate(places):
         start = t.env.scene.qpos_slice("vases").start + 7 * i
-        state = moved(state, slice(start, start + 2), jnp.tile(jnp.asarray(xy), (4, 1)))
+        state = with_qpos(state, slice(start, start + 2), jnp.tile(jnp.asarray(xy), (4, 1)))
     return state
 
 
 def test_a_vase_that_is_hit_wakes_and_costs():
-    options = HERE | {"vases_num": 6, "hazards_num": 0, "constrain_vases": True}
+    options = ROBOT_AT_ORIGIN | {"vases_num": 6, "hazards_num": 0, "constrain_vases": True}
     some, everyone = (task("point_goal1", awake=k, **options) for k in (2, None))
     a, b = beside_the_robot(some, 4), beside_the_robot(everyone, 4)
     ahead = jnp.tile(jnp.array([1.0, 0.0]), (4, 1))
@@ -58,7 +58,7 @@ def test_a_vase_that_is_hit_wakes_and_costs():
 
 
 def test_a_moving_vase_stays_awake_and_the_others_rest():
-    t = task("point_goal1", awake=2, **(HERE | {"vases_num": 6, "hazards_num": 0}))
+    t = task("point_goal1", awake=2, **(ROBOT_AT_ORIGIN | {"vases_num": 6, "hazards_num": 0}))
     state = beside_the_robot(t, 4)
     first = t.env.scene.qvel_slice("vases").start
     qvel = state.physics.physics.qvel.at[:, first].set(1.0)  # vase 0, the farthest, slides along x
@@ -74,7 +74,7 @@ def test_a_moving_vase_stays_awake_and_the_others_rest():
 
 
 def test_a_vase_whose_speed_is_charged_stays_awake():
-    options = HERE | {"vases_num": 6, "hazards_num": 0, "vases_velocity_threshold": 1e-5}
+    options = ROBOT_AT_ORIGIN | {"vases_num": 6, "hazards_num": 0, "vases_velocity_threshold": 1e-5}
     t = task("point_goal1", awake=2, **options)
     state = beside_the_robot(t, 4)
     at = t.env.scene.qvel_slice("vases").start + 12  # vase 2
@@ -84,7 +84,7 @@ def test_a_vase_whose_speed_is_charged_stays_awake():
 
 
 def test_of_too_many_moving_vases_the_nearest_stay_awake():
-    t = task("point_goal1", awake=2, **(HERE | {"vases_num": 6, "hazards_num": 0}))
+    t = task("point_goal1", awake=2, **(ROBOT_AT_ORIGIN | {"vases_num": 6, "hazards_num": 0}))
     state = beside_the_robot(t, 4)
     speeds = state.physics.physics.qvel.at[:, t.env.scene.qvel_slice("vases")].set(0.5)
     physics = jax.tree.map(lambda x: x[0], change(state, {"qvel": speeds}).physics.physics)
@@ -94,7 +94,7 @@ def test_of_too_many_moving_vases_the_nearest_stay_awake():
 
 
 def test_a_gremlin_alone_goes_where_mujoco_takes_it():
-    options = HERE | {"gremlins_num": 3, "hazards_num": 0, "vases_num": 0}
+    options = ROBOT_AT_ORIGIN | {"gremlins_num": 3, "hazards_num": 0, "vases_num": 0}
     some, everyone = (task("point_goal1", awake=k, **options) for k in (1, None))
     a, b = some.begin(), everyone.begin()
     for _ in range(70):
@@ -116,7 +116,7 @@ def test_how_many_are_awake_by_default():
 
 
 def test_settings_that_need_everyone_are_refused():
-    with pytest.raises(ConfigError, match=r"env.awake=0: expected at least 1, or null"):
+    with pytest.raises(ConfigError, match=r"env.awake=0: expected a whole number between 1 and"):
         envs.make("point_goal2", engine="c", awake=0)
     with pytest.raises(ConfigError, match=r"env.awake=2: expected 10 or null with .*natural"):
         envs.make("point_goal2", engine="c", awake=2, lidar_type="natural")

@@ -72,7 +72,7 @@ def test_sensors_of_what_the_dynamics_do_not_write():
 def test_contacts_without_room_are_counted():
     t = task("point_goal1", engine="warp", contact_room=0.01)
     assert (t.idle(t.begin(64)).info["overflow"] == 1).all()
-    with pytest.raises(ConfigError, match=r"env.contact_room=0.0: expected above 0"):
+    with pytest.raises(ConfigError, match=r"env.contact_room=0.0: expected a number between 0.01 and"):
         envs.make("point_goal1", contact_room=0.0)
 
 

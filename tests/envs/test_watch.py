@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from toys import reflex
 
 from jaxsafe import envs
 from jaxsafe.commands import render as render_command
@@ -25,17 +26,16 @@ from jaxsafe.commands import watch as watch_command
 from jaxsafe.config import ConfigError
 from jaxsafe.envs.view import watch
 from jaxsafe.envs.view.driving import FRONT, drive, robot_of
-from jaxsafe.learn.acting import reflex
 from jaxsafe.report import film
 
 ROOT = Path(__file__).parent.parent.parent
 
 
 @pytest.fixture(scope="module")
-def session() -> watch.Session:
+def session() -> watch.Playback:
     """Of a policy that always turns left at half speed."""
     env = envs.make("point_goal0", engine="c", num_steps=6)
-    return watch.Session(env, reflex(lambda obs: jnp.array([0.0, 0.5]), env), seed=3)
+    return watch.Playback(env, reflex(lambda obs: jnp.array([0.0, 0.5]), env), seed=3)
 
 
 @pytest.mark.parametrize(
@@ -70,9 +70,9 @@ def test_no_keys_drive_a_robot_of_ones_own(tmp_path):
     own.write_text((ROOT / "envs" / "safety_gym" / "assets" / "point.xml").read_text())
     env = envs.make("point_goal0", engine="c", robot_base=str(own))
     with pytest.raises(ConfigError, match=r"rover\.xml'?: keys drive point, car, doggo alone"):
-        watch.Session(env)
+        watch.Playback(env)
     with pytest.raises(ConfigError, match="only Safety Gym's environments can be drawn, not a Simple"):
-        watch.Session(SimpleNamespace())  # type: ignore[arg-type]
+        watch.Playback(SimpleNamespace())  # type: ignore[arg-type]
     assert robot_of(envs.make("car_goal0", engine="c", robot_base="xmls/car.xml")) == "car"
 
 
@@ -121,7 +121,7 @@ def test_play_shows_all_the_time_and_steps_at_the_pace_of_the_robot_unless_pause
             session.seconds, playing, lambda: stepped.append(1)
         )
         end = time.monotonic() + 0.5
-        watch.Session.play(fake, lambda: shown.append(1), lambda: time.monotonic() > end)  # type: ignore[arg-type]
+        watch.Playback.play(fake, lambda: shown.append(1), lambda: time.monotonic() > end)  # type: ignore[arg-type]
         return len(stepped), len(shown)
 
     stepped, shown = seconds(True)
@@ -164,9 +164,9 @@ BAD = {
     ("nowhere",): "nowhere is not a run folder: it has no config.yaml",
     ("nowhere", "elsewhere"): "elsewhere: expected one run, or env=NAME",
     ("env=point_goal0", "algo=cpo"): "algo=cpo is not a run folder",
-    ("env=point_goal0", "--seed", "-1"): "--seed -1: expected 0 to 2147483647",
-    ("env=point_goal0", "--port", "0"): "--port 0: expected a number from 1 to 65535",
-    ("nowhere", "env=a:b", "env.engine=c"): "env.engine=c: with a run, expected env=MODULE:NAME alone",
+    ("env=point_goal0", "--seed", "-1"): "--seed: -1: expected a whole number between 0 and 2147483647",
+    ("env=point_goal0", "--port", "0"): "--port: 0: expected a whole number between 1 and 65535",
+    ("nowhere", "env=a:b", "env.engine=c"): "env.engine=c: with a run, expected env=MODULE:NAME or",
     (): "required",
 }
 
@@ -272,9 +272,9 @@ def fetch(address: str) -> bytes:
 
 @pytest.mark.slow  # needs playwright and Debian's chromium
 def test_a_browser_shows_it_and_its_keys_drive(page):
-    from playwright.sync_api import sync_playwright  # pyright: ignore[reportMissingImports]
+    playwright = pytest.importorskip("playwright.sync_api")
 
-    with sync_playwright() as play:
+    with playwright.sync_playwright() as play:
         quiet = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--no-first-run"]
         browser = play.chromium.launch(executable_path="/usr/bin/chromium", args=quiet)
         tab = browser.new_page(viewport={"width": 1040, "height": 680})

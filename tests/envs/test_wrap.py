@@ -7,9 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from toys import Clock, Corridor
+from toys import Corridor, Ticker
 
 from jaxsafe import envs
+from jaxsafe.api import choose_env
 from jaxsafe.config import ConfigError
 from jaxsafe.envs.check import check_env
 from jaxsafe.envs.wrap import (
@@ -22,8 +23,8 @@ from jaxsafe.envs.wrap import (
 )
 from jaxsafe.learn.rollout import collect, init_rollout
 from jaxsafe.run.arguments import compose
-from jaxsafe.run.settings import make_env, settle
-from jaxsafe.run.spread import build
+from jaxsafe.run.programs import build
+from jaxsafe.run.settings import make_env, settings_from_config
 from jaxsafe.types import Env, State
 
 
@@ -62,7 +63,7 @@ def test_actions_are_stretched_over_the_bounds_and_clipped():
 
 def test_a_repeated_action_earns_and_costs_the_sums_and_stops_at_the_end():
     """Of five steps of life, at reward 1 and cost 2 each, the third row has one."""
-    env = ActionRepeat(Clock(lives=(5, 5), episode_length=7), 2)
+    env = ActionRepeat(Ticker(lives=(5, 5), episode_length=7), 2)
     _, *after = steps(env, [[0.0]] * 3)
     np.testing.assert_array_equal([s.reward for s in after], [2, 2, 1])
     np.testing.assert_array_equal([s.cost for s in after], [4, 4, 2])
@@ -73,7 +74,7 @@ def test_a_repeated_action_earns_and_costs_the_sums_and_stops_at_the_end():
 
 
 def test_frames_are_stacked_newest_first():
-    env = FrameStack(Clock(lives=(9, 9)), 3)
+    env = FrameStack(Ticker(lives=(9, 9)), 3)
     clocks = [np.asarray(s.obs).reshape(3, 3)[:, 1] for s in steps(env, [[0.0]] * 4)]
     np.testing.assert_array_equal(clocks, [[0, 0, 0], [1, 0, 0], [2, 1, 0], [3, 2, 1], [4, 3, 2]])
     assert env.obs_size == 9
@@ -81,7 +82,7 @@ def test_frames_are_stacked_newest_first():
 
 def test_pixels_are_stacked_by_channel():
     @dataclass(frozen=True)
-    class Camera(Clock):
+    class Camera(Ticker):
         def reset(self, key: jax.Array) -> State:
             state = super().reset(key)
             return replace(state, obs={"vision": jnp.zeros((4, 5, 3), jnp.uint8)})
@@ -96,7 +97,7 @@ def test_pixels_are_stacked_by_channel():
 
 
 def test_a_time_limit_truncates_and_frames_do_not_leak_into_the_next_episode():
-    env = FrameStack(TimeLimit(Clock(), 3), 2)
+    env = FrameStack(TimeLimit(Ticker(), 3), 2)
     rollout = init_rollout(env, jax.random.key(0), 2, False)
 
     def act(carry: Any, obs: jax.Array, first: jax.Array, key: jax.Array) -> Any:
@@ -167,18 +168,21 @@ def test_wrappers_are_set_on_the_command_line(hall):
 def test_settings_of_a_run_that_knew_no_wrappers_are_read(hall):
     saved = compose(["env=hall", "algo=ppo"]).plain()
     del saved["env"]["wrap"]
-    assert make_env(settle(saved)) == Corridor()
+    assert make_env(settings_from_config(saved)) == Corridor()
 
 
 @pytest.mark.parametrize(
     "wrap, says",
     [
-        ({"action_repeat": 0}, "env.wrap: ActionRepeat: repeat=0: expected 1 to 20"),
+        ({"action_repeat": 0}, "env.wrap.action_repeat=0: expected a whole number between 1 and"),
         ({"action_repeat": 21}, "expected 1 to 20, the steps of an episode"),
-        ({"frame_stack": 0}, "env.wrap: FrameStack: frames=0: expected at least 1"),
-        ({"time_limit": 0}, "env.wrap: TimeLimit: steps=0: expected at least 1"),
-        ({"action_bounds": (1.0, 1.0)}, "low=1.0 and high=1.0: expected low < high"),
-        ({"action_bounds": (0.0, float("inf"))}, "expected low < high"),
+        ({"frame_stack": 0}, "env.wrap.frame_stack=0: expected a whole number between 1 and"),
+        ({"time_limit": 0}, "env.wrap.time_limit=0: expected a whole number between 1 and"),
+        ({"action_bounds": (1.0, 1.0)}, "env.wrap.action_bounds=[1.0, 1.0]: expected low < high"),
+        (
+            {"action_bounds": (0.0, float("inf"))},
+            "env.wrap.action_bounds[1]=inf: expected a number",
+        ),
         ({"action_repat": 2}, "unknown option env.wrap.action_repat; did you mean 'action_repeat'"),
         ({"action_repeat": 1.5}, "env.wrap.action_repeat=1.5: expected a whole number"),
         (3, "env.wrap=3: set its parts"),
@@ -205,3 +209,23 @@ def test_steps_of_a_run_are_raw_steps(hall):
     settings = compose(texts)
     program = build(make_env(settings), settings.row.make, settings.configs, settings.train)
     assert program.clocks.steps == 2 * 8 * 3
+
+
+def test_a_wrapped_task_given_from_python_is_recorded_with_its_wrappers():
+    wrap = {"time_limit": 500, "action_repeat": 2, "frame_stack": 3}
+    env = envs.make("point_goal0", engine="c", hazards_num=2, wrap=wrap)
+    chosen, objects = choose_env(env)
+    assert chosen["env"] == "point_goal0" and not objects
+    assert chosen["env.hazards_num"] == 2
+    assert {k: v for k, v in chosen.items() if k.startswith("env.wrap.")} == {
+        f"env.wrap.{name}": value for name, value in wrap.items()
+    }
+
+
+def test_wrappers_in_another_order_are_the_callers_object_with_all_fields_on_record():
+    inner = envs.make("point_goal0", engine="c", hazards_num=2)
+    chosen, objects = choose_env(ActionRepeat(FrameStack(inner, 3), 2))
+    assert chosen["env"] == "point_goal0"
+    (entry,) = objects.values()
+    assert entry.defaults["repeat"] == 2 and entry.defaults["inner"]["frames"] == 3
+    assert entry.defaults["inner"]["inner"]["hazards_num"] == 2

@@ -11,14 +11,15 @@ import pytest
 from brax.envs.fast import ObservationMode
 from brax.envs.wrappers import training
 from brax.training.agents.ppo import train as ppo
-from tasks import FAST
-from toys import Clock, Corridor
+from compiling import FAST
+from toys import START, Corridor, Ticker
 
 from jaxsafe import algos, envs
 from jaxsafe.config import ConfigError
 from jaxsafe.envs.check import check_env
 from jaxsafe.interop.brax import from_brax, mend_brax, to_brax, to_playground
 from jaxsafe.learn.rollout import collect, init_rollout, memoryless
+from jaxsafe.types import Shared
 
 
 class Fast(brax.envs.fast.Fast):
@@ -43,7 +44,7 @@ class Fast(brax.envs.fast.Fast):
 
 def test_in_brax_s_wrappers_a_time_limit_truncates_and_an_end_does_not():
     def run(lives: tuple[int, int]):
-        env = training.wrap(to_brax(Clock(lives=lives)), episode_length=3)
+        env = training.wrap(to_brax(Ticker(lives=lives)), episode_length=3)
 
         def step(state, _):
             state = env.step(state, jnp.zeros((2, 1)))
@@ -66,7 +67,7 @@ def test_in_brax_s_wrappers_a_time_limit_truncates_and_an_end_does_not():
 
 @pytest.mark.parametrize("adapt", [to_brax, to_playground])
 def test_either_state_steps_alike_and_keeps_what_wrappers_add(adapt):
-    env, key = adapt(Clock()), jax.random.key(3)
+    env, key = adapt(Ticker()), jax.random.key(3)
     assert (env.observation_size, env.action_size) == (3, 1)
     first = env.reset(key)
     old = env.reset(jax.random.key_data(key))  # Brax's style of keys
@@ -157,11 +158,12 @@ def train(env: Any, iterations: int, **options: Any) -> dict[str, np.ndarray]:
     """Metrics of each update, [iterations], of PPO-Lagrangian."""
     config, make, *_ = algos.ALGOS["ppo_lag"]
     algo = make(env)
-    ts = jax.jit(algo.init)(jax.random.key(0), config(num_envs=64, horizon=50, **options))
+    cfg = config(num_envs=64, horizon=50, **options)
+    ts = jax.jit(algo.init)(jax.random.key(0), cfg, START)
     update = jax.jit(algo.update)
     rows = []
-    for _ in range(iterations):
-        ts, metrics = update(ts)
+    for iteration in range(iterations):
+        ts, metrics = update(ts, Shared(np.int32(iteration)))
         rows.append(jax.device_get(metrics))
     return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
@@ -219,7 +221,7 @@ def test_brax_s_pendulum_learns_to_stand_within_a_limit_on_its_cost():
 
 @pytest.mark.slow  # needs playground
 def test_playground_s_cartpole_trains_within_a_limit_on_its_cost():
-    from mujoco_playground import registry  # type: ignore[import-not-found]
+    registry = pytest.importorskip("mujoco_playground").registry
 
     cartpole = from_brax(
         registry.load("CartpoleBalance", config_overrides={"impl": "jax"}),
@@ -235,7 +237,7 @@ def test_playground_s_cartpole_trains_within_a_limit_on_its_cost():
 
 @pytest.mark.slow  # needs playground
 def test_ours_step_in_playground_s_wrappers():
-    from mujoco_playground._src import wrapper  # type: ignore[import-not-found]
+    wrapper = pytest.importorskip("mujoco_playground._src.wrapper")
 
     ours: Any = to_playground(Corridor())
     env = wrapper.wrap_for_brax_training(ours, episode_length=3, full_reset=True)

@@ -1,5 +1,6 @@
 """Gymnasium's and Safety-Gymnasium's interface to our environments."""
 
+import functools
 import importlib
 import sys
 from collections.abc import Iterator
@@ -9,8 +10,8 @@ import jax
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from toys import Clock, Corridor
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from toys import Corridor, Ticker
 
 from jaxsafe import envs
 from jaxsafe.config import ConfigError
@@ -38,7 +39,7 @@ def walk(env, steps: int = 5, seed: int | None = 7) -> list:
 @pytest.mark.filterwarnings("error", UNBOUNDED)
 def test_gymnasium_s_checker_finds_nothing():
     check_env(GymEnv(Corridor()), skip_render_check=True)
-    check_env(GymEnv(Clock(lives=(2, 4))), skip_render_check=True)
+    check_env(GymEnv(Ticker(lives=(2, 4))), skip_render_check=True)
 
 
 @pytest.mark.filterwarnings("error", UNBOUNDED)
@@ -53,7 +54,11 @@ def test_point_goal1_is_made_by_its_id_and_passes_the_checker_with_its_pictures(
 
 def test_every_environment_of_the_suite_has_an_id():
     ids = {key for key in gymnasium.registry if key.startswith("jaxsafe/")}
-    assert ids == {f"jaxsafe/{name}" for name in envs.ALIASES.values()}
+    theirs = {alias.removeprefix("Safexp-") for alias in envs.ALIASES}
+    assert ids == {f"jaxsafe/{name}" for name in {*envs.ALIASES.values(), *theirs}}
+    assert {"jaxsafe/point_goal1", "jaxsafe/PointGoal1-v0"} <= ids
+    kwargs = [gymnasium.spec(f"jaxsafe/{name}").kwargs for name in ("point_goal1", "PointGoal1-v0")]
+    assert kwargs == [{"env": "point_goal1"}] * 2
 
 
 @pytest.mark.filterwarnings("error")
@@ -82,10 +87,10 @@ def test_a_seed_repeats_and_no_seed_goes_on():
 
 
 def test_time_runs_out_or_the_episode_ends():
-    env = GymEnv(Clock(episode_length=2))
+    env = GymEnv(Ticker(episode_length=2))
     env.reset(seed=0)
     assert [env.step(np.zeros(1))[2:4] for _ in range(2)] == [(False, False), (False, True)]
-    env = GymEnv(Clock(episode_length=2, lives=(2, 2)))
+    env = GymEnv(Ticker(episode_length=2, lives=(2, 2)))
     env.reset(seed=0)
     assert [env.step(np.zeros(1))[2:4] for _ in range(2)] == [(False, False), (True, False)]
 
@@ -96,7 +101,7 @@ def shapes(infos: dict) -> dict:
 
 
 def test_a_vector_gives_what_gymnasium_s_own_gives():
-    clock = Clock(lives=(3, 3))
+    clock = Ticker(lives=(3, 3))
     theirs = SyncVectorEnv([lambda: GymEnv(clock)] * 2, autoreset_mode=AutoresetMode.SAME_STEP)
     ours = GymVectorEnv(clock, 2)
     assert ours.observation_space == theirs.observation_space
@@ -118,7 +123,7 @@ def test_a_vector_gives_what_gymnasium_s_own_gives():
 
 
 def test_only_those_that_ended_have_a_last_observation():
-    vector = GymVectorEnv(Clock(lives=(1, 2)), 8)
+    vector = GymVectorEnv(Ticker(lives=(1, 2)), 8)
     first, _ = vector.reset(seed=0)
     obs, _, terminated, _, info = vector.step(np.zeros((8, 1)))
     np.testing.assert_array_equal(terminated, first[:, 2] == 1)
@@ -132,7 +137,7 @@ def test_only_those_that_ended_have_a_last_observation():
 
 
 def test_six_tuples_have_the_cost_beside_the_reward():
-    one, several = SixTuple(GymEnv(Clock())), SixTupleVector(GymVectorEnv(Clock(episode_length=1), 2))
+    one, several = SixTuple(GymEnv(Ticker())), SixTupleVector(GymVectorEnv(Ticker(episode_length=1), 2))
     one.reset(seed=0)
     several.reset(seed=0)
     _, reward, cost, terminated, truncated, info = one.step(np.zeros(1))
@@ -142,15 +147,111 @@ def test_six_tuples_have_the_cost_beside_the_reward():
     assert truncated.all()
 
 
+def test_the_time_limit_stands_in_the_spec_and_no_wrapper_adds_another():
+    made = gymnasium.make("jaxsafe/PointGoal1-v0", num_steps=2)
+    assert made.spec is not None and made.spec.max_episode_steps == 2
+    made.reset(seed=0)
+    ends = [made.step(made.action_space.sample())[3] for _ in range(2)]
+    assert ends == [False, True]
+    vector = gymnasium.make_vec(
+        "jaxsafe/point_goal1", num_envs=2, vectorization_mode="vector_entry_point", num_steps=3
+    )
+    assert vector.spec is not None and vector.spec.max_episode_steps == 3
+
+
+def test_a_six_tuple_that_begins_anew_keeps_the_last_observation():
+    env = SixTuple(GymEnv(Ticker(episode_length=2)), autoreset=True)
+    env.reset(seed=0)
+    _, _, _, _, truncated, info = env.step(np.zeros(1))
+    assert not truncated and "final_observation" not in info
+    obs, _, cost, _, truncated, info = env.step(np.zeros(1))
+    assert truncated and cost == 2 and (obs[1], info["final_observation"][1]) == (0, 2)
+    assert info["final_info"]["cost"] == 2 and info["cost"] == 0
+
+
+@pytest.mark.parametrize("num_envs", [1, 4])
+def test_omnisafe_finds_what_its_wrappers_read(num_envs):
+    """`SafetyGymnasiumEnv` and `ObsNormalize` of OmniSafe 0.5 read these; see the slow test, too."""
+    clock = Ticker(episode_length=4, lives=(2, 9))
+    env = SixTuple(GymEnv(clock), autoreset=True) if num_envs == 1 else None
+    env = env or SixTupleVector(GymVectorEnv(clock, num_envs))
+    obs, _ = env.reset(seed=0)
+    size, ended = obs.shape[-1], 0
+    action = np.zeros(1 if num_envs == 1 else (num_envs, 1))
+    for _ in range(8):
+        obs, reward, cost, terminated, truncated, info = env.step(action)
+        for x in (reward, cost, terminated, truncated):
+            assert np.shape(x) == (() if num_envs == 1 else (num_envs,))
+        done = np.logical_or(terminated, truncated)
+        assert ("final_observation" in info) == bool(np.any(done))
+        if np.any(done):
+            rows = [np.zeros(size) if x is None else x for x in info["final_observation"]]
+            final = np.array(rows, np.float32)
+            assert final.shape == obs.shape
+            which = slice(None) if num_envs == 1 else info["_final_observation"]
+            ended += final[which].reshape(-1, size).shape[0]
+            if num_envs > 1:
+                np.testing.assert_array_equal(done, which)
+    assert ended >= 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("num_envs", [1, 2])
+def test_omnisafe_s_own_ppo_lag_trains_on_our_six_tuple(num_envs, monkeypatch, tmp_path):
+    omnisafe = pytest.importorskip("omnisafe", reason="OmniSafe 0.5 needs Python 3.8 to 3.10")
+    theirs = pytest.importorskip("safety_gymnasium")
+    monkeypatch.chdir(tmp_path)
+
+    def make(id: str, autoreset: bool = False, **kwargs):
+        return SixTuple(gymnasium.make("jaxsafe/PointGoal1-v0", num_steps=100), autoreset)
+
+    def make_vec(env_id: str, num_envs: int, **kwargs):
+        made = gymnasium.make_vec(
+            "jaxsafe/PointGoal1-v0",
+            num_envs=num_envs,
+            vectorization_mode="vector_entry_point",
+            num_steps=100,
+        )
+        return SixTupleVector(made)
+
+    monkeypatch.setattr(theirs, "make", make)
+    monkeypatch.setattr(theirs.vector, "make", make_vec)
+    custom = {
+        "train_cfgs": {"total_steps": 800, "vector_env_nums": num_envs, "device": "cpu"},
+        "algo_cfgs": {"steps_per_epoch": 400, "update_iters": 2},
+        "logger_cfgs": {"use_wandb": False, "use_tensorboard": False},
+    }
+    agent = omnisafe.Agent("PPOLag", "SafetyPointGoal1-v0", custom_cfgs=custom)
+    ret, cost, length = agent.learn()
+    assert np.isfinite([ret, cost]).all() and length == 100
+
+
+def test_in_a_forked_process_there_is_one_line(monkeypatch):
+    monkeypatch.setattr("jaxsafe.interop.gymnasium.PROCESS", 0)
+    with pytest.raises(ConfigError, match=r"forked process: give AsyncVectorEnv\(.*context='spawn'"):
+        GymEnv(Ticker())
+
+
+def test_processes_that_are_spawned_step_side_by_side():
+    """One worker is enough: it is a new Python, which imports JAX."""
+    several = AsyncVectorEnv([functools.partial(GymEnv, Ticker())], context="spawn", shared_memory=False)
+    try:
+        obs, _ = several.reset(seed=0)
+        obs, rewards, *_ = several.step(np.zeros((1, 1)))
+        assert obs.shape == (1, 3) and rewards.shape == (1,)
+    finally:
+        several.close()
+
+
 def test_bad_input_is_one_line():
     with pytest.raises(ConfigError, match="did you mean 'hazards_num'"):
         GymEnv("point_goal1", hazard_num=3)
     with pytest.raises(ConfigError, match="options are for a name"):
-        GymEnv(Clock(), lives=(1, 1))
+        GymEnv(Ticker(), lives=(1, 1))
     with pytest.raises(ConfigError, match="expected 'rgb_array'"):
-        GymVectorEnv(Clock(), render_mode="human")
+        GymVectorEnv(Ticker(), render_mode="human")
     with pytest.raises(ConfigError, match="only Safety Gym's environments can be drawn"):
-        GymEnv(Clock(), render_mode="rgb_array")
+        GymEnv(Ticker(), render_mode="rgb_array")
 
 
 def test_without_gymnasium_there_is_one_line(monkeypatch):

@@ -82,7 +82,7 @@ PLAIN = ["env=point_goal1", "env.rules=safety_gymnasium"]
 
 def migrated(config: dict[str, Any], algo: str) -> migrate.Migrated:
     found = migrate.omnisafe(config, algo, "SafetyPointGoal1-v0")
-    arguments.read(found.argv)  # train.py takes it
+    arguments.check_arguments(found.argv)  # train.py takes it
     return found
 
 
@@ -190,7 +190,7 @@ def test_every_option_that_a_key_becomes_exists():
             {"algo_cfgs": {"batch_size": 0}},
             "PPOLag",
             "point_goal1",
-            "batch_size=0: expected at least 1",
+            "batch_size=0: expected a whole number between 1 and",
         ),
         ({}, "PPOlag", "point_goal1", "did you mean 'PPOLag'"),
         ({}, "SACLag", "point_goal1", "off-policy"),
@@ -224,7 +224,7 @@ def test_an_engine_dict_is_the_nearest_environment_and_the_rest():
     expected = ["env.hazards_num=3", "env.hazards_locations=[[1.0,1.0],[-1.0,0.5]]"]
     assert sorted(found.argv) == sorted(["env=point_push1", *expected, "env.constrain_indicator=false"])
     assert {line.key for line in found.lines} == set(config)
-    request = arguments.read(found.argv)
+    request = arguments.check_arguments(found.argv)
     assert expected[1] in request.argv
     for name, message in (("hazard_num", "did you mean 'hazards_num'"), ("awake", "of Engine")):
         with pytest.raises(ConfigError, match=message):

@@ -6,14 +6,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tasks import FAST
-from toys import FIRST, Clock, Lever, updated
+from compiling import FAST
+from toys import START, Lever, Ticker, updated
 
 from jaxsafe.algos import ALGOS
 from jaxsafe.learn import augment
 from jaxsafe.learn.augment import Budget, control_budget, full_budget, init_schedule
 from jaxsafe.learn.normalise import Normaliser, normalise
-from jaxsafe.learn.on_policy import see
+from jaxsafe.learn.on_policy import network_inputs
 from jaxsafe.learn.rollout import collect, init_rollout, memoryless
 from jaxsafe.run import checkpoint, compat, evaluate
 from jaxsafe.types import Policy
@@ -36,7 +36,7 @@ def build(name, env):
 
 
 def start(name, env, **settings):
-    return build(name, env)[0].init(jax.random.key(0), ALGOS[name].config(**TINY | settings), FIRST)
+    return build(name, env)[0].init(jax.random.key(0), ALGOS[name].config(**TINY | settings), START)
 
 
 def run(env, num_envs, horizon, policy, **options):
@@ -53,7 +53,7 @@ def idle(obs, key):
 
 
 def test_the_budget_by_hand_before_and_after_a_reset():
-    env = Budget(Clock(episode_length=3), start=1.0, budget=8.0, discount=0.5)  # cost 2 a step
+    env = Budget(Ticker(episode_length=3), start=1.0, budget=8.0, discount=0.5)  # cost 2 a step
     traj = run(env, 4, 7, idle)
     for i in range(4):
         np.testing.assert_array_equal(traj.obs[:, i, -1], [1, 1.5, 2.5, 1, 1.5, 2.5, 1])
@@ -61,7 +61,7 @@ def test_the_budget_by_hand_before_and_after_a_reset():
 
 
 def test_each_environment_has_a_budget_of_its_own():
-    env = Budget(Clock(episode_length=3, lives=(1, 3)), start=0.5, budget=8.0, discount=1.0)
+    env = Budget(Ticker(episode_length=3, lives=(1, 3)), start=0.5, budget=8.0, discount=1.0)
     traj = run(env, 8, 20, idle)
     assert len(np.unique(traj.length[traj.ended])) == 3  # they end at different times
     for obs in (traj.obs, traj.next_obs):
@@ -86,7 +86,7 @@ def test_a_budget_is_the_discounted_sum_that_is_left():
 
 @pytest.mark.parametrize("discount", [0.9, 0.999, 1.0])
 def test_spending_the_limit_evenly_spends_the_budget(discount):
-    env, cfg = Clock(episode_length=7), ALGOS["ppo_saute"].config(cost_limit=14.0)
+    env, cfg = Ticker(episode_length=7), ALGOS["ppo_saute"].config(cost_limit=14.0)
     cfg = dataclasses.replace(cfg, saute_discount=discount)
     if discount < 1:
         np.testing.assert_allclose(
@@ -101,17 +101,20 @@ def test_spending_the_limit_evenly_spends_the_budget(discount):
 def test_what_is_left_is_seen_as_it_is(normalised):
     ts = start("ppo_saute", Lever(), obs_normalize=normalised)
     if normalised:
-        seen = Normaliser(mean=jnp.array([1.0, -2.0]), var=jnp.array([4.0, 0.25]), count=jnp.float32(9))
-        ts = dataclasses.replace(ts, normaliser=seen)
+        stats = Normaliser(
+            mean=jnp.array([1.0, -2.0]), var=jnp.array([4.0, 0.25]), count=jnp.float32(9)
+        )
+        ts = dataclasses.replace(ts, normaliser=stats)
     obs = jax.random.normal(jax.random.key(0), (5, 3))
-    np.testing.assert_array_equal(see(ts, obs)[:, -1], obs[:, -1])
+    np.testing.assert_array_equal(network_inputs(ts.normaliser, obs)[:, -1], obs[:, -1])
     if normalised:
         assert ts.normaliser.mean.shape == (2,)
-        np.testing.assert_array_equal(see(ts, obs)[:, :2], normalise(ts.normaliser, obs[:, :2]))
+        inputs = network_inputs(ts.normaliser, obs)
+        np.testing.assert_array_equal(inputs[:, :2], normalise(ts.normaliser, obs[:, :2]))
 
 
 def test_a_step_that_ends_without_budget_earns_the_unsafe_reward():
-    env, cfg = Clock(episode_length=5), ALGOS["ppo_saute"].config(cost_limit=4.0, unsafe_reward=-3.0)
+    env, cfg = Ticker(episode_length=5), ALGOS["ppo_saute"].config(cost_limit=4.0, unsafe_reward=-3.0)
     cfg = dataclasses.replace(cfg, saute_discount=1.0)
     traj = run(augment.saute.wrap(env, cfg, ()), 2, 6, idle)
     np.testing.assert_array_equal(traj.next_obs[:, 0, -1], [0.5, 0, -0.5, -1, -1.5, 0.5])
@@ -119,7 +122,7 @@ def test_a_step_that_ends_without_budget_earns_the_unsafe_reward():
 
 
 def test_omnisafes_value_at_a_time_limit_is_of_a_full_budget():
-    env, cfg = Clock(episode_length=5, lives=(3, 9)), ALGOS["ppo_saute"].config(full_at_end=True)
+    env, cfg = Ticker(episode_length=5, lives=(3, 9)), ALGOS["ppo_saute"].config(full_at_end=True)
     traj = run(augment.saute.wrap(env, cfg, ()), 6, 20, idle)
     assert traj.truncated.any() and traj.terminated.any()
     last = augment.saute.last_obs(traj, cfg)
@@ -131,7 +134,7 @@ def test_omnisafes_value_at_a_time_limit_is_of_a_full_budget():
 
 
 def test_the_unsafe_reward_is_the_learners_alone():
-    env = Clock(episode_length=5)
+    env = Ticker(episode_length=5)
     after = {}
     for limit, price in ((4.0, -1.0), (4.0, -5.0), (90.0, -1.0), (90.0, -5.0)):
         ts = start("ppo_saute", env, cost_limit=limit, unsafe_reward=price)
@@ -178,8 +181,8 @@ def test_the_controller_by_hand():
         (0.0, -1.234375, 10.0, -0.4),  # d = 10, u = 0.4: B is cut at the limit
         (10.0, -0.6171875, 10 - 0.69375, 0.0),  # u = -0.30859375 - 0.18515625 - 0.2
     ]
-    for cost, error, budget, clipped in rows:
-        dual = control_budget(dual, jnp.float32(cost), cfg)
+    for iteration, (cost, error, budget, clipped) in enumerate(rows):
+        dual = control_budget(dual, jnp.float32(cost), cfg, iteration)
         np.testing.assert_allclose(dual.errors[-1], error, rtol=1e-6)
         np.testing.assert_allclose(dual.budget, budget, rtol=1e-6)
         np.testing.assert_allclose(dual.clipped, clipped, rtol=1e-5, atol=1e-6)
@@ -193,11 +196,11 @@ def test_omnisafes_controller_adds_to_the_last_budget_by_hand():
         (3.0, 1.0, 5.6),  # e = 2 / 2, u = 0.5 + 0.1
         (9.6, -1.5, 4.8),  # e = 1 / 2 - 4 / 2, u = -0.75 - 0.05
     ]
-    for cost, error, budget in rows:
-        dual = control_budget(dual, jnp.float32(cost), cfg)
+    for iteration, (cost, error, budget) in enumerate(rows):
+        dual = control_budget(dual, jnp.float32(cost), cfg, iteration)
         np.testing.assert_allclose(dual.errors[-1], error, rtol=1e-6)
         np.testing.assert_allclose(dual.budget, budget, rtol=1e-6)
-    env = Clock(episode_length=5)
+    env = Ticker(episode_length=5)
     shown: Any = augment.simmer.wrap(env, cfg, dual)
     assert shown.start == 1.0
     np.testing.assert_allclose(shown.budget, full_budget(env, cfg) * 0.48, rtol=1e-6)
@@ -207,13 +210,13 @@ def test_omnisafes_controller_keeps_most_of_its_budget_where_costs_are_too_high(
     config = ALGOS["ppo_simmer_pid"].config
     dual = init_schedule(cfg := config(**compat.overrides("omnisafe", config)))
     assert dual.budget == cfg.cost_limit == 25
-    for _ in range(500):
-        dual = control_budget(dual, jnp.float32(40.0), cfg)
+    for iteration in range(500):
+        dual = control_budget(dual, jnp.float32(40.0), cfg, iteration)
     assert 10 < dual.budget < 25
 
 
 def test_new_episodes_start_with_the_present_budget_and_running_ones_keep_theirs():
-    env = Clock(episode_length=6)
+    env = Ticker(episode_length=6)
     update = build("ppo_simmer_pid", env)[1]
     ts = start("ppo_simmer_pid", env, horizon=4, **HAND | {"cost_limit": 50.0})
     np.testing.assert_array_equal(ts.rollout.state.obs[:, -1], 0.5)
@@ -235,7 +238,7 @@ def test_new_episodes_start_with_the_present_budget_and_running_ones_keep_theirs
 
 
 def test_a_policy_acts_with_the_budget_that_training_left_it():
-    env = Clock(episode_length=6)
+    env = Ticker(episode_length=6)
     algo, update = build("ppo_simmer_pid", env)
     ts, _ = update(start("ppo_simmer_pid", env, **HAND))
     task = algo.task(ts)
@@ -249,18 +252,18 @@ def test_evaluation_shows_what_is_left_of_the_scheduled_budget():
 
     algo = ALGOS["ppo_simmer_pid"].make(Lever())._replace(policy=Policy(lambda params: (), spend))
     cfg = ALGOS["ppo_simmer_pid"].config(**TINY, cost_limit=1e6, budget_init=0.2)
-    ts = jax.tree.map(lambda x: x[None], algo.init(jax.random.key(0), cfg, FIRST))
+    ts = jax.tree.map(lambda x: x[None], algo.init(jax.random.key(0), cfg, START))
     cost = evaluate.run_episodes(algo, ts, 50, seed=0).cost  # 10 steps of 0.4 or 0.6
     assert cost.min() > 3.99 and cost.max() < 6.01 and cost.std() > 0.1
 
 
 def test_a_schedule_comes_back_from_a_checkpoint(tmp_path):
-    env = Clock(episode_length=6)
+    env = Ticker(episode_length=6)
     algo, update = build("ppo_simmer_pid", env)
     ts, _ = update(start("ppo_simmer_pid", env, **HAND))
     checkpoint.save(tmp_path, ts, checkpoint.Progress(1, 24, 1))
     cfg = ALGOS["ppo_simmer_pid"].config(**TINY | HAND)
-    like = jax.eval_shape(lambda: algo.init(jax.random.key(0), cfg, FIRST))
+    like = jax.eval_shape(lambda: algo.init(jax.random.key(0), cfg, START))
     back, _ = checkpoint.restore(tmp_path, like)
     for x, y in zip(*(jax.tree.leaves(update(s)[0].dual) for s in (ts, back)), strict=True):
         np.testing.assert_array_equal(x, y)
@@ -272,7 +275,7 @@ def test_a_schedule_comes_back_from_a_checkpoint(tmp_path):
 @pytest.mark.parametrize("limit, length", [(5.0, 3), (6.0, 4), (9.0, 5)])
 def test_an_episode_ends_for_good_where_it_breaks_the_limit(limit, length):
     cfg = ALGOS["ppo_early_terminated"].config(cost_limit=limit, termination_reward=-7.0)
-    traj = run(Clock(episode_length=5), 2, 20, idle, stop=lambda sums: augment.early.stop(sums, cfg))
+    traj = run(Ticker(episode_length=5), 2, 20, idle, stop=lambda sums: augment.early.stop(sums, cfg))
     ends = np.arange(length - 1, 20, length)
     np.testing.assert_array_equal(np.flatnonzero(traj.terminated[:, 0]), ends)
     assert not traj.truncated.any()
@@ -285,13 +288,13 @@ def test_an_episode_ends_for_good_where_it_breaks_the_limit(limit, length):
 
 def test_the_count_of_cost_begins_anew_with_every_episode():
     cfg = ALGOS["ppo_early_terminated"].config(cost_limit=10.0)  # what an episode costs
-    traj = run(Clock(episode_length=5), 2, 20, idle, stop=lambda sums: augment.early.stop(sums, cfg))
+    traj = run(Ticker(episode_length=5), 2, 20, idle, stop=lambda sums: augment.early.stop(sums, cfg))
     assert not traj.terminated.any() and traj.truncated.sum() == 8
 
 
 def test_omnisafes_count_of_cost_goes_on_until_it_ends_an_episode():
     cfg = ALGOS["ppo_early_terminated"].config(cost_limit=13.0, keep_cost=True, termination_reward=-7.0)
-    traj = run(Clock(episode_length=5), 2, 24, idle, stop=lambda sums: augment.early.stop(sums, cfg))
+    traj = run(Ticker(episode_length=5), 2, 24, idle, stop=lambda sums: augment.early.stop(sums, cfg))
     # 2 a step: 10 at the first time limit, 14 two steps later, which ends the second episode
     ends = [6, 13, 20]
     np.testing.assert_array_equal(np.flatnonzero(traj.terminated[:, 0]), ends)
@@ -303,7 +306,7 @@ def test_omnisafes_count_of_cost_goes_on_until_it_ends_an_episode():
 
 
 def test_training_episodes_end_early_and_others_do_not():
-    env = Clock(episode_length=5)
+    env = Ticker(episode_length=5)
     algo, update = build("ppo_early_terminated", env)
     ts, m = update(start("ppo_early_terminated", env, cost_limit=5.0))
     assert (m["train/episode_length"], m["train/cost"], m["train/return"]) == (3, 6, 3)
@@ -318,12 +321,12 @@ def test_training_episodes_end_early_and_others_do_not():
 
 @pytest.mark.parametrize("name", ["ppo_saute", "ppo_simmer_pid", "ppo_early_terminated"])
 def test_cost_limits_side_by_side_are_different_tasks(name):
-    algo = ALGOS[name].make(Clock(episode_length=5))
+    algo = ALGOS[name].make(Ticker(episode_length=5))
     limits = jnp.array([5.0, 6.0, 40.0])
     cfg = ALGOS[name].config(**TINY | {"horizon": 3})
 
     def init(limit):
-        return algo.init(jax.random.key(0), dataclasses.replace(cfg, cost_limit=limit), FIRST)
+        return algo.init(jax.random.key(0), dataclasses.replace(cfg, cost_limit=limit), START)
 
     update = jax.jit(jax.vmap(updated(algo)), compiler_options=FAST)
     ts, _ = update(jax.vmap(init)(limits))

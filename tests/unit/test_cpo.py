@@ -4,19 +4,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import FAST
 from jax.flatten_util import ravel_pytree
 from scipy.optimize import minimize
-from tasks import FAST
 from toys import context
 
-from jaxsafe.algos.cpo import BOUNDED, FREE, RECOVER, RETURN, CPOConfig, Margin, cpo_step, dual
+from jaxsafe.algos.cpo import BOUNDED, FREE, RECOVER, RETURN, CPOConfig, Margin, cpo_step, multipliers
 from jaxsafe.learn.on_policy import Batch
 from jaxsafe.learn.steps import Pair, mean_kl
 from jaxsafe.learn.surrogates import plain
 from jaxsafe.nn.gaussian import log_prob, sample
 from jaxsafe.nn.networks import init_params, policy
 
-solve = jax.jit(dual)
+solve = jax.jit(multipliers)
 
 
 def step_of(g, b, hessian, c, delta):
@@ -25,6 +25,17 @@ def step_of(g, b, hessian, c, delta):
     scalars = [jnp.float32(x) for x in (g @ h_g, g @ h_b, b @ h_b, c, delta)]
     lam, nu, case = (np.float64(x) for x in solve(*scalars))
     return (-nu * h_b if case == RECOVER else (h_g - nu * h_b) / lam), int(case), lam, nu
+
+
+@pytest.mark.parametrize("kappa", [-0.9999999, -0.99999, -0.9999, -0.99])
+@pytest.mark.parametrize("nearer", [0.1, 0.5, 0.9])
+def test_a_safe_step_keeps_its_gain_where_cost_is_nearly_in_proportion_to_reward(kappa, nearer):
+    """The best gain is -kappa rho + sqrt((1 - kappa^2)(1 - rho^2)), with rho the cosine of g and b."""
+    rho = 1 - nearer * (1 + kappa)
+    best = -kappa * rho + np.sqrt((1 - kappa**2) * (1 - rho**2))
+    lam, nu, case = (np.float64(x) for x in solve(*map(jnp.float32, (1.0, rho, 1.0, kappa, 0.5))))
+    gain, cost = (1 - nu * rho) / lam, (rho - nu) / lam  # g'x and b'x of x = (h_g - nu h_b) / lam
+    assert case == BOUNDED and gain > 0.98 * best and cost + kappa < 1e-5
 
 
 def problems(count, seed=0):
@@ -156,7 +167,7 @@ def test_the_dual_is_finite_everywhere():
             values, values, jnp.array([-1e3, -1e-9, 0, 1e-9, 1e3]), jnp.array([-1.0, 0, 1.0])
         )
     )
-    out = jax.vmap(dual)(q, rho * jnp.sqrt(q) * jnp.sqrt(s), s, c, jnp.full_like(q, 0.01))
+    out = jax.vmap(multipliers)(q, rho * jnp.sqrt(q) * jnp.sqrt(s), s, c, jnp.full_like(q, 0.01))
     assert all(jnp.isfinite(x).all() for x in out)
     assert (out[0] >= 0).all() and (out[1] >= 0).all()
 
@@ -184,7 +195,7 @@ def moved(cfg, actor, violation, margin, batch, axis_name=None):
         return lambda actor, batch: plain(policy(actor, batch.obs, cfg), batch, adv(batch), cfg)
 
     pair = Pair(objective(lambda batch: batch.adv_r), objective(lambda batch: batch.adv_c))
-    told = context(cfg, axis_name=axis_name, excess=LENGTH * violation, length=LENGTH)
+    told = context(cfg, axis_name=axis_name, violation=LENGTH * violation, episode_length=LENGTH)
     return cpo_step.update(actor, margin, pair, batch, told)
 
 

@@ -3,8 +3,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsafe.nn.distributions import squashed_mean, squashed_sample
 from jaxsafe.nn.gaussian import Gaussian
+from jaxsafe.nn.squashed import squashed_mean, squashed_sample
 
 
 @pytest.mark.parametrize("mean, log_std", [(0.0, 0.0), (1.5, -1.0), (-0.7, 0.3)])

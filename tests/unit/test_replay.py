@@ -10,7 +10,7 @@ import pytest
 
 from jaxsafe.learn.replay import (
     Index,
-    Row,
+    Record,
     Span,
     draw,
     empty_ring,
@@ -55,7 +55,7 @@ def as_rows(lives, begin, end):
 
     names, envs = field("name"), np.arange(len(lives))
     pixels = np.stack([names % 256, names // 256, names + envs], -1) % 256
-    make: Any = Row  # of NumPy's arrays
+    make: Any = Record  # of NumPy's arrays
     return make(
         obs={"vector": np.stack([names, field("episode")], -1), "pixels": pixels.astype(np.uint8)},
         action=field("action")[..., None],

@@ -6,11 +6,10 @@ import sys
 import jax
 import numpy as np
 import pytest
-from toys import Clock
+from toys import Ticker, reflex
 
 from jaxsafe.config import ConfigError
-from jaxsafe.learn.acting import reflex
-from jaxsafe.report import evaluation, plots, scores
+from jaxsafe.report import evaluation, plots, scores, stats
 from jaxsafe.run import checkpoint, evaluate, run_folder
 from jaxsafe.run.checkpoint import Progress
 from jaxsafe.run.run_folder import Metrics, read_config, read_metrics
@@ -103,12 +102,12 @@ def test_curves_are_drawn_for_one_seed_for_several_and_for_none(tmp_path):
 
 def test_an_interval_is_over_seeds_and_of_one_seed_over_its_episodes():
     two = np.array([[0.0, 8.0], [6.0, 6.0]])
-    assert evaluation.estimate(two) == (5.0, 4.0, 6.0)  # a quarter of the draws is one seed twice
-    assert evaluation.estimate(two[:1]) == (4.0, 0.0, 8.0)
+    assert evaluation.estimate(two) == stats.estimate(np.array([4.0, 6.0]))  # seeds
+    assert evaluation.estimate(two[:1]) == stats.estimate(two[0])  # episodes of the one seed
 
 
 def test_discounted_sums_and_named_costs_of_an_episode_by_hand():
-    player = reflex(lambda obs: obs[:1], Clock(lives=(3, 3)))
+    player = reflex(lambda obs: obs[:1], Ticker(lives=(3, 3)))
     three = evaluate.episode(player, jax.random.key(0), 0.5, 0.1)
     assert (three.ret, three.length) == (3, 3) and three.cost == 6  # 1 and 2 a step
     np.testing.assert_allclose(three.discounted_ret, 1 + 0.5 + 0.25)
@@ -138,12 +137,12 @@ def test_unconstrained_ppo_scores_one_and_a_safe_policy_violates_by_zero():
 
 
 def test_progress_reads_the_newest_manifest(tmp_path):
-    assert run_folder.progress(tmp_path) is None
+    assert run_folder.newest_progress(tmp_path) is None
     for done in (Progress(3, 30, 6), Progress(4, 40, 8)):
         newest = checkpoint.save(tmp_path / "checkpoints", {"x": np.ones(2)}, done)
-    assert run_folder.progress(tmp_path) == Progress(4, 40, 8)
+    assert run_folder.newest_progress(tmp_path) == Progress(4, 40, 8)
     (newest / "manifest.json").write_text("{")
-    assert run_folder.progress(tmp_path) == Progress(3, 30, 6)
+    assert run_folder.newest_progress(tmp_path) == Progress(3, 30, 6)
 
 
 def test_the_command_of_a_run_is_recorded_as_it_was_typed(tmp_path, monkeypatch):

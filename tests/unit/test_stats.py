@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+import scipy
 
 from jaxsafe.report import stats
 
@@ -23,7 +24,7 @@ RLIABLE = {
 }
 
 
-def test_estimates_over_tasks_are_those_of_rliable():
+def test_estimates_over_tasks_are_those_of_rliable_and_intervals_of_shares_too():
     found = {
         "mean": stats.estimate(*X.T),
         "iqm": stats.estimate(*X.T, statistic=stats.iqm),
@@ -32,17 +33,46 @@ def test_estimates_over_tasks_are_those_of_rliable():
     }
     for name, expected in RLIABLE.items():
         np.testing.assert_allclose(found[name].mean, expected[0], rtol=1e-6, err_msg=name)
-        np.testing.assert_allclose(found[name][1:], expected[1:], atol=0.02, err_msg=name)
+        if name not in ("mean", "iqm"):  # whose intervals are by Student's t
+            np.testing.assert_allclose(found[name][1:], expected[1:], atol=0.02, err_msg=name)
+
+
+@pytest.mark.parametrize("seeds", [4, 5, 8])
+def test_the_interval_of_a_mean_covers_it_95_times_in_100(seeds):
+    """2,000 samples of one task, and as many of two tasks with other spreads and numbers of seeds."""
+    rng = np.random.default_rng(seeds)
+    one = rng.normal(3.0, 2.0, (seeds, 2000))
+    two = rng.normal(5.0, 0.5, (seeds + 2, 2000))
+    for samples, truth in (([one], 3.0), ([one, two], 4.0)):
+        e = stats.estimate(*samples)
+        assert 0.93 < np.mean((e.low <= truth) & (truth <= e.high)) < 0.97
+
+
+@pytest.mark.parametrize("seeds", [4, 5, 8])
+def test_the_interval_of_an_interquartile_mean_covers_it_at_least_as_often(seeds):
+    values = np.random.default_rng(seeds).normal(3.0, 2.0, (seeds, 2000))
+    e = stats.estimate(values, statistic=stats.iqm, draws=500)
+    assert 0.93 < np.mean((e.low <= 3.0) & (e.high >= 3.0)) < 0.99
+
+
+def test_the_interval_of_a_mean_is_scipys_of_student_and_welch():
+    x, y = X[:, 0], Y[:, 1]
+    known = scipy.stats.ttest_1samp(x, 0.0).confidence_interval()
+    np.testing.assert_allclose(stats.estimate(x)[1:], known)
+    # a mean over two tasks is half the difference of x and -y
+    known = scipy.stats.ttest_ind(x, -y, equal_var=False).confidence_interval()
+    np.testing.assert_allclose(stats.estimate(x, y)[1:], np.array(known) / 2)
 
 
 def test_means_and_interquartile_means_by_hand():
     few, many = np.array([2.0, 4.0]), np.array([0.0, 10.0, 20.0, 30.0, 40.0, 50.0])
     assert stats.estimate(few, many).mean == (3 + 25) / 2  # a task counts once, whatever its seeds
     assert stats.estimate(few, many, statistic=stats.iqm).mean == (4 + 10 + 20 + 30) / 4
-    assert stats.estimate(few) == (3.0, 2.0, 4.0)  # a quarter of the draws is one seed twice
+    low = 3.0 - 12.7062047  # t of one degree of freedom, and a standard error of 1
+    np.testing.assert_allclose(stats.estimate(few), (3.0, low, 6.0 - low))
 
 
-def test_seeds_are_resampled_within_their_task():
+def test_the_spread_between_tasks_does_not_widen_the_interval():
     assert stats.estimate(np.full(5, 1.0), np.full(5, 9.0)) == (5.0, 5.0, 5.0)
 
 
@@ -60,7 +90,8 @@ def test_one_seed_has_no_interval_and_what_is_unknown_stays_unknown():
     assert stats.estimate(np.array([7.0]), np.array([1.0, 3.0])) == (4.5, 4.5, 4.5)
     assert np.isnan(stats.estimate(np.array([7.0, np.nan]))).all()
     columns = stats.estimate(np.array([[1.0, np.nan, 3.0], [2.0, 5.0, 3.0]]))
-    np.testing.assert_array_equal(columns, [[1.5, np.nan, 3], [1, np.nan, 3], [2, np.nan, 3]])
+    np.testing.assert_array_equal(np.isnan(columns), [[False, True, False]] * 3)
+    np.testing.assert_allclose(np.array(columns)[:, 2], 3.0)
 
 
 def test_probability_of_improvement_counts_pairs_and_halves_of_equal_ones():

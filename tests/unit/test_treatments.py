@@ -5,15 +5,15 @@ import pytest
 
 from jaxsafe.algos.ppo import CPPOPIDConfig, IPOConfig, PPOLagConfig, PPOPenaltyConfig
 from jaxsafe.algos.trpo import CRPOConfig
-from jaxsafe.learn.treatments import barrier, lagrangian, none, penalty, pid, switch
+from jaxsafe.learn.treatments import barrier, lagrangian, no_treatment, penalty, pid, switch
 
 
 def test_the_multiplier_takes_adams_steps_by_hand():
     cfg = PPOLagConfig(cost_limit=25.0, dual_lr=0.1, lam_init=1.0)
-    dual = lagrangian.update(lagrangian.init(cfg), jnp.float32(35.0), cfg)
+    dual = lagrangian.update(lagrangian.init(cfg), jnp.float32(35.0), cfg, 0)
     # the first step of Adam is lr times the sign of the gradient
     np.testing.assert_allclose(dual.lam, 1.1, rtol=1e-6)
-    dual = lagrangian.update(dual, jnp.float32(20.0), cfg)
+    dual = lagrangian.update(dual, jnp.float32(20.0), cfg, 0)
     # gradients -10, then 5: m = 0.9 (0.1 -10) + 0.1 5 and v = 0.999 (0.001 100) + 0.001 25,
     # over 1 - 0.9^2 and 1 - 0.999^2
     m, v = (-0.9 + 0.5) / 0.19, (0.0999 + 0.025) / 0.001999
@@ -25,7 +25,7 @@ def test_the_multiplier_stays_in_its_interval(cost, bound):
     cfg = PPOLagConfig(dual_lr=0.1, lam_max=0.3)
     dual = lagrangian.init(cfg)
     for _ in range(10):
-        dual = lagrangian.update(dual, jnp.float32(cost), cfg)
+        dual = lagrangian.update(dual, jnp.float32(cost), cfg, 0)
     np.testing.assert_allclose(dual.lam, bound, rtol=1e-6)
 
 
@@ -36,8 +36,8 @@ def test_the_mixed_advantage_by_hand():
 
 
 def test_no_treatment_keeps_nothing_and_sees_only_reward():
-    assert jax.tree.leaves(none.init(PPOLagConfig())) == []
-    assert none.advantage((), jnp.float32(2.0), jnp.float32(9.0)) == 2.0
+    assert jax.tree.leaves(no_treatment.init(PPOLagConfig())) == []
+    assert no_treatment.advantage((), jnp.float32(2.0), jnp.float32(9.0)) == 2.0
 
 
 def test_the_controller_by_hand():
@@ -52,17 +52,17 @@ def test_the_controller_by_hand():
     )
     dual = pid.init(cfg)
     assert dual.lam == 0.5
-    dual = pid.update(dual, jnp.float32(35.0), cfg)
+    dual = pid.update(dual, jnp.float32(35.0), cfg, 0)
     # error 10: I = 0.5 + 0.1, P = 0.5 10, smoothed cost 17.5, which rose from 0
     np.testing.assert_allclose(dual.lam, 0.1 * 5 + 0.6 + 0.2 * 17.5, rtol=1e-6)
-    dual = pid.update(dual, jnp.float32(5.0), cfg)
+    dual = pid.update(dual, jnp.float32(5.0), cfg, 0)
     # error -20: I = 0.6 - 0.2, P = 0.5 5 - 10, smoothed cost 11.25, two iterations after 0
     np.testing.assert_allclose(dual.lam, 0.1 * -7.5 + 0.4 + 0.2 * 11.25, rtol=1e-6)
-    dual = pid.update(dual, jnp.float32(5.0), cfg)
+    dual = pid.update(dual, jnp.float32(5.0), cfg, 0)
     # I = 0.4 - 0.2, P = -3.75 - 10, smoothed cost 8.125, below the 17.5 of two iterations ago
     np.testing.assert_allclose(dual.lam, 0.0, atol=1e-7)
     for _ in range(5):
-        dual = pid.update(dual, jnp.float32(0.0), cfg)
+        dual = pid.update(dual, jnp.float32(0.0), cfg, 0)
     assert dual.integral == 0 and dual.lam == 0  # neither winds up below
 
 
@@ -71,7 +71,7 @@ def test_the_controller_by_hand():
 )
 def test_the_barrier_is_steep_near_the_limit_and_as_steep_as_allowed_beyond(cost, price):
     cfg = IPOConfig(cost_limit=25.0, barrier=0.5, price_max=0.6)
-    dual = barrier.update(barrier.init(cfg), jnp.float32(cost), cfg)
+    dual = barrier.update(barrier.init(cfg), jnp.float32(cost), cfg, 0)
     np.testing.assert_allclose(dual, price, rtol=1e-5)
     mixed = barrier.advantage(dual, jnp.float32(1.0), jnp.float32(2.0))
     np.testing.assert_allclose(mixed, (1 - 2 * price) / (1 + price), rtol=1e-5)
@@ -80,11 +80,11 @@ def test_the_barrier_is_steep_near_the_limit_and_as_steep_as_allowed_beyond(cost
 def test_the_switch_turns_beyond_the_tolerance():
     cfg = CRPOConfig(cost_limit=25.0, tolerance=2.0)
     for cost, expected in ((0.0, 3.0), (27.0, 3.0), (27.1, -4.0)):
-        over = switch.update(switch.init(cfg), jnp.float32(cost), cfg)
+        over = switch.update(switch.init(cfg), jnp.float32(cost), cfg, 0)
         assert switch.advantage(over, jnp.float32(3.0), jnp.float32(4.0)) == expected
 
 
 def test_a_fixed_price_is_fixed():
     cfg = PPOPenaltyConfig(price=0.5)
-    price = penalty.update(penalty.init(cfg), jnp.float32(1e6), cfg)
+    price = penalty.update(penalty.init(cfg), jnp.float32(1e6), cfg, 0)
     assert penalty.advantage(price, jnp.float32(3.0), jnp.float32(4.0)) == 1.0

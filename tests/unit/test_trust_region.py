@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import FAST
 from jax.flatten_util import ravel_pytree
-from tasks import FAST
 from toys import context
 
 from jaxsafe.algos.cpo import CPOConfig

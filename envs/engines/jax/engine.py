@@ -11,7 +11,7 @@ from jaxsafe.config import ConfigError
 from jaxsafe.envs.engines.jax import contacts  # noqa: F401  (registers our collisions with MJX)
 from jaxsafe.envs.engines.jax.solver import solve
 from jaxsafe.envs.engines.rows import STATE
-from jaxsafe.envs.engines.simulation import Engine, Physics, Readings, Run, Simulation, mocap_at
+from jaxsafe.envs.engines.simulation import Engine, Physics, PhysicsCall, Readings, Simulation, mocap_at
 
 State = dict[str, jax.Array]  # of a world between two substeps
 INTEGRATORS = {
@@ -55,7 +55,7 @@ def runner(
     model: mjx.Model,
     template: mjx.Data,
     most: int,  # substeps
-) -> Run:
+) -> PhysicsCall:
     integrate = INTEGRATORS[compiled.opt.integrator]
     ones, others = map(jnp.asarray, contact_geoms(simulation, compiled))
     orbits = simulation.orbits_of(compiled)

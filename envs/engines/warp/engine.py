@@ -29,7 +29,7 @@ from mujoco.mjx.third_party.mujoco_warp._src import (
 
 from jaxsafe.envs.engines.batching import batched
 from jaxsafe.envs.engines.rows import STATE, columns, pack, unpack, widths
-from jaxsafe.envs.engines.simulation import Engine, Physics, Run, Simulation
+from jaxsafe.envs.engines.simulation import Engine, Physics, PhysicsCall, Simulation
 from jaxsafe.envs.engines.warp.dynamics import adopt, forward, step, uncovered
 from jaxsafe.envs.engines.warp.solver import make_constraint, solve
 
@@ -156,7 +156,7 @@ def make(simulation: Simulation) -> Engine:
     model = simulation.compile(count=True)
     kernels = Kernels(simulation, model)
 
-    def runner(substeps: int) -> Run:
+    def runner(substeps: int) -> PhysicsCall:
         def launch(packed: wp.array2d[float], result: wp.array2d[float]):
             with one_at_a_time:
                 kernels.launch(packed, result, substeps)

@@ -1,7 +1,7 @@
-"""Measure a peer: python scripts/peers.py crax --num-envs 2048, one JSON line a measurement
+"""Measure a peer: python jaxsafe/commands/peers.py crax --num-envs 2048, one JSON line a measurement
 
 Run by the Python in which the peer is installed (peers pin other versions of MuJoCo than jaxsafe), or
-by `scripts/benchmark.py --peer crax=PYTHON`. It imports nothing of jaxsafe. Each peer runs its nearest
+by `jaxsafe benchmark --peer crax=PYTHON`. It imports nothing of jaxsafe. Each peer runs its nearest
 task with its own defaults:
 
     crax              safe_goal_point, level 1 (4 substeps, no vase): steps, and its PPO-Lagrangian

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from jaxsafe.learn.constraints import in_words
+from jaxsafe.learn.constraints import limits_in_words
 from jaxsafe.report import scores, stats, tables
 from jaxsafe.report.group import Group, Suite, differing, suite, tasks_of
 from jaxsafe.report.published import Published, beside
@@ -31,7 +31,7 @@ def results(
     """Return or cost: a row a setting, with what was published below it, and a column a task."""
     envs = tasks_of(groups)
     at = {(g.name, g.env): g for g in groups}
-    limits = {in_words(g.limits) for g in groups}
+    limits = {limits_in_words(g.limits) for g in groups}
     safe = [g for g in groups if g.held == "yes" and not np.isnan(g.ret.mean) and len(limits) == 1]
     best = {env: max((g.ret.mean for g in safe if g.env == env), default=None) for env in envs}
     rows = []
@@ -74,7 +74,7 @@ def details(groups: Sequence[Group]) -> list[Table]:
         [
             f"`{g.env}`", f"`{g.name}`", str(len(g.costs)), f"{g.steps:,}",
             *(tables.cell(g.estimate(m, stats.iqm)) for m in ("return", "cost")),
-            in_words(g.limits), g.held,
+            limits_in_words(g.limits), g.held,
             *(tables.cell(g.estimate(m), ".3g") for m in known),
         ]
         for g in groups
@@ -181,8 +181,10 @@ def notes(groups: Sequence[Group]) -> list[str]:
         lines.append(f"averaged over {name} ({', '.join(map(str, values))})")
     for run in (run for g in groups for run in g.runs):
         if not run.ended:
-            total = run.config.get("total_updates") or run.config["total_steps"]
-            lines.append(f"unfinished: {run.config['run_dir']}, at {run.steps:,} of {total:,} steps")
+            done, end, unit = run.progress
+            lines.append(f"unfinished: {run.config['run_dir']}, at {done:,} of {end:,} {unit}")
+        if run.estimated:
+            lines.append(f"estimates, as no episode ended yet: {run.config['run_dir']}")
     envs = tasks_of(groups)
     if left := [env for env in envs if env not in suite(groups).tasks]:
         lines.append(f"not in comparisons across tasks, as a setting lacks them: {', '.join(left)}")

@@ -14,15 +14,13 @@ import csv
 import io
 import json
 import re
-import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxsafe.config import ConfigError
-from jaxsafe.run import run_folder
+from jaxsafe.run import files
 
 ROW = ("run", "env", "algo", "settings", "seed", "state", "steps")
 CURVES = ("train/return", "train/cost", "train/cost_rate")  # as metrics.csv calls them
@@ -58,7 +56,7 @@ class Condensed(NamedTuple):
 
 
 def there(folder: Path) -> bool:
-    return (folder / "final.csv").is_file()
+    return files.there(folder / "final.csv")
 
 
 def name_of(run: str) -> str:
@@ -75,18 +73,20 @@ def read(folder: Path) -> Condensed:
     """
     if not there(folder):
         return Condensed([], {}, {})
-    try:
-        with (folder / "final.csv").open(newline="") as file:
-            rows = list(csv.DictReader(file))
-        with np.load(folder / "curves.npz", allow_pickle=False) as file:
-            keys = zip(file["run"].tolist(), file["seed"].tolist(), strict=True)
-            curves = dict(zip(keys, file["curves"], strict=True))
-            saved = json.loads(str(file["settings"]))
+    text = files.read_text(folder / "final.csv")
+    found = files.read_arrays(folder / "curves.npz")
+    with files.reading(folder):
+        rows = list(csv.DictReader(io.StringIO(text, newline="")))
+        if not all(isinstance(x, str) for row in rows for x in (*row.keys(), *row.values())):
+            raise ValueError("final.csv has rows of another length than its header")
+        keys = zip(found["run"].tolist(), found["seed"].tolist(), strict=True)
+        curves = dict(zip(keys, found["curves"], strict=True))
+        saved = json.loads(str(found["settings"]))
         settings = {run: saved["common"] | own for run, own in saved["runs"].items()}
         if any((row["run"], row["seed"]) not in curves or row["run"] not in settings for row in rows):
-            raise ConfigError("curves.npz lacks rows of final.csv")
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, zipfile.BadZipFile) as error:
-        raise ConfigError(f"{folder} cannot be read: {' '.join(str(error).split())}") from error
+            raise ValueError("curves.npz lacks rows of final.csv")
+        if found["curves"].shape[1:] != (len(CURVES), POINTS) or found["curves"].dtype.kind != "f":
+            raise ValueError(f"curves.npz has curves {found['curves'].dtype}{found['curves'].shape}")
     return Condensed(rows, curves, settings)
 
 
@@ -106,10 +106,8 @@ def write(folder: Path, runs: Condensed) -> None:
     writer = csv.DictWriter(text, header, restval="", lineterminator="\n")
     writer.writeheader()
     writer.writerows(runs.rows)
-    part = folder / "curves.npz.part"
-    part.write_bytes(packed.getvalue())
-    part.replace(folder / "curves.npz")
-    run_folder.replace_text(folder / "final.csv", text.getvalue())
+    files.write(folder / "curves.npz", packed.getvalue())
+    files.write(folder / "final.csv", text.getvalue())
 
 
 def apart(settings: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

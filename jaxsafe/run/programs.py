@@ -35,20 +35,21 @@ class Member(NamedTuple):
         return run_folder.setting_name(self.swept)
 
 
-def members(configs: Sequence[Any], settings: TrainConfig) -> list[Member]:
+def members(configs: Sequence[Any], train_cfg: TrainConfig) -> list[Member]:
     """Every setting with every seed, seeds fastest."""
     plain = [flat({"algo": dataclasses.asdict(c)}) for c in configs]
     swept = [name for name, value in plain[0].items() if any(c[name] != value for c in plain)]
     return [
-        Member(cfg, settings.seed + i, {name: values[name] for name in swept})
+        Member(cfg, train_cfg.seed + i, {name: values[name] for name in swept})
         for cfg, values in zip(configs, plain, strict=True)
-        for i in range(settings.num_seeds)
+        for i in range(train_cfg.num_seeds)
     ]
 
 
 class Program(NamedTuple):
     """`init(start, shared) -> ts` and `update(ts, shared) -> (ts, metrics)` over the leading axis, not
-    yet compiled. `params(ts)` is what acts, on the same axis; `clocks` are those of one seed."""
+    yet compiled. `params(ts)` are the policies' parameters, on the same axis. `clocks` are of one seed.
+    """
 
     init: Callable[[PyTree, Shared], PyTree]
     update: Callable[[PyTree, Shared], tuple[PyTree, dict[str, jax.Array]]]
@@ -65,21 +66,21 @@ class Program(NamedTuple):
 
 
 def build(
-    env: Env, make: Callable, configs: Sequence[Any], settings: TrainConfig, data: PyTree = ()
+    env: Env, make: Callable, configs: Sequence[Any], train_cfg: TrainConfig, data: PyTree = ()
 ) -> Program:
-    """Spread one algorithm over settings, seeds and devices.
+    """The program of one algorithm over settings, seeds and devices.
 
     Args:
         env: the environment.
         make: `make(env, axis_name) -> Algorithm` of the algorithm.
         configs: its config in each setting; they differ in floats alone.
-        settings: seeds and devices.
+        train_cfg: seeds and devices.
         data: the data set, for an algorithm that takes no environment steps.
     Raises:
         ConfigError: the members, or the environments of a lone one, do not split over the devices; a
             data set that is missing, or that the algorithm has no use for.
     """
-    devices, run = settings.devices, members(configs, settings)
+    devices, run = train_cfg.devices, members(configs, train_cfg)
     share = devices if len(run) == 1 else 1  # devices among which the environments of one are split
     if len(run) % devices and share == 1:
         raise ConfigError(
@@ -90,7 +91,7 @@ def build(
     clocks = algo.clocks(configs[0])
     clocks = clocks._replace(steps=clocks.steps * raw_steps(env))
     if data and clocks.steps:
-        raise ConfigError(f"dataset={settings.dataset}: this algorithm learns from no data set")
+        raise ConfigError(f"dataset={train_cfg.dataset}: this algorithm learns from no data set")
     if not data and not clocks.steps:
         raise ConfigError("an offline algorithm learns from a data set: give dataset=PATH")
     if share > 1 and not clocks.steps:
@@ -99,7 +100,7 @@ def build(
         )
     if share > 1 and configs[0].num_envs % share:
         raise ConfigError(f"num_envs={configs[0].num_envs} does not split over devices={devices}")
-    iterations = float(clock.iterations(settings, clocks))
+    iterations = float(clock.iterations(train_cfg, clocks))
 
     def settled(cfg: Any) -> Any:
         ends = iterations if math.isinf(cfg.total_iterations) else cfg.total_iterations

@@ -4,9 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from jaxsafe.report import plots, tables
-from jaxsafe.report.group import Group, suite
-from jaxsafe.report.published import Published, beside
-from jaxsafe.report.results import (
+from jaxsafe.report.comparison_tables import (
     SCORES,
     across,
     aggregates,
@@ -17,7 +15,9 @@ from jaxsafe.report.results import (
     notes,
     results,
 )
-from jaxsafe.run import run_folder
+from jaxsafe.report.group import Group, suite
+from jaxsafe.report.published import Published, beside
+from jaxsafe.run import files
 
 
 def write(
@@ -35,11 +35,11 @@ def write(
     remarks = notes(groups)
     parts = [f"{t.caption}\n\n{tables.markdown(t)}" for t in (*main, *rest)]
     text = "\n".join([*parts, *([f"Notes: {'; '.join(remarks)}.\n"] if remarks else [])])
-    out.mkdir(parents=True, exist_ok=True)
-    run_folder.replace_text(out / "results.md", text)
+    files.make_folder(out)
+    files.write(out / "results.md", text)
     latex = [f"% {line}\n" for line in remarks] + [tables.latex(t) for t in (*main, *rest)]
-    run_folder.replace_text(out / "results.tex", "\n".join(latex))
-    run_folder.replace_text(out / "results.csv", as_csv(groups, both, found, pairs))
+    files.write(out / "results.tex", "\n".join(latex))
+    files.write(out / "results.csv", as_csv(groups, both, found, pairs))
     plots.save(plots.learning(groups), out / "curves")
     known = {(g.env, g.name): beside(g, published) for g in groups}
     plots.save(plots.trade_off(groups, "last 10 % of training", known), out / "trade_off")

@@ -1,0 +1,229 @@
+"""Measure environments and fused training: jaxsafe benchmark point_goal1 --num-envs 1024
+
+Each row is one program, compiled apart from its runs: the median of `--repeats` runs, after as many
+as make `--warmup` steps of each environment: fresh layouts, where nothing touches yet, are faster.
+With `--algo` a row is the algorithm's whole update, else random actions, resets included. A physics
+step is one substep; the forward pass at the end of a step is not counted.
+"""
+
+import argparse
+import json
+import os
+import platform
+import resource
+import statistics
+import subprocess
+import sys
+import time
+from importlib.metadata import version
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsafe import algos, envs
+from jaxsafe.commands.guard import guarded
+from jaxsafe.config import Amount, ConfigError, Devices, Iterations, Period
+from jaxsafe.learn.rollout import collect, init_rollout, memoryless
+from jaxsafe.run import run_folder
+from jaxsafe.run.arguments import fail, number
+from jaxsafe.run.devices import check_devices, device_name, use_compilation_cache
+from jaxsafe.run.programs import build
+from jaxsafe.run.settings import TrainConfig, find_algo
+from jaxsafe.types import Shared
+
+
+def timed(fn, *args, before: int, repeats: int) -> tuple[float, list[float]]:
+    """Compile time, then the run times of `state = fn(state)` after some `before`, in seconds."""
+    start = time.perf_counter()
+    compiled = jax.jit(fn, donate_argnums=0).lower(*args).compile()
+    compile_time, runs = time.perf_counter() - start, []
+    state = args[0]
+    for _ in range(before + repeats):
+        start = time.perf_counter()
+        state = jax.block_until_ready(compiled(state))
+        runs.append(time.perf_counter() - start)
+    return compile_time, runs[before:]
+
+
+def stepping(env, num_envs: int, seeds: int, horizon: int):
+    """(state, fn): `horizon` steps of random actions, with resets."""
+
+    def policy(obs, key):
+        action = jax.random.uniform(key, (num_envs, env.action_size), minval=-1.0, maxval=1.0)
+        return action, jnp.zeros(num_envs)
+
+    def run(state):
+        rollout, key = state
+        key, next_key = jax.random.split(key)
+        rollout, trajectory = collect(env, memoryless(policy), rollout, key, horizon)
+        return (rollout, next_key), trajectory.reward.sum() + trajectory.obs.sum()
+
+    def init(key):
+        reset_key, key = jax.random.split(key)
+        return init_rollout(env, reset_key, num_envs, stagger=True), key
+
+    return per_seed(init, seeds), lambda state: jax.vmap(run)(state)[0]
+
+
+def training(env, algo: str, cfg, seeds: int, devices: int):
+    """(state, fn): one update of `algo`."""
+    settings = TrainConfig(num_seeds=seeds, devices=devices)
+    check_devices(settings)
+    program = build(env, algos.ALGOS[algo].make, [cfg], settings)
+    shared = Shared(np.int32(0))
+    state = jax.jit(program.init)(jax.device_put(program.start, program.sharding), shared)
+    return state, lambda ts: program.update(ts, shared)[0]
+
+
+def per_seed(init, seeds: int):
+    return jax.jit(jax.vmap(init))(jax.random.split(jax.random.key(0), seeds))
+
+
+def memory() -> int:
+    """Most bytes in use so far: on the device, Warp's included, or of this process on a CPU."""
+    stats = jax.local_devices()[0].memory_stats()
+    if stats and "peak_bytes_in_use" in stats:
+        warp = sys.modules.get("warp")  # imported by its engine
+        apart = warp.get_mempool_used_mem_high("cuda:0") if warp else 0
+        return stats["peak_bytes_in_use"] + apart
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+def measure(name: str, num_envs: int, args: argparse.Namespace) -> dict:
+    options = {} if args.awake is None else {"awake": args.awake}
+    env = envs.make(name, engine=args.engine, **options)
+    if args.algo:
+        config = algos.ALGOS[args.algo].config
+        cfg = config(num_envs=num_envs, **({"horizon": args.horizon} if args.horizon else {}))
+        horizon = cfg.horizon
+        state, fn = training(env, args.algo, cfg, args.seeds, args.devices)
+    else:
+        horizon = args.horizon or 100
+        state, fn = stepping(env, num_envs, args.seeds, horizon)
+    before = max(1, -(-args.warmup // horizon))
+    compile_time, runs = timed(fn, state, before=before, repeats=args.repeats)
+    seconds = statistics.median(runs)
+    rate = num_envs * horizon * args.seeds / seconds
+    return {
+        "env": name,
+        "engine": env.engine,
+        "awake": args.awake,
+        "algo": args.algo,
+        "num_envs": num_envs,
+        "num_seeds": args.seeds,
+        "devices": args.devices if args.algo else 1,
+        "horizon": horizon,
+        "warmup": before * horizon,
+        "env_steps_per_s": rate,
+        "physics_steps_per_s": rate * env.config.frameskip_binom_n,
+        "simulated_s_per_s": rate * env.step_seconds,
+        "fastest": num_envs * horizon * args.seeds / min(runs),
+        "slowest": num_envs * horizon * args.seeds / max(runs),
+        "compile_s": compile_time,
+        "memory_bytes": memory(),
+    }
+
+
+def measure_peer(spec: str) -> list[dict]:
+    """The rows of peers.py, by the Python that has the peer installed."""
+    name, _, python = spec.partition("=")
+    script = Path(__file__).with_name("peers.py")
+    try:
+        done = subprocess.run(
+            [python or sys.executable, script, name], stdout=subprocess.PIPE, text=True
+        )
+    except OSError as error:
+        raise ConfigError(f"--peer {spec}: {error.strerror}: {python}") from None
+    if done.returncode:
+        raise ConfigError(f"--peer {spec}: it ended with status {done.returncode}; see above")
+    return [json.loads(line) for line in done.stdout.splitlines()]
+
+
+def versions() -> dict[str, str]:
+    packages = ("jax", "mujoco", "mujoco-mjx", "warp-lang", "jaxsafe")
+    found = {"python": platform.python_version(), "device": device_name(), "cores": str(os.cpu_count())}
+    for package in packages:
+        try:
+            found[package] = version(package)
+        except ImportError:
+            continue
+    return found
+
+
+def show(row: dict) -> str:
+    what = row["algo"] or "steps"
+    return (
+        f"{row['env']:<16} {row['engine']:<5} {what:<8} {row['num_seeds']:>3} x {row['num_envs']:<6} "
+        f"{row['env_steps_per_s']:>11,.0f} {row['physics_steps_per_s']:>12,.0f} "
+        f"{row['simulated_s_per_s']:>10,.0f} {row['compile_s']:>8.1f} "
+        f"{row['memory_bytes'] / 2**30:>7.2f}"
+    )
+
+
+def show_peer(row: dict) -> str:
+    what = f"{row['peer']}: {row['algo'] or 'steps'}"
+    return f"{row['env']:<22} {what:<14} {row['num_envs']:>6} {row['env_steps_per_s']:>11,.0f}"
+
+
+def main() -> int:
+    """Exit status: 2 for bad input, 1 where the memory is too small."""
+    return guarded(command)
+
+
+def command() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.error = fail  # type: ignore[method-assign]
+    parser.add_argument("envs", nargs="*", metavar="ENV")
+    parser.add_argument(
+        "--num-envs", type=number(Amount), nargs="+", default=[256], help="of each seed"
+    )
+    parser.add_argument("--seeds", type=number(Devices), default=1)
+    parser.add_argument(
+        "--devices", type=number(Devices), default=1, help="over which --algo splits its seeds"
+    )
+    parser.add_argument("--engine", default="auto", help="auto, c, warp or jax")
+    parser.add_argument(
+        "--awake", type=number(Iterations), metavar="K", help="vases, and gremlins, simulated at once"
+    )
+    parser.add_argument("--algo", help="measure its update instead of random actions")
+    parser.add_argument("--horizon", type=number(Amount), help="steps of each environment in a run")
+    parser.add_argument(
+        "--warmup", type=number(Period), default=200, help="steps of each environment before"
+    )
+    parser.add_argument("--repeats", type=number(Iterations), default=5)
+    parser.add_argument(
+        "--peer", nargs="*", default=[], metavar="NAME=PYTHON", help="also measure crax, ... (peers.py)"
+    )
+    parser.add_argument("--json", type=Path, help="append the rows to this file, a line each")
+    args = parser.parse_args()
+    if args.algo:
+        find_algo(args.algo)
+    for name in args.envs:
+        envs.check_options(name, engine=args.engine)
+    use_compilation_cache()
+    about = versions()
+    print(f"{' '.join(f'{k} {v}' for k, v in about.items())}")
+    print(
+        f"{'env':<16} {'engine':<5} {'what':<8} {'seeds x envs':<12} {'env steps/s':>11} "
+        f"{'physics/s':>12} {'sim s/s':>10} {'compile':>8} {'GiB':>7}"
+    )
+
+    def keep(row: dict) -> None:
+        if args.json:
+            with args.json.open("a") as file:
+                command = " ".join(sys.argv)
+                row = row | {"command": command, "commit": run_folder.commit(), **about}
+                file.write(json.dumps(row) + "\n")
+
+    for name in args.envs:
+        for num_envs in args.num_envs:
+            row = measure(name, num_envs, args)
+            print(show(row), flush=True)
+            keep(row)
+    for spec in args.peer:
+        for row in measure_peer(spec):
+            print(show_peer(row), flush=True)
+            keep(row)
+    return 0

@@ -1,0 +1,147 @@
+"""From a command of AMBS, or of ALF with SEditor's configs, to the nearest command line here.
+
+    jaxsafe migrate ambs "python train.py --task safetygym_Safexp-PointGoal1-v0 --run.steps 500000"
+    jaxsafe migrate alf "python -m alf.bin.train --conf seditor_safety_gym_conf.py --conf_param=..."
+
+Their algorithms are not here yet: the command has their task, seed, steps and environments, and the
+default algorithm. Source: the READMEs and configs of sacktock/AMBS @5184901 and hnyu/seditor @f78b720.
+"""
+
+import ast
+import shlex
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from jaxsafe import envs
+from jaxsafe.config import ConfigError, Seed, convert, nearest
+from jaxsafe.interop.migrate import Line, Migrated, as_option
+from jaxsafe.run.settings import nested, settings_from_options
+
+AMBS_REPEAT = 2  # raw steps in a step, of its safetygym configs
+SEDITOR: dict[str, Any] = {  # what its configs for Safety Gym have
+    "num_envs": 32,
+    "total_steps": 5_000_000,
+    "algo.cost_limit": 0.5,  # E[cost > 0] <= 5e-4 a step, over 1,000 steps
+    "env.wrap.frame_stack": 4,
+}
+
+
+class Flag(NamedTuple):
+    """What becomes of a flag: `turn(value)` gives options, `note` says why there is none."""
+
+    turn: Callable[[Any], dict[str, Any]] = lambda value: {}
+    note: str = ""
+    lost: bool = True
+
+
+def ambs_task(value: str) -> dict[str, Any]:
+    suite, _, name = value.partition("_")
+    if suite != "safetygym":
+        raise ConfigError(f"--task {value} has no counterpart: of AMBS's tasks we have Safety Gym's")
+    return {"env": envs.canonical(name)}
+
+
+def ambs_steps(value: Any) -> dict[str, Any]:
+    return {"total_steps": AMBS_REPEAT * convert(value, int, "--run.steps")}
+
+
+SHIELD = "the shield and its penalties are not available yet"
+AMBS: dict[str, Flag] = {
+    "task": Flag(ambs_task),
+    "seed": Flag(lambda value: {"seed": convert(value, Seed, "--seed")}),
+    "run.steps": Flag(ambs_steps),
+    "envs.amount": Flag(lambda value: {"num_envs": value}),
+    "logdir": Flag(note="run_dir names a run's folder", lost=False),
+    "configs": Flag(note="sizes of a world model, and pixels, which are not available yet"),
+    "penalty_coeff": Flag(note=SHIELD),
+    "plpg": Flag(note=SHIELD),
+    "copt": Flag(note=SHIELD),
+    "penl_critic_type": Flag(note=SHIELD),
+    "normalise_ret": Flag(note=SHIELD),
+}
+ALF: dict[str, Flag] = {
+    "create_environment.env_name": Flag(lambda value: {"env": envs.canonical(str(value))}),
+    "create_environment.num_parallel_environments": Flag(lambda value: {"num_envs": value}),
+    "TrainerConfig.num_env_steps": Flag(lambda value: {"total_steps": value}),
+    "TrainerConfig.random_seed": Flag(lambda value: {"seed": value}),
+    "root_dir": Flag(note="run_dir names a run's folder", lost=False),
+}
+
+
+def ambs(command: str) -> Migrated:
+    """The command line for a command of AMBS.
+
+    Raises:
+        ConfigError: a task without counterpart, no task, or a value that cannot be.
+    """
+    flags = dict(flags_of(command))
+    found, lines = turned(flags, AMBS)
+    lines.append(Line("algo", "AMBS", "approximate model-based shielding is not available yet", True))
+    return migrated({"env.wrap.action_repeat": AMBS_REPEAT} | found, lines, "--task")
+
+
+def alf(command: str) -> Migrated:
+    """The command line for a command of ALF with one of SEditor's configs. Raises as `ambs`."""
+    flags: dict[str, Any] = {}
+    conf = ""
+    for name, value in flags_of(command):
+        if name == "conf":
+            conf = value
+        elif name == "conf_param":
+            key, _, text = value.partition("=")
+            flags[key.strip()] = literal(text.strip())
+        else:
+            flags[name] = value
+    if "seditor" not in conf and "sac_safety_gym" not in conf:
+        raise ConfigError(f"--conf {conf or '?'}: expected SEditor's, as in seditor_safety_gym_conf.py")
+    if "racing" in conf:
+        raise ConfigError(f"--conf {conf} has no counterpart: of SEditor's tasks we have Safety Gym's")
+    found, lines = turned(flags, ALF)
+    lines.append(Line("conf", conf, "SEditor and SAC-Lagrangian are not available yet", True))
+    lines.append(Line("safety_gym", "a fork", "its layouts and lidars differ from Safety Gym's", True))
+    return migrated(SEDITOR | found, lines, "create_environment.env_name")
+
+
+def flags_of(command: str) -> list[tuple[str, str]]:
+    """(name, value) of --name value ..., --name=value; several values with spaces between."""
+    try:
+        words = shlex.split(command)
+    except ValueError as error:
+        raise ConfigError(f"cannot read the command: {error}") from error
+    found: list[tuple[str, str]] = []
+    for word in words:
+        if word.startswith("--"):
+            name, _, value = word[2:].partition("=")
+            found.append((name, value))
+        elif found:
+            name, value = found[-1]
+            found[-1] = name, f"{value} {word}".strip()
+    return found
+
+
+def literal(text: str) -> Any:
+    """The Python literal that ALF reads; its text if it is none. Executes nothing."""
+    try:
+        return ast.literal_eval(text)
+    except (ValueError, SyntaxError, RecursionError, MemoryError):
+        return text
+
+
+def turned(flags: dict[str, Any], rules: dict[str, Flag]) -> tuple[dict[str, Any], list[Line]]:
+    found: dict[str, Any] = {}
+    lines = []
+    for name, value in flags.items():
+        value = literal(value) if isinstance(value, str) else value
+        rule = rules.get(name, Flag(note=f"no option{nearest(name, rules)}"))
+        options = rule.turn(value)
+        found |= options
+        text = " ".join(as_option(k, v) for k, v in options.items()) or rule.note
+        lines.append(Line(name, value, text, lost=not options and rule.lost))
+    return found, lines
+
+
+def migrated(options: dict[str, Any], lines: list[Line], task: str) -> Migrated:
+    if "env" not in options:
+        raise ConfigError(f"the command names no task: expected {task}")
+    settings_from_options(nested(options))
+    return Migrated([as_option(k, v) for k, v in options.items()], lines)

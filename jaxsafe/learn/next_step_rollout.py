@@ -1,0 +1,111 @@
+"""Rollouts for a replay: environments that reset on the step after an episode's last one.
+
+The last observation of an episode so gets a record of its own, whose action is ignored, and the next
+record is the first of the next episode: see `jaxsafe.learn.replay`.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import NamedTuple
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from jaxsafe.learn.batch import select_rows
+from jaxsafe.learn.replay import Record
+from jaxsafe.learn.rollout import Bad, Episode, RolloutState, bad_of, mended, restart, sums
+from jaxsafe.types import Env, State
+
+
+@flax.struct.dataclass
+class Stepping:
+    """N environments, and how each arrived where it is: bool [N]."""
+
+    rollout: RolloutState
+    first: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+
+
+class StepRecord(NamedTuple):
+    """What T steps of N environments came to, [T, N]. A reset and a bad step are none: `real` is false.
+
+    ended marks complete episodes that end with the step; episode and length are their sums.
+    """
+
+    real: jax.Array
+    reward: jax.Array
+    cost: jax.Array
+    ended: jax.Array
+    episode: Episode
+    length: jax.Array
+    bad: Bad
+
+
+def started(rollout: RolloutState) -> Stepping:
+    """Environments that have just been reset."""
+    no = jnp.zeros(rollout.steps.shape, bool)
+    return Stepping(rollout, first=~no, terminated=no, truncated=no)
+
+
+def arrival_record(stepping: Stepping, action: jax.Array) -> Record:
+    """The records [N, ...] of where the environments are, with the actions that they take there."""
+    state = stepping.rollout.state
+    return Record(
+        obs=state.obs,
+        action=action,
+        reward=state.reward,
+        cost=state.cost,
+        costs=state.costs,
+        first=stepping.first,
+        terminated=stepping.terminated,
+        truncated=stepping.truncated,
+    )
+
+
+def collect_records(
+    env: Env, act: Callable[[jax.Array, jax.Array], jax.Array], stepping: Stepping, keys: jax.Array
+) -> tuple[Stepping, tuple[Record, StepRecord]]:
+    """One step of every environment for each of `keys` [T], or a reset where its episode has ended.
+
+    Args:
+        act: (obs [N, O], key) -> action [N, A].
+    Returns:
+        The environments afterwards, and the records, [T, N, ...].
+    """
+
+    def step(now: Stepping, key: jax.Array) -> tuple[Stepping, tuple[Record, StepRecord]]:
+        act_key, reset_key = jax.random.split(key)
+        record = arrival_record(now, act(now.rollout.state.obs, act_key))
+        state = jax.vmap(env.step)(now.rollout.state, record.action)
+        rollout = dataclasses.replace(
+            now.rollout,
+            state=state,
+            steps=now.rollout.steps + 1,
+            episode=jax.tree.map(jnp.add, now.rollout.episode, sums(state)),
+        )
+        rollout = restart(env, rollout, record.last, reset_key)
+        bad = bad_of(rollout.state)
+        rollout = dataclasses.replace(rollout, state=marked(rollout.state, bad, record.obs))
+        terminated = rollout.state.terminated & ~bad.any
+        truncated = ((rollout.steps >= env.episode_length) | bad.any) & ~terminated
+        came_to = StepRecord(
+            real=~record.last & ~bad.any,
+            reward=rollout.state.reward,
+            cost=rollout.state.cost,
+            ended=(terminated | truncated) & rollout.complete & ~bad.any,
+            episode=rollout.episode,
+            length=rollout.steps,
+            bad=bad,
+        )
+        return Stepping(rollout, record.last, terminated, truncated), (record, came_to)
+
+    return jax.lax.scan(step, stepping, keys)
+
+
+def marked(state: State, bad: Bad, before: jax.Array) -> State:
+    """`state` with a reward of NaN in bad worlds, so that no transition that leads there counts. What
+    they observe is what they did `before`, [N, O]."""
+    state = dataclasses.replace(mended(state, bad), obs=select_rows(bad.any, before, state.obs))
+    return dataclasses.replace(state, reward=jnp.where(bad.any, jnp.nan, state.reward))

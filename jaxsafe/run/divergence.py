@@ -1,0 +1,94 @@
+"""Whether the members of a run still learn, and what stopped being finite first where one does not."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsafe.run import checkpoint
+from jaxsafe.run.programs import Member
+from jaxsafe.types import PyTree
+
+PATIENCE = 10  # iterations without any learning, after which a member is given up
+KINDS = {"obs": "observation", "reward": "reward", "cost": "cost"}  # train/bad_obs, ...
+
+
+class Diverged(RuntimeError):
+    """No member of a run learns any more. The message is one line for the user."""
+
+
+class Health(NamedTuple):
+    """Of what acts of M members.
+
+    finite: by name of a parameter, bool [M].
+    mark: uint32 [M], another one whenever a parameter changes, but for about one case in 4e9.
+    """
+
+    finite: dict[str, jax.Array]
+    mark: jax.Array
+
+
+def health(params: PyTree) -> Health:
+    """`Health` of `params` [M, ...], the settings among them left aside."""
+    named = dict(zip(checkpoint.leaf_names(params), jax.tree.leaves(params), strict=True))
+    learned = {k: x for k, x in named.items() if not k.startswith("config") and x.dtype == jnp.float32}
+    rows = {k: x.reshape(x.shape[0], -1) for k, x in learned.items()}
+
+    def mark(x: jax.Array) -> jax.Array:
+        bits = jax.lax.bitcast_convert_type(x, jnp.uint32)
+        return (bits * (2 * jnp.arange(x.shape[1], dtype=jnp.uint32) + 1)).sum(1)
+
+    total = sum(((i + 1) * mark(x) for i, x in enumerate(rows.values())), start=jnp.uint32(0))
+    return Health({k: jnp.isfinite(x).all(1) for k, x in rows.items()}, jnp.asarray(total))
+
+
+class Watch:
+    """Judges every iteration of a run.
+
+    Args:
+        members: of the run.
+        about: what to add on a member that is given up: its unusual settings.
+    """
+
+    def __init__(self, members: Sequence[Member], about: Callable[[Member], str]):
+        self.members, self.about = members, about
+        self.idle = np.zeros(len(members), int)  # iterations since a member last learned
+        self.mark: np.ndarray | None = None
+        self.lost: dict[int, str] = {}  # why, by member
+
+    def __call__(self, shown: str, values: Mapping[str, np.ndarray], now: Health) -> list[str]:
+        """What is new, a line for each member that is given up.
+
+        Args:
+            shown: how far training is, in words.
+            values: the metrics of the iteration, [M] by name.
+            now: after it.
+        """
+        count = len(self.members)
+        mark = np.asarray(now.mark)[:count]
+        same = np.zeros(count, bool) if self.mark is None else mark == self.mark
+        nothing = np.zeros(count)
+        unseen = np.isnan(values.get("train/return_estimate", nothing))  # every step was bad
+        self.idle = np.where(same & (values["train/nonfinite"] > 0) | unseen, self.idle + 1, 0)
+        self.mark, lines = mark, []
+        for i, member in enumerate(self.members):
+            first = next((k for k, x in now.finite.items() if not np.asarray(x)[i]), None)
+            if i in self.lost or (first is None and self.idle[i] < PATIENCE):
+                continue
+            what = f"{first} is not finite" if first else self.nothing_learned(i, values)
+            who = ", ".join([f"seed {member.seed}", *([member.setting] if member.setting else [])])
+            self.lost[i] = f"{f'{who} ' * (count > 1)}diverged at {shown}: {what}; {self.about(member)}"
+            lines.append(self.lost[i])
+        return lines
+
+    def nothing_learned(self, i: int, values: Mapping[str, np.ndarray]) -> str:
+        kinds = [word for k, word in KINDS.items() if values.get(f"train/bad_{k}", np.zeros(i + 1))[i]]
+        worlds = f"the {' and the '.join(kinds)} of worlds" if kinds else "the gradient of the loss"
+        return f"nothing was learned in {PATIENCE} iterations, as {worlds} is not finite"
+
+    @property
+    def over(self) -> bool:
+        """Whether no member is left."""
+        return len(self.lost) == len(self.members)

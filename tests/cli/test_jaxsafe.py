@@ -1,0 +1,81 @@
+"""One command, `jaxsafe`, for all that the scripts do."""
+
+import importlib
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from shell import SCRIPTS
+
+from jaxsafe.commands import jaxsafe
+from jaxsafe.commands.train import resume_command
+from jaxsafe.run.settings import settings_from_options
+
+
+def run(monkeypatch, *args: str) -> int | str | None:
+    monkeypatch.setattr(sys, "argv", ["/usr/bin/jaxsafe", *args])
+    try:
+        return jaxsafe.main()
+    except SystemExit as stop:
+        return stop.code
+
+
+@pytest.mark.parametrize("args", [(), ("--help",), ("-h",)])
+def test_alone_it_lists_every_command_on_one_screen(args, monkeypatch, capsys):
+    assert run(monkeypatch, *args) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) <= 24 and all(len(line) <= 80 for line in lines)
+    assert [line.split()[0] for line in lines if line.startswith("  ")] == [*jaxsafe.COMMANDS]
+
+
+def test_every_command_has_a_module_and_a_thin_script():
+    for name in jaxsafe.COMMANDS:
+        assert callable(importlib.import_module(f"jaxsafe.commands.{name}").main)
+        text = (SCRIPTS / f"{name}.py").read_text()
+        assert f"from jaxsafe.commands.{name} import main" in text and len(text.splitlines()) < 12
+
+
+def test_a_typo_names_the_nearest_command(monkeypatch, capsys):
+    assert run(monkeypatch, "trian", "algo=cpo") == 2
+    assert capsys.readouterr().err == "error: unknown command trian; did you mean 'train'?\n"
+
+
+WRONG = {
+    "train algo.lr=nan": "algo.lr=nan: expected",
+    "sweep algo.lr=0.1": "nothing to sweep",
+    "evaluate nowhere": "nowhere is not a run folder",
+    "plot nowhere": "nowhere",
+    "render nowhere --seed -1": "expected a whole number",
+    "watch nowhere": "nowhere is not a run folder",
+    "migrate omnisafe nowhere.json": "cannot read nowhere.json",
+    "benchmark point_gol1": "did you mean 'point_goal1'?",
+    "benchmark --algo nope": "unknown algo 'nope'",
+    "benchmark point_goal1 --num-envs -5": "expected a whole number between 1 and",
+    "study nothing": "no study nothing",
+}
+
+
+@pytest.mark.parametrize("line", WRONG)
+def test_bad_input_is_one_line_and_status_2(line, monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    assert run(monkeypatch, *line.split()) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("error: ") and err.count("\n") == 1 and WRONG[line] in err
+
+
+def test_what_continues_a_run_is_typed_as_it_was_begun(monkeypatch):
+    settings = settings_from_options({})
+    for argv, says in (
+        (["scripts/train.py"], "python scripts/train.py"),
+        (["jaxsafe train"], "jaxsafe train"),
+    ):
+        monkeypatch.setattr(sys, "argv", argv)
+        assert resume_command(settings, Path("runs/a")) == f"{says} resume=runs/a"
+
+
+def test_python_m_jaxsafe_is_the_command(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-m", "jaxsafe", "plott"], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert (done.returncode, done.stdout) == (2, "") and "did you mean 'plot'" in done.stderr

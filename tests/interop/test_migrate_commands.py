@@ -1,0 +1,74 @@
+"""Commands of AMBS and of ALF, as they stand in their READMEs."""
+
+import shlex
+
+import pytest
+from shell import typed
+
+from jaxsafe.config import ConfigError
+from jaxsafe.interop.migrate_commands import alf, ambs
+from jaxsafe.run.arguments import compose
+
+AMBS = (
+    "python train.py --logdir ./logdir/shield_plpg --configs safetygym_vision large "
+    "--task safetygym_Safexp-PointGoal1-v0 --penalty_coeff 0.8 --plpg True --normalise_ret False "
+    "--penl_critic_type vfunction --run.steps 500000 --seed 3"
+)
+ALF = (
+    "python -m alf.bin.train --root_dir=job --conf safety/seditor/seditor_safety_gym_conf.py "
+    "--conf_param=\"create_environment.env_name='Safexp-CarButton2-v0'\" "
+    "--conf_param 'TrainerConfig.random_seed=7'"
+)
+
+
+def test_a_command_of_ambs_keeps_task_seed_and_frames():
+    found = ambs(AMBS)
+    settings = compose(found.argv)
+    assert (settings.env_name, settings.train.seed) == ("point_goal1", 3)
+    assert settings.train.total_steps == 1_000_000  # frames: its steps have two raw ones
+    assert settings.env_options["wrap"]["action_repeat"] == 2
+    lost = {line.key for line in found.lines if line.lost}
+    assert lost == {"configs", "penalty_coeff", "plpg", "normalise_ret", "penl_critic_type", "algo"}
+
+
+def test_a_command_of_alf_keeps_task_seed_and_seditor_s_settings():
+    found = alf(ALF)
+    settings = compose(found.argv)
+    assert (settings.env_name, settings.train.seed, settings.algo.num_envs) == ("car_button2", 7, 32)
+    assert (settings.train.total_steps, settings.algo.cost_limit) == (5_000_000, 0.5)
+    assert settings.env_options["wrap"]["frame_stack"] == 4
+    assert {line.key for line in found.lines if line.lost} == {"conf", "safety_gym"}
+
+
+@pytest.mark.parametrize(
+    "migrate, command, says",
+    [
+        (ambs, "python train.py --task atari_seaquest", "we have Safety Gym's"),
+        (ambs, "python train.py --task safetygym_Safexp-PointGoal9-v0", "did you mean"),
+        (ambs, "python train.py --run.steps 5", "names no task: expected --task"),
+        (ambs, AMBS.replace("500000", "many"), "--run.steps='many': expected a whole number"),
+        (ambs, AMBS.replace("--seed 3", "--seed -3"), "--seed=-3: expected a whole number between 0"),
+        (ambs, 'python train.py --task "', "cannot read the command"),
+        (alf, "python -m alf.bin.train --conf atari_conf.py", "expected SEditor's"),
+        (alf, "python -m alf.bin.train --conf seditor_safe_car_racing_conf.py", "Safety Gym's"),
+        (alf, ALF.replace("random_seed=7", "num_env_steps=0"), "total_steps=0: expected"),
+    ],
+)
+def test_what_has_no_counterpart_at_all_is_one_line(migrate, command, says):
+    with pytest.raises(ConfigError) as error:
+        migrate(command)
+    assert says in str(error.value) and "\n" not in str(error.value)
+
+
+def test_an_unknown_flag_is_named_with_the_nearest():
+    lines = ambs(AMBS + " --penalty_coef 2").lines
+    (line,) = [line for line in lines if line.key == "penalty_coef"]
+    assert line.lost and "did you mean 'penalty_coeff'" in line.text
+
+
+@pytest.mark.parametrize("source, command", [("ambs", AMBS), ("alf", ALF)])
+def test_the_command_prints_what_to_type_and_what_is_lost(source, command, capsys):
+    assert typed("migrate", source, command) == 0
+    out, err = capsys.readouterr()
+    assert compose(shlex.split(out)[2:]).train.seed in (3, 7)
+    assert err.count("no counterpart: ") >= 2 and "not available yet" in err
