@@ -1,25 +1,37 @@
-"""Soft actor-critic, for a thousand environments or for one."""
+"""Soft actor-critic, and with each treatment of the constraint, for a thousand environments or one."""
 
+from functools import partial
 from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
 import optax
 
-from jaxsafe.config import Bounds, Iterations, Rate, config
-from jaxsafe.learn.batch import pmean, select
-from jaxsafe.learn.learner import GradientStep, Learner
-from jaxsafe.learn.off_policy import OffPolicyConfig, off_policy
-from jaxsafe.learn.replay import Transitions
+from jaxsafe.config import Bounds, Rate, config
+from jaxsafe.learn.actor_critic import (
+    Actor,
+    ActorCriticConfig,
+    CostCriticConfig,
+    Proposal,
+    actor_critic,
+)
+from jaxsafe.learn.off_policy import off_policy
 from jaxsafe.learn.row import Row
-from jaxsafe.learn.steps import Trainable, adam
-from jaxsafe.nn.critics import init_critics, q_values
+from jaxsafe.learn.steps import adam
+from jaxsafe.learn.treatments import (
+    LagrangianConfig,
+    PIDConfig,
+    Treatment,
+    lagrangian,
+    no_treatment,
+    pid,
+)
 from jaxsafe.nn.squashed import init_squashed, squashed_mean, squashed_policy, squashed_sample
-from jaxsafe.types import Algorithm, Env, Metrics, PyTree
+from jaxsafe.types import Algorithm, Env, PyTree
 
 
 @config
-class SACConfig(OffPolicyConfig):
+class SACConfig(ActorCriticConfig):
     """SAC: soft actor-critic, blind to cost.
 
         y = r + discount (1 - terminated) (min_i Q'_i(s', a') - alpha log pi(a' | s')),   a' ~ pi(s')
@@ -43,92 +55,90 @@ class SACConfig(OffPolicyConfig):
     alpha_lr: Rate = 3e-4
     # The entropy that alpha aims at, in nats for each dimension of the action, as in the paper.
     target_entropy: Annotated[float, Bounds(-100, 100)] = -1.0
-    # Gradient steps of the critics for each one of policy, alpha and targets. The paper has 1.
-    policy_delay: Iterations = 1
 
 
-def init(key: jax.Array, obs_size: int, action_size: int, cfg: Any) -> Trainable:
-    actor_key, critic_key = jax.random.split(key)
-    critics = init_critics(critic_key, obs_size, action_size, 2, cfg)
-    params = {
-        "actor": init_squashed(actor_key, obs_size, action_size, cfg),
-        "critic_r": critics,
-        "target_r": critics,
-        "log_alpha": jnp.log(cfg.alpha_init),
-    }
-    opt_state = {
-        "actor": adam(cfg.lr, cfg).init(params["actor"]),
-        "critic_r": adam(cfg.critic_lr, cfg).init(critics),
-        "log_alpha": optax.adam(cfg.alpha_lr).init(params["log_alpha"]),
-    }
-    return Trainable(params, opt_state)
+@config
+class SACLagConfig(LagrangianConfig, CostCriticConfig, SACConfig):
+    """SAC-Lagrangian: SAC whose policy pays for cost at an adaptive price.
+
+        y_c = c + cost_discount (1 - terminated) reduce_j Q'_cj(s', a'),   a' ~ pi(s'), as for y
+        minimise_Q    E[sum_j (Q_cj(s, a) - y_c)^2], and the loss of Q as in SAC
+        maximise_pi   E[(min_i Q_i(s, a) - alpha log pi(a | s) - lam Q_c(s, a)) / (1 + lam)]
+        minimise_lam  -lam (J_c - cost_limit),  lam >= 0,  by Adam, once every `dual_every` steps
+
+    J_c is what an episode has cost since lam last moved. The rest is as in SAC.
+
+    Source: Ray, Achiam and Amodei (2019), "Benchmarking Safe Exploration in Deep Reinforcement
+    Learning", for the multiplier; Ha et al. (2020), "Learning to Walk in the Real World with Minimal
+    Human Effort", arXiv:2002.08550, for SAC with one.
+    Differs from OmniSafe: there lam moves at every gradient step, so that its speed depends on
+    `replay_ratio`. There is one critic of cost, and its target takes the policy's mean action.
+    """
 
 
-def learner(action_size: int) -> Learner:
-    def pi(actor: PyTree, obs: jax.Array, cfg: Any):
-        return squashed_policy(actor, obs, action_size, cfg)
+@config
+class SACPIDConfig(PIDConfig, CostCriticConfig, SACConfig):
+    """SAC-PID: SAC whose price on cost is the output of a PID controller.
 
-    def act(params: PyTree, obs: jax.Array, key: jax.Array | None, cfg: Any) -> jax.Array:
-        dist = pi(params["actor"], obs, cfg)
+        maximise_pi  E[(min_i Q_i(s, a) - alpha log pi(a | s) - lam Q_c(s, a)) / (1 + lam)]
+        lam <- (K_p P + I + K_d D)+,   I <- (I + K_i (J_c - cost_limit))+
+
+    once every `dual_every` steps. P is the smoothed J_c - cost_limit. D is what the smoothed J_c rose
+    over `pid_delay` moves, and 0 if it fell. The critics are those of SAC-Lagrangian.
+
+    Source: Stooke, Achiam and Abbeel (2020), "Responsive Safety in Reinforcement Learning by PID
+    Lagrangian Methods", arXiv:2007.03964, algorithm 2, for the controller.
+    Differs from OmniSafe: there the controller runs at every gradient step, on a J_c that only changes
+    when an episode ends.
+    """
+
+
+def init(key: jax.Array, obs_size: int, action_size: int, cfg: Any) -> dict[str, PyTree]:
+    actor = init_squashed(key, obs_size, action_size, cfg)
+    return {"actor": actor, "log_alpha": jnp.log(cfg.alpha_init)}
+
+
+def optimisers(cfg: Any, share: jax.Array | float) -> dict[str, optax.GradientTransformation]:
+    return {"actor": adam(cfg.lr * share, cfg), "log_alpha": optax.adam(cfg.alpha_lr)}
+
+
+def soft_actor(action_size: int) -> Actor:
+    def drawn(params: dict[str, PyTree], obs: jax.Array, key: jax.Array, cfg: Any):
+        return squashed_sample(squashed_policy(params["actor"], obs, action_size, cfg), key)
+
+    def act(params: dict[str, PyTree], obs: jax.Array, key: jax.Array | None, cfg: Any) -> jax.Array:
+        dist = squashed_policy(params["actor"], obs, action_size, cfg)
         return squashed_mean(dist) if key is None else squashed_sample(dist, key)[0]
 
-    def step(
-        nets: Trainable, batch: Transitions, at: GradientStep, cfg: Any, axis_name: str | None
-    ) -> tuple[Trainable, Metrics]:
-        params, opt_state = nets
-        next_key, key = jax.random.split(at.key)
-        alpha = jnp.exp(params["log_alpha"])
-        share = at.remaining if cfg.lr_decay else 1.0
+    def next_action(
+        params: dict[str, PyTree], targets: PyTree, obs: jax.Array, key: jax.Array, cfg: Any
+    ) -> tuple[jax.Array, jax.Array]:
+        action, log_prob = drawn(params, obs, key, cfg)
+        return action, -jnp.exp(params["log_alpha"]) * log_prob
 
-        def mean(x: jax.Array) -> jax.Array:
-            return (batch.weight * x).sum()  # this device's share
+    def propose(params: dict[str, PyTree], obs: jax.Array, key: jax.Array, cfg: Any) -> Proposal:
+        action, log_prob = drawn(params, obs, key, cfg)
+        log_alpha = params["log_alpha"]
+        alpha = jax.lax.stop_gradient(jnp.exp(log_alpha))
+        too_sure = jax.lax.stop_gradient(log_prob + cfg.target_entropy * action_size)
+        metrics = {"train/entropy": -log_prob, "train/alpha": jnp.full_like(log_prob, alpha)}
+        return Proposal(action, -alpha * log_prob, -log_alpha * too_sure, metrics)
 
-        def adam_step(name: str, optimiser: Any, grads: PyTree) -> tuple[PyTree, PyTree]:
-            change, state = optimiser.update(pmean(grads, axis_name), opt_state[name])
-            return optax.apply_updates(params[name], change), state
-
-        # critics
-        next_action, next_log_prob = squashed_sample(pi(params["actor"], batch.next_obs, cfg), next_key)
-        next_q = q_values(params["target_r"], batch.next_obs, next_action, cfg).min(0)
-        future = jnp.where(batch.terminated, 0.0, next_q - alpha * next_log_prob)
-        y = batch.reward + cfg.discount**batch.steps * future
-
-        def critic_loss(critics: PyTree) -> tuple[jax.Array, jax.Array]:
-            q = q_values(critics, batch.obs, batch.action, cfg)
-            return mean(((q - y) ** 2).sum(0)), mean(q.mean(0))
-
-        (critic_error, q), grads = jax.value_and_grad(critic_loss, has_aux=True)(params["critic_r"])
-        critics, opt_critics = adam_step("critic_r", adam(cfg.critic_lr * share, cfg), grads)
-
-        # policy
-        def actor_loss(actor: PyTree) -> tuple[jax.Array, jax.Array]:
-            action, log_prob = squashed_sample(pi(actor, batch.obs, cfg), key)
-            q = q_values(critics, batch.obs, action, cfg).min(0)
-            return mean(alpha * log_prob - q), mean(log_prob)
-
-        (loss, log_prob), grads = jax.value_and_grad(actor_loss, has_aux=True)(params["actor"])
-        actor, opt_actor = adam_step("actor", adam(cfg.lr * share, cfg), grads)
-
-        # temperature, and the critics' targets
-        too_sure = log_prob + cfg.target_entropy * action_size * batch.weight.sum()
-        log_alpha, opt_alpha = adam_step("log_alpha", optax.adam(cfg.alpha_lr), -too_sure)
-        targets = optax.incremental_update(critics, params["target_r"], cfg.tau)
-
-        old = {name: params[name] for name in ("actor", "target_r", "log_alpha")}
-        new = {"actor": actor, "target_r": targets, "log_alpha": log_alpha}
-        old_state = {name: opt_state[name] for name in ("actor", "log_alpha")}
-        due = (at.number + 1) % cfg.policy_delay == 0
-        new, state = select(due, (new, {"actor": opt_actor, "log_alpha": opt_alpha}), (old, old_state))
-        metrics = {"train/critic_loss": critic_error, "train/q": q, "train/actor_loss": loss}
-        metrics = pmean(metrics | {"train/entropy": -log_prob}, axis_name)
-        nets = Trainable(new | {"critic_r": critics}, state | {"critic_r": opt_critics})
-        return nets, metrics | {"train/alpha": alpha}
-
-    return Learner(init=init, act=act, step=step)
+    return Actor(
+        critics=2,
+        followed=(),
+        init=init,
+        optimisers=optimisers,
+        act=act,
+        next_action=next_action,
+        propose=propose,
+        pick=lambda q: q.min(0),
+    )
 
 
-def make(env: Env, axis_name: str | None = None) -> Algorithm:
-    return off_policy(env, learner(env.action_size), axis_name)
+def make(env: Env, axis_name: str | None = None, treatment: Treatment = no_treatment) -> Algorithm:
+    learner = actor_critic(env, soft_actor(env.action_size), treatment)
+    return off_policy(env, learner, treatment, axis_name)
 
 
 # OmniSafe @15603dd, configs/off-policy/SAC.yaml: of the velocity tasks first. Its gradient step comes
@@ -146,12 +156,16 @@ OMNISAFE: dict[str, Any] = {
     "alpha_lr": 0.0,
     "policy_delay": 2,
 }
-PUBLISHED: dict[str, dict[str, Any]] = {
-    "omnisafe": OMNISAFE,
-    "omnisafe_navigation": OMNISAFE | {"alpha_init": 1e-5, "lr": 5e-6, "critic_lr": 1e-3},
-    # the published replay ratio with 64 environments: 4 gradient steps for each of their steps
-    "parallel": {"num_envs": 64, "replay_ratio": 256, "batch_size": 4096, "tau": 0.005},
-}
+NAVIGATION: dict[str, Any] = OMNISAFE | {"alpha_init": 1e-5, "lr": 5e-6, "critic_lr": 1e-3}
+# the published replay ratio with 64 environments: 4 gradient steps for each of their steps
+PARALLEL: dict[str, Any] = {"num_envs": 64, "replay_ratio": 256, "batch_size": 4096, "tau": 0.005}
+# A price that OmniSafe moves at every step by 1e-5 moves by 0.2 in 20,000 steps; likewise the others.
+LAG: dict[str, Any] = {"dual_starts": 200_000, "dual_lr": 0.2}
+LAG_NAVIGATION: dict[str, Any] = {"dual_starts": 200_000, "dual_lr": 0.01, "lam_init": 0.0}
+PID: dict[str, Any] = {
+    "dual_starts": 200_000, "pid_kp": 1e-6, "pid_ki": 2e-3, "pid_kd": 1e-7, "lr": 1e-4,
+}  # fmt: skip
+PID_NAVIGATION: dict[str, Any] = PID | {"pid_kp": 5e-7, "pid_ki": 2e-4, "pid_kd": 1e-8, "lr": 5e-6}
 # for a problem of two levers
 LEVER: dict[str, Any] = {
     "num_envs": 32, "horizon": 8, "learn_every": 2, "batch_size": 256, "replay_size": 20_000,
@@ -164,8 +178,30 @@ ROWS = {
         SACConfig,
         make,
         "soft actor-critic, no constraint",
-        PUBLISHED,
+        {"omnisafe": OMNISAFE, "omnisafe_navigation": NAVIGATION, "parallel": PARALLEL},
         holds="nothing",
         lever=LEVER,
-    )
+    ),
+    "sac_lag": Row(
+        SACLagConfig,
+        partial(make, treatment=lagrangian),
+        "SAC with an adaptive price on cost",
+        {
+            "omnisafe": OMNISAFE | LAG,
+            "omnisafe_navigation": NAVIGATION | LAG_NAVIGATION,
+            "parallel": PARALLEL,
+        },
+        lever=LEVER,
+    ),
+    "sac_pid": Row(
+        SACPIDConfig,
+        partial(make, treatment=pid),
+        "SAC with a price on cost from a PID controller",
+        {
+            "omnisafe": OMNISAFE | PID,
+            "omnisafe_navigation": NAVIGATION | PID_NAVIGATION,
+            "parallel": PARALLEL,
+        },
+        lever=LEVER,
+    ),
 }

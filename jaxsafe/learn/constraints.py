@@ -7,13 +7,12 @@ what belongs to it at each step (A_c, the critic's targets) has a last axis K, i
 
 import dataclasses
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
 
 from jaxsafe.config import ConfigError, Weight, config, nearest
-from jaxsafe.learn.rollout import Trajectory
 from jaxsafe.types import Env, Metrics
 
 Names = tuple[str, ...]
@@ -71,9 +70,19 @@ def check_cost_names(names: Iterable[str], env: Env) -> None:
             raise ConfigError(f"cost_limits: unknown cost {name!r}{hint}")
 
 
-def signal(env: Env, traj: Trajectory, names: Names) -> jax.Array:
-    """What is held under the limit: float [T, N] or, of several, [T, N, K]."""
-    return traj.costs[..., [env.cost_names.index(n) for n in names]] if names else traj.cost
+class Costs(Protocol):
+    """What steps cost, float [...], and the parts of it, float [..., len(env.cost_names)]."""
+
+    @property
+    def cost(self) -> jax.Array: ...
+
+    @property
+    def costs(self) -> jax.Array: ...
+
+
+def signal(env: Env, steps: Costs, names: Names) -> jax.Array:
+    """What is held under the limit: float [...] or, of several, [..., K]."""
+    return steps.costs[..., [env.cost_names.index(n) for n in names]] if names else steps.cost
 
 
 def each(fn: Callable, names: Names) -> Callable:

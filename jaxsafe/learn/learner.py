@@ -18,11 +18,13 @@ class GradientStep(NamedTuple):
     number: int32 [], gradient steps of the run that were due before this one.
     remaining: float [], the share of training that is left: 1 at first, 0 at the end.
     key: a random key, for this step on this device.
+    dual: the state of the treatment of the constraint, () without one.
     """
 
     number: jax.Array
     remaining: jax.Array
     key: jax.Array
+    dual: PyTree = ()
 
 
 class Learner(NamedTuple):

@@ -29,7 +29,8 @@ class Stepping:
 
 
 class StepRecord(NamedTuple):
-    """What T steps of N environments came to, [T, N]. A reset and a bad step are none: `real` is false.
+    """What T steps of N environments came to, [T, N], costs [T, N, K]. A reset and a bad step are none:
+    `real` is false.
 
     ended marks complete episodes that end with the step; episode and length are their sums.
     """
@@ -37,6 +38,7 @@ class StepRecord(NamedTuple):
     real: jax.Array
     reward: jax.Array
     cost: jax.Array
+    costs: jax.Array
     ended: jax.Array
     episode: Episode
     length: jax.Array
@@ -94,6 +96,7 @@ def collect_records(
             real=~record.last & ~bad.any,
             reward=rollout.state.reward,
             cost=rollout.state.cost,
+            costs=rollout.state.costs,
             ended=(terminated | truncated) & rollout.complete & ~bad.any,
             episode=rollout.episode,
             length=rollout.steps,

@@ -2,7 +2,8 @@
 
 An update is `horizon` steps of every environment. They go in rounds: `learn_every` steps, whose rows
 are written into the replay, and then the gradient steps that `replay_ratio` asks for. What a method
-adds to this is a `Learner`.
+adds to this is a `Learner`, and a `Treatment` of the constraint. The treatment's price moves on a clock
+of environment steps: however many environments, rounds and gradient steps there are, it moves as often.
 
 `jit(update)` compiles an iteration, `vmap(update, in_axes=(0, None))` runs seeds or floats of the
 config side by side, and `shard_map(update)` with `axis_name` set splits environments, replay and batch
@@ -35,6 +36,13 @@ from jaxsafe.config import (
 )
 from jaxsafe.learn.acting import learned_of
 from jaxsafe.learn.batch import all_finite, device_key, masked_mean, psum, select
+from jaxsafe.learn.constraints import (
+    Names,
+    check_cost_names,
+    limit,
+    metrics_by_constraint,
+    signal,
+)
 from jaxsafe.learn.learner import GradientStep, Learner, policy_by
 from jaxsafe.learn.metrics import episode_metrics, world_metrics
 from jaxsafe.learn.next_step_rollout import Stepping, arrival_record, collect_records, started
@@ -52,6 +60,7 @@ from jaxsafe.learn.replay import (
 from jaxsafe.learn.returns import mean_length
 from jaxsafe.learn.rollout import check_steps, init_rollout
 from jaxsafe.learn.steps import Trainable, remaining
+from jaxsafe.learn.treatments import Treatment, no_treatment
 from jaxsafe.types import Algorithm, Clocks, Env, Metrics, PyTree, Shared
 
 
@@ -97,13 +106,36 @@ class OffPolicyConfig:
     max_grad_norm: Norm = 40.0  # The largest norm of each network's gradient, as in OmniSafe.
 
 
+@config
+class PriceClockConfig:
+    """For algorithms with a treatment: when its price on cost moves."""
+
+    # Environment steps between two moves of the price. OmniSafe moves it at every gradient step.
+    dual_every: Annotated[int, Bounds(1, 2**30)] = 20_000
+    # Environment steps before its first move. OmniSafe's 100 epochs are 200,000.
+    dual_starts: Annotated[int, Bounds(0, 2**31 - 1)] = 0
+
+
+class Bill(NamedTuple):
+    """What the environments of all devices were charged since the price last moved.
+
+    cost: float [], or [K] of several constraints, summed over `steps`, float []. age: int32 [],
+    environment steps of the run since then, resets included; below 0 before `dual_starts`.
+    """
+
+    cost: jax.Array
+    steps: jax.Array
+    age: jax.Array
+
+
 @flax.struct.dataclass
 class TrainState:
     """All that an update needs besides `Shared`.
 
     config: the algorithm's, with its floats as arrays; `num_envs` is this device's share.
     params, opt_state: the learner's.
-    dual: (), the state of a treatment of the constraint.
+    dual: the treatment's state, () without one.
+    bill: Bill, or () without a treatment.
     normaliser: Normaliser, or () without `obs_normalize`.
     stepping: this device's environments.
     replay: their ring, [R, N, ...].
@@ -114,6 +146,7 @@ class TrainState:
     params: dict[str, PyTree]
     opt_state: dict[str, PyTree]
     dual: PyTree
+    bill: PyTree
     normaliser: PyTree
     stepping: Stepping
     replay: Record
@@ -130,12 +163,20 @@ class RoundCarry(NamedTuple):
     replay: Record
 
 
-def off_policy(env: Env, learner: Learner, axis_name: str | None = None) -> Algorithm:
-    """The algorithm that `learner` makes of the loop."""
+def off_policy(
+    env: Env,
+    learner: Learner,
+    treatment: Treatment = no_treatment,
+    axis_name: str | None = None,
+) -> Algorithm:
+    """The algorithm that `learner` makes of the loop, with a price on cost that `treatment` moves."""
     explore = learner.explore or learner.act
+    priced = treatment is not no_treatment
 
     def init(key: jax.Array, cfg: Any, shared: Shared) -> TrainState:
         sizes = sizes_of(cfg, axis_name)
+        names = treatment.constrained_costs(cfg)
+        check_cost_names(names, env)
         cfg = jax.tree.map(jnp.float32, cfg)
         params_key, stepping_key, key = jax.random.split(key, 3)
         nets = learner.init(params_key, env.obs_size, env.action_size, cfg)
@@ -146,7 +187,8 @@ def off_policy(env: Env, learner: Learner, axis_name: str | None = None) -> Algo
             config=cfg,
             params=nets.params,
             opt_state=nets.opt_state,
-            dual=(),
+            dual=treatment.init(cfg),
+            bill=empty_bill(cfg, names) if priced else (),
             normaliser=init_normaliser(env.obs_size) if cfg.obs_normalize else (),
             stepping=stepping,
             replay=empty_ring(arrival_record(stepping, actions), sizes.rows),
@@ -156,6 +198,7 @@ def off_policy(env: Env, learner: Learner, axis_name: str | None = None) -> Algo
 
     def update(ts: TrainState, shared: Shared) -> tuple[TrainState, Metrics]:
         cfg, iteration = ts.config, jnp.asarray(shared.iteration)
+        names = treatment.constrained_costs(cfg)
         sizes = sizes_of(cfg, axis_name)
 
         def learn(
@@ -175,7 +218,7 @@ def off_policy(env: Env, learner: Learner, axis_name: str | None = None) -> Algo
                 batch, dropped = usable(found, axis_name)
                 obs, next_obs = (network_inputs(normaliser, x) for x in (batch.obs, batch.next_obs))
                 batch = batch._replace(obs=obs, next_obs=next_obs)
-                at = GradientStep(count, remaining(iteration, cfg), step_key)
+                at = GradientStep(count, remaining(iteration, cfg), step_key, ts.dual)
                 new, metrics = learner.step(nets, batch, at, cfg, axis_name)
                 finite = psum(~jnp.isfinite(optax.tree.norm(new)), axis_name) == 0
                 lost = {"train/nonfinite": dropped + ~finite}
@@ -227,6 +270,15 @@ def off_policy(env: Env, learner: Learner, axis_name: str | None = None) -> Algo
         metrics = {k: masked_mean(x.mean(1), ready, None) for k, x in metrics.items()}
         metrics |= episode_metrics(env, steps, axis_name) | world_metrics(steps.bad, axis_name)
         rate_r, rate_c = (masked_mean(x, steps.real, axis_name) for x in (steps.reward, steps.cost))
+        dual, bill = ts.dual, ts.bill
+        if priced:
+            bill = charge(ts.bill, signal(env, steps, names), steps.real, axis_name)
+            dual, bill, stuck = settle(treatment, ts.dual, bill, length, cfg, iteration)
+            metrics |= metrics_by_constraint(treatment.metrics(dual), names)
+            nonfinite += stuck
+        for k, name in enumerate(names):  # J_c of each; the total's is below
+            rate = masked_mean(signal(env, steps, names)[..., k], steps.real, axis_name)
+            metrics[f"train/cost_estimate_{name}"] = rate * length
         metrics |= {
             "train/cost_rate": rate_c,  # per environment step
             "train/cost_estimate": rate_c * length,  # of an episode
@@ -237,6 +289,8 @@ def off_policy(env: Env, learner: Learner, axis_name: str | None = None) -> Algo
             ts,
             params=now.nets.params,
             opt_state=now.nets.opt_state,
+            dual=dual,
+            bill=bill,
             normaliser=now.normaliser,
             stepping=now.stepping,
             replay=now.replay,
@@ -250,6 +304,43 @@ def off_policy(env: Env, learner: Learner, axis_name: str | None = None) -> Algo
         return Clocks(cfg.num_envs * cfg.horizon, sizes.rounds * sizes.updates)
 
     return Algorithm(init, update, policy_by(learner), learned_of, lambda learned: env, clocks)
+
+
+# ---- the price on cost -------------------------------------------------------------------------
+
+
+def empty_bill(cfg: Any, names: Names) -> Bill:
+    return Bill(jnp.zeros(jnp.shape(limit(cfg, names))), jnp.float32(0), jnp.int32(-cfg.dual_starts))
+
+
+def charge(bill: Bill, cost: jax.Array, real: jax.Array, axis_name: str | None) -> Bill:
+    """`bill` with `cost`, float [T, N] or [T, N, K], of the steps that are `real`, bool [T, N]."""
+    mask = real.reshape(*real.shape, *(1,) * (cost.ndim - 2))
+    more, steps, age = psum(
+        (jnp.where(mask, cost, 0.0).sum((0, 1)), real.sum(), jnp.int32(real.size)), axis_name
+    )
+    return Bill(bill.cost + more, bill.steps + steps, bill.age + age)
+
+
+def settle(
+    treatment: Treatment, dual: PyTree, bill: Bill, length: jax.Array, cfg: Any, iteration: jax.Array
+) -> tuple[PyTree, Bill, jax.Array]:
+    """The price after the moves that are due, what remains of the bill, and whether a move failed.
+
+    J_c is what a step has cost since the last move, times the mean `length` of an episode. After an
+    iteration of more than `dual_every` steps several moves may be due; they see the same J_c.
+    """
+    episode_cost = bill.cost / jnp.maximum(bill.steps, 1) * length
+    due = jnp.maximum(bill.age, 0) // cfg.dual_every
+
+    def move(_: jax.Array, dual: PyTree) -> PyTree:
+        return treatment.update(dual, episode_cost, cfg, iteration)
+
+    moved = jax.lax.fori_loop(0, due, move, dual)
+    finite = all_finite(moved)
+    paid = Bill(jnp.zeros_like(bill.cost), jnp.float32(0), bill.age - due * cfg.dual_every)
+    bill = select((due > 0) | (bill.age < 0), paid, bill)
+    return select(finite, moved, dual), bill, ~finite
 
 
 # ---- sizes -------------------------------------------------------------------------------------

@@ -1,0 +1,107 @@
+"""Deep deterministic policy gradients, and with each treatment of the constraint."""
+
+from functools import partial
+
+import jax.numpy as jnp
+
+from jaxsafe.algos import sac, td3
+from jaxsafe.config import config
+from jaxsafe.learn.actor_critic import CostCriticConfig, actor_critic
+from jaxsafe.learn.off_policy import off_policy
+from jaxsafe.learn.row import Row
+from jaxsafe.learn.treatments import (
+    LagrangianConfig,
+    PIDConfig,
+    Treatment,
+    lagrangian,
+    no_treatment,
+    pid,
+)
+from jaxsafe.types import Algorithm, Env
+
+
+@config
+class DDPGConfig(td3.DeterministicConfig):
+    """DDPG: deep deterministic policy gradients, blind to cost.
+
+        y = r + discount (1 - terminated) Q'(s', mu'(s'))
+        minimise_Q   E[(Q(s, a) - y)^2]
+        maximise_mu  E[Q(s, mu(s))]
+        Q' <- Q' + tau (Q - Q'),   mu' <- mu' + tau (mu - mu')
+
+    Actions in training are clip(mu(s) + N(0, sigma^2), +-1), with a sigma for each environment. With
+    `n_step` n, r is the discounted sum of up to n rewards and s' the state after them.
+
+    Source: Lillicrap et al. (2016), "Continuous control with deep reinforcement learning",
+    arXiv:1509.02971, algorithm 1.
+    Differs from it: the noise is Gaussian and has no memory, as in OmniSafe, and each environment has
+    its own, as in Li et al. (2023), "Parallel Q-Learning", arXiv:2307.12983. The defaults are for a
+    thousand environments, as in TD3. OmniSafe's y has mu for mu'.
+    """
+
+
+@config
+class DDPGLagConfig(LagrangianConfig, CostCriticConfig, DDPGConfig):
+    """DDPG-Lagrangian: DDPG whose policy pays for cost at an adaptive price.
+
+        y_c = c + cost_discount (1 - terminated) reduce_j Q'_cj(s', mu'(s'))
+        minimise_Q    E[sum_j (Q_cj(s, a) - y_c)^2], and the loss of Q as in DDPG
+        maximise_mu   E[(Q(s, mu(s)) - lam Q_c(s, mu(s))) / (1 + lam)]
+        minimise_lam  -lam (J_c - cost_limit),  lam >= 0,  by Adam, once every `dual_every` steps
+
+    J_c is what an episode has cost since lam last moved. The rest is as in DDPG.
+
+    Source: Ray, Achiam and Amodei (2019), "Benchmarking Safe Exploration in Deep Reinforcement
+    Learning", for the multiplier.
+    Differs from OmniSafe: there lam moves at every gradient step, so that its speed depends on
+    `replay_ratio`. There is one critic of cost, whose target takes mu(s').
+    """
+
+
+@config
+class DDPGPIDConfig(PIDConfig, CostCriticConfig, DDPGConfig):
+    """DDPG-PID: DDPG whose price on cost is the output of a PID controller.
+
+        maximise_mu  E[(Q(s, mu(s)) - lam Q_c(s, mu(s))) / (1 + lam)]
+        lam <- (K_p P + I + K_d D)+,   I <- (I + K_i (J_c - cost_limit))+
+
+    once every `dual_every` steps. P is the smoothed J_c - cost_limit. D is what the smoothed J_c rose
+    over `pid_delay` moves, and 0 if it fell. The critics are those of DDPG-Lagrangian.
+
+    Source: Stooke, Achiam and Abbeel (2020), "Responsive Safety in Reinforcement Learning by PID
+    Lagrangian Methods", arXiv:2007.03964, algorithm 2, for the controller.
+    Differs from OmniSafe: there the controller runs at every gradient step, on a J_c that only changes
+    when an episode ends.
+    """
+
+
+def make(env: Env, axis_name: str | None = None, treatment: Treatment = no_treatment) -> Algorithm:
+    no_noise = lambda key, shape, cfg: jnp.zeros(shape)  # noqa: E731
+    actor = td3.deterministic_actor(env.action_size, critics=1, noise=no_noise)
+    return off_policy(env, actor_critic(env, actor, treatment), treatment, axis_name)
+
+
+ROWS = {
+    "ddpg": Row(
+        DDPGConfig,
+        make,
+        "deterministic policy, one critic, no constraint",
+        td3.published({}),
+        holds="nothing",
+        lever=td3.LEVER,
+    ),
+    "ddpg_lag": Row(
+        DDPGLagConfig,
+        partial(make, treatment=lagrangian),
+        "DDPG with an adaptive price on cost",
+        td3.published(sac.LAG, sac.LAG_NAVIGATION),
+        lever=td3.LEVER,
+    ),
+    "ddpg_pid": Row(
+        DDPGPIDConfig,
+        partial(make, treatment=pid),
+        "DDPG with a price on cost from a PID controller",
+        td3.published(sac.PID, sac.PID_NAVIGATION),
+        lever=td3.LEVER,
+    ),
+}

@@ -1,0 +1,223 @@
+"""Twin delayed deep deterministic policy gradients, and with each treatment of the constraint.
+
+The parts of a deterministic policy are shared with DDPG.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Annotated, Any
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from jaxsafe.algos import sac
+from jaxsafe.config import Bounds, Iterations, config
+from jaxsafe.learn.actor_critic import (
+    Actor,
+    ActorCriticConfig,
+    CostCriticConfig,
+    Proposal,
+    actor_critic,
+)
+from jaxsafe.learn.off_policy import off_policy
+from jaxsafe.learn.row import Row
+from jaxsafe.learn.steps import adam
+from jaxsafe.learn.treatments import (
+    LagrangianConfig,
+    PIDConfig,
+    Treatment,
+    lagrangian,
+    no_treatment,
+    pid,
+)
+from jaxsafe.nn.networks import coarse_mlp
+from jaxsafe.types import Algorithm, Env, PyTree
+
+Noise = Annotated[float, Bounds(0, 10)]  # a standard deviation; actions lie in [-1, 1]
+
+
+@config
+class DeterministicConfig(ActorCriticConfig):
+    """What methods with a deterministic policy share."""
+
+    # Standard deviation of the noise on actions in training, of the calmest and of the boldest
+    # environment; the others lie between, evenly. OmniSafe has 0.1 for all.
+    noise_min: Noise = 0.05
+    noise_max: Noise = 0.5
+
+
+@config
+class TD3Config(DeterministicConfig):
+    """TD3: twin delayed deterministic policy gradients, blind to cost.
+
+        a' = clip(mu'(s') + clip(noise, +-clip), +-1),   noise ~ N(0, smoothing^2)
+        y = r + discount (1 - terminated) min_i Q'_i(s', a')
+        minimise_Q   E[sum_i (Q_i(s, a) - y)^2]
+        maximise_mu  E[Q_1(s, mu(s))],   at every `policy_delay`-th step, and then
+        Q' <- Q' + tau (Q - Q'),   mu' <- mu' + tau (mu - mu')
+
+    i = 1, 2. Actions in training are clip(mu(s) + N(0, sigma^2), +-1), with a sigma for each
+    environment. With `n_step` n, r is the discounted sum of up to n rewards and s' the state after
+    them.
+
+    Source: Fujimoto, van Hoof and Meger (2018), "Addressing Function Approximation Error in
+    Actor-Critic Methods", arXiv:1802.09477, algorithm 1.
+    Differs from it: the defaults are for a thousand environments, each with noise of its own, as in Li
+    et al. (2023), "Parallel Q-Learning", arXiv:2307.12983. Gradient steps are few and large, the
+    targets follow faster, the critics have layer norm, and observations are normalised.
+    """
+
+    policy_delay: Iterations = 2  # As in the paper.
+    smoothing: Noise = 0.2  # Standard deviation of the noise on next actions, as in the paper.
+    smoothing_clip: Noise = 0.5  # The largest such noise, as in the paper.
+
+
+@config
+class TD3LagConfig(LagrangianConfig, CostCriticConfig, TD3Config):
+    """TD3-Lagrangian: TD3 whose policy pays for cost at an adaptive price.
+
+        y_c = c + cost_discount (1 - terminated) reduce_j Q'_cj(s', a'),   a' as for y
+        minimise_Q    E[sum_j (Q_cj(s, a) - y_c)^2], and the loss of Q as in TD3
+        maximise_mu   E[(Q_1(s, mu(s)) - lam Q_c(s, mu(s))) / (1 + lam)]
+        minimise_lam  -lam (J_c - cost_limit),  lam >= 0,  by Adam, once every `dual_every` steps
+
+    J_c is what an episode has cost since lam last moved. The rest is as in TD3.
+
+    Source: Ray, Achiam and Amodei (2019), "Benchmarking Safe Exploration in Deep Reinforcement
+    Learning", for the multiplier.
+    Differs from OmniSafe: there lam moves at every gradient step, so that its speed depends on
+    `replay_ratio`. There is one critic of cost, whose target takes mu(s') without noise.
+    """
+
+
+@config
+class TD3PIDConfig(PIDConfig, CostCriticConfig, TD3Config):
+    """TD3-PID: TD3 whose price on cost is the output of a PID controller.
+
+        maximise_mu  E[(Q_1(s, mu(s)) - lam Q_c(s, mu(s))) / (1 + lam)]
+        lam <- (K_p P + I + K_d D)+,   I <- (I + K_i (J_c - cost_limit))+
+
+    once every `dual_every` steps. P is the smoothed J_c - cost_limit. D is what the smoothed J_c rose
+    over `pid_delay` moves, and 0 if it fell. The critics are those of TD3-Lagrangian.
+
+    Source: Stooke, Achiam and Abbeel (2020), "Responsive Safety in Reinforcement Learning by PID
+    Lagrangian Methods", arXiv:2007.03964, algorithm 2, for the controller.
+    Differs from OmniSafe: there the controller runs at every gradient step, on a J_c that only changes
+    when an episode ends.
+    """
+
+
+def init(key: jax.Array, obs_size: int, action_size: int, cfg: Any) -> dict[str, PyTree]:
+    return {"actor": coarse_mlp(cfg, action_size).init(key, jnp.zeros(obs_size))}
+
+
+def optimisers(cfg: Any, share: jax.Array | float) -> dict[str, optax.GradientTransformation]:
+    return {"actor": adam(cfg.lr * share, cfg)}
+
+
+def deterministic_actor(
+    action_size: int, critics: int, noise: Callable[[jax.Array, tuple[int, ...], Any], jax.Array]
+) -> Actor:
+    """mu(s) = tanh of a network. `noise`(key, shape, cfg) is what is added to mu'(s')."""
+
+    def mu(actor: PyTree, obs: jax.Array, cfg: Any) -> jax.Array:
+        out: Any = coarse_mlp(cfg, action_size).apply(actor, obs)
+        return jnp.tanh(out)
+
+    def noisy(action: jax.Array, noise: jax.Array) -> jax.Array:
+        return jnp.clip(action + noise, -1.0, 1.0)
+
+    def explore(params: PyTree, obs: jax.Array, key: jax.Array, cfg: Any) -> jax.Array:
+        sigma = jnp.linspace(cfg.noise_min, cfg.noise_max, obs.shape[0])[:, None]
+        noise = sigma * jax.random.normal(key, (obs.shape[0], action_size))
+        return noisy(mu(params["actor"], obs, cfg), noise)
+
+    def act(params: dict[str, PyTree], obs: jax.Array, key: jax.Array | None, cfg: Any) -> jax.Array:
+        """Sampled actions have the noise of any environment of training, a new one at each step."""
+        action = mu(params["actor"], obs, cfg)
+        if key is None:
+            return action
+        sigma_key, noise_key = jax.random.split(key)
+        lowest, highest = cfg.noise_min, cfg.noise_max
+        sigma = jax.random.uniform(sigma_key, (*action.shape[:-1], 1), minval=lowest, maxval=highest)
+        return noisy(action, sigma * jax.random.normal(noise_key, action.shape))
+
+    def next_action(
+        params: dict[str, PyTree], targets: PyTree, obs: jax.Array, key: jax.Array, cfg: Any
+    ) -> tuple[jax.Array, jax.Array]:
+        action = mu(targets["actor"], obs, cfg)
+        return noisy(action, noise(key, action.shape, cfg)), jnp.zeros(obs.shape[0])
+
+    def propose(params: dict[str, PyTree], obs: jax.Array, key: jax.Array, cfg: Any) -> Proposal:
+        zero = jnp.zeros(obs.shape[0])
+        return Proposal(mu(params["actor"], obs, cfg), bonus=zero, extra=zero, metrics={})
+
+    return Actor(
+        critics=critics,
+        followed=("actor",),
+        init=init,
+        optimisers=optimisers,
+        act=act,
+        next_action=next_action,
+        propose=propose,
+        pick=lambda q: q[0],
+        explore=explore,
+    )
+
+
+def smoothing(key: jax.Array, shape: tuple[int, ...], cfg: Any) -> jax.Array:
+    noise = cfg.smoothing * jax.random.normal(key, shape)
+    return jnp.clip(noise, -cfg.smoothing_clip, cfg.smoothing_clip)
+
+
+def make(env: Env, axis_name: str | None = None, treatment: Treatment = no_treatment) -> Algorithm:
+    actor = deterministic_actor(env.action_size, critics=2, noise=smoothing)
+    return off_policy(env, actor_critic(env, actor, treatment), treatment, axis_name)
+
+
+# OmniSafe @15603dd, configs/off-policy/TD3.yaml and DDPG.yaml: as SAC.yaml, but for the policy's part.
+ONE_NOISE: dict[str, Any] = {"noise_min": 0.1, "noise_max": 0.1, "learning_starts": 25_000}
+
+
+def published(base: dict[str, Any], navigation: dict[str, Any] | None = None) -> dict[str, Any]:
+    """The settings of a row: OmniSafe's for velocity, for navigation, and ours for 64 environments."""
+    of_sac = {"alpha_init", "alpha_lr", "policy_delay"}
+    omnisafe = {k: v for k, v in sac.OMNISAFE.items() if k not in of_sac} | ONE_NOISE
+    rates = {"lr": 5e-6, "critic_lr": 1e-3}
+    return {
+        "omnisafe": omnisafe | base,
+        "omnisafe_navigation": omnisafe | rates | (base if navigation is None else navigation),
+        "parallel": sac.PARALLEL,
+    }
+
+
+# for a problem of two levers
+LEVER: dict[str, Any] = {
+    k: v for k, v in sac.LEVER.items() if k not in ("alpha_init", "alpha_lr", "target_entropy")
+}
+
+ROWS = {
+    "td3": Row(
+        TD3Config,
+        make,
+        "deterministic policy, twin critics, no constraint",
+        published({}),
+        holds="nothing",
+        lever=LEVER,
+    ),
+    "td3_lag": Row(
+        TD3LagConfig,
+        partial(make, treatment=lagrangian),
+        "TD3 with an adaptive price on cost",
+        published(sac.LAG, sac.LAG_NAVIGATION),
+        lever=LEVER,
+    ),
+    "td3_pid": Row(
+        TD3PIDConfig,
+        partial(make, treatment=pid),
+        "TD3 with a price on cost from a PID controller",
+        published(sac.PID, sac.PID_NAVIGATION),
+        lever=LEVER,
+    ),
+}
