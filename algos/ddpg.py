@@ -1,7 +1,9 @@
 """Deep deterministic policy gradients, and with each treatment of the constraint."""
 
 from functools import partial
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 
 from jaxsafe.algos import sac, td3
@@ -75,8 +77,11 @@ class DDPGPIDConfig(PIDConfig, CostCriticConfig, DDPGConfig):
     """
 
 
+def no_noise(key: jax.Array, shape: tuple[int, ...], cfg: Any) -> jax.Array:
+    return jnp.zeros(shape)
+
+
 def make(env: Env, axis_name: str | None = None, treatment: Treatment = no_treatment) -> Algorithm:
-    no_noise = lambda key, shape, cfg: jnp.zeros(shape)  # noqa: E731
     actor = td3.deterministic_actor(env.action_size, critics=1, noise=no_noise)
     return off_policy(env, actor_critic(env, actor, treatment), treatment, axis_name)
 

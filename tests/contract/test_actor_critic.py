@@ -1,0 +1,407 @@
+"""SAC, TD3 and DDPG by hand, with and without a price on cost, and the clock of the price."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from compiling import FAST
+from toys import START, Lever, Ticker
+
+from jaxsafe.algos import ALGOS, ddpg, sac, td3
+from jaxsafe.learn.actor_critic import Actor, actor_critic
+from jaxsafe.learn.learner import GradientStep
+from jaxsafe.learn.off_policy import charge, empty_bill, settle
+from jaxsafe.learn.replay import Transitions
+from jaxsafe.learn.treatments import Multiplier, lagrangian, no_treatment
+from jaxsafe.nn.critics import q_values
+from jaxsafe.types import Env, Shared, State
+
+ACTORS: dict[str, Callable[[int], Actor]] = {
+    "sac": sac.soft_actor,
+    "td3": lambda size: td3.deterministic_actor(size, critics=2, noise=td3.smoothing),
+    "ddpg": lambda size: td3.deterministic_actor(size, critics=1, noise=ddpg.no_noise),
+}
+
+
+# ---- gradient steps by hand --------------------------------------------------------------------
+
+
+@dataclass
+class ByHand:
+    """A gradient step in float64, with linear networks. Parameters are those before the step."""
+
+    method: str
+    params: dict[str, Any]
+    batch: Transitions
+    noise: list[np.ndarray]
+    alpha: float
+    lam: float | None
+    reduce: str
+    discount: float = 0.9
+    cost_discount: float = 0.8
+
+    def pi(self, actor, obs, noise):
+        """The action, and its log probability times -alpha."""
+        out = obs @ actor["kernel"] + actor["bias"]
+        if self.method != "sac":
+            return np.tanh(out), 0.0
+        mean, log_std = np.split(out, 2, axis=-1)
+        u = mean + np.exp(log_std) * noise
+        log_prob = -0.5 * noise**2 - log_std - 0.5 * np.log(2 * np.pi) - np.log(1 - np.tanh(u) ** 2)
+        return np.tanh(u), -self.alpha * log_prob.sum(-1)
+
+    def q(self, critics, obs, action):
+        pair = np.concatenate([obs, action], -1)
+        return (np.einsum("bi,nij->nbj", pair, critics["kernel"]) + critics["bias"][:, None])[..., 0]
+
+    def reduced(self, q):
+        return q.max(0) if self.reduce == "max" else q.mean(0)
+
+    def next_action(self):
+        obs = self.batch.next_obs
+        if self.method == "sac":
+            return self.pi(self.params["actor"], obs, self.noise[0])
+        action, _ = self.pi(self.params["target_actor"], obs, None)
+        noise = np.clip(0.2 * self.noise[0], -0.5, 0.5) if self.method == "td3" else 0.0
+        return np.clip(action + noise, -1, 1), 0.0
+
+    def error_r(self, critics):
+        b, (action, bonus) = self.batch, self.next_action()
+        v = self.q(self.params["target_r"], b.next_obs, action).min(0) + bonus
+        y = b.reward + self.discount**b.steps * (1 - b.terminated) * v
+        return (b.weight * (self.q(critics, b.obs, b.action) - y) ** 2).sum()
+
+    def error_c(self, critics):
+        b, (action, _) = self.batch, self.next_action()
+        v = self.reduced(self.q(self.params["target_c"], b.next_obs, action))
+        y = b.cost + self.cost_discount**b.steps * (1 - b.terminated) * v
+        return (b.weight * (self.q(critics, b.obs, b.action) - y) ** 2).sum()
+
+    def actor_loss(self, actor, critic_r, critic_c):
+        obs = self.batch.obs
+        action, bonus = self.pi(actor, obs, self.noise[1])
+        q = self.q(critic_r, obs, action)
+        worth = (q.min(0) if self.method == "sac" else q[0]) + bonus
+        if self.lam is not None:
+            q_c = self.reduced(self.q(critic_c, obs, action))
+            worth = (worth - self.lam * q_c) / (1 + self.lam)
+        return -(self.batch.weight * worth).sum()
+
+
+def numerical(loss, params, eps=1e-6):
+    """The gradient of `loss` by central differences."""
+
+    def one(name, index):
+        def moved(by):
+            x = params[name].copy()
+            x[index] += by
+            return loss({**params, name: x})
+
+        return (moved(eps) - moved(-eps)) / (2 * eps)
+
+    return {
+        name: np.array([one(name, i) for i in np.ndindex(x.shape)]).reshape(x.shape)
+        for name, x in params.items()
+    }
+
+
+class Adam:
+    def __init__(self, lr):
+        self.lr, self.count, self.mu, self.nu = lr, 0, 0.0, 0.0
+
+    def step(self, params, grads):
+        self.count += 1
+        zero = dict.fromkeys(grads, 0.0)
+        mu, nu = self.mu or zero, self.nu or zero
+        self.mu = {k: 0.9 * mu[k] + 0.1 * g for k, g in grads.items()}
+        self.nu = {k: 0.999 * nu[k] + 0.001 * g**2 for k, g in grads.items()}
+        scale = {k: np.sqrt(v / (1 - 0.999**self.count)) + 1e-8 for k, v in self.nu.items()}
+        size = self.lr / (1 - 0.9**self.count)
+        return {k: params[k] - size * self.mu[k] / scale[k] for k in grads}
+
+
+NARROW = {"f": np.float32, "i": np.int32}
+
+
+def dense(params):
+    return params["params"]["Dense_0"]
+
+
+def drawn_batch() -> Transitions:
+    """A plain step, one of two steps, one that terminated, one that was truncated, which bootstraps
+    like any other, and one that does not count."""
+    rng = np.random.default_rng(0)
+    cost = rng.uniform(size=5)
+    fields: dict[str, Any] = {
+        "obs": rng.normal(size=(5, 3)), "action": np.tanh(rng.normal(size=(5, 2))),
+        "reward": rng.normal(size=5), "cost": cost, "costs": cost[:, None],
+        "next_obs": rng.normal(size=(5, 3)), "steps": np.array([1, 2, 1, 1, 1]),
+        "terminated": np.array([0, 0, 1, 0, 0], bool), "weight": np.array([0.25, 0.25, 0.25, 0.25, 0]),
+    }  # fmt: skip
+    return Transitions(**fields)
+
+
+@pytest.mark.parametrize(
+    "method, lam, reduce",
+    [("sac", None, ""), ("sac", 0.7, "mean"), ("td3", None, ""), ("td3", 1.5, "max"),
+     ("ddpg", None, ""), ("ddpg", 0.3, "one")],
+)  # fmt: skip
+def test_two_gradient_steps_are_those_of_the_paper(method, lam, reduce):
+    row = method if lam is None else f"{method}_lag"
+    settings: dict[str, Any] = {"hidden": (), "layer_norm": False, "lr": 0.01, "critic_lr": 0.02,
+                                "tau": 0.1, "discount": 0.9, "cost_discount": 0.8,
+                                "policy_delay": 1}  # fmt: skip
+    settings |= {"alpha_init": 0.3, "alpha_lr": 0.03} if method == "sac" else {}
+    settings |= {"cost_reduce": reduce} if reduce else {}
+    cfg = jax.tree.map(jnp.float32, ALGOS[row].config(**settings))
+    learner = actor_critic(Lever(), ACTORS[method](2), no_treatment if lam is None else lagrangian)
+    nets = jax.jit(lambda key: learner.init(key, 3, 2, cfg))(jax.random.key(0))
+    batch = drawn_batch()
+    narrow = jax.tree.map(lambda x: jnp.asarray(x, NARROW.get(x.dtype.kind, x.dtype)), batch)
+    step = jax.jit(lambda nets, at: learner.step(nets, narrow, at, cfg, None), compiler_options=FAST)
+    dual = () if lam is None else Multiplier(jnp.float32(lam), ())
+
+    trained = ["actor", "critic_r"] + ["critic_c"] * (lam is not None)
+    targets = {"actor": "target_actor", "critic_r": "target_r", "critic_c": "target_c"}
+    followed = [name for name in trained if name != "actor" or method != "sac"]
+    hand = {name: jax.tree.map(np.float64, dense(nets.params[name])) for name in trained}
+    hand |= {targets[n]: jax.tree.map(np.float64, dense(nets.params["targets"][n])) for n in followed}
+    adams = {name: Adam(0.01 if name == "actor" else 0.02) for name in trained}
+    alphas, log_alpha = Adam(0.03), {"a": np.log(0.3)}
+    for count in (1, 2):
+        key = jax.random.key(count)
+        noise = [np.float64(jax.random.normal(k, (5, 2))) for k in jax.random.split(key)]
+        p = ByHand(method, dict(hand), batch, noise, np.exp(log_alpha["a"]), lam, reduce)
+        critic_loss = p.error_r(hand["critic_r"])
+        grads = {"critic_r": numerical(p.error_r, hand["critic_r"])}
+        if lam is not None:
+            critic_loss_c = p.error_c(hand["critic_c"])
+            grads["critic_c"] = numerical(p.error_c, hand["critic_c"])
+        for name, gradient in grads.items():
+            hand[name] = adams[name].step(hand[name], gradient)
+        critics = hand["critic_r"], hand.get("critic_c")
+        gradient = numerical(lambda a, p=p, c=critics: p.actor_loss(a, *c), hand["actor"])
+        log_prob = p.pi(hand["actor"], batch.obs, noise[1])[1] / -p.alpha
+        hand["actor"] = adams["actor"].step(hand["actor"], gradient)
+        if method == "sac":  # H = -1 for each of two actions
+            slope = {"a": -(batch.weight * (log_prob - 2.0)).sum()}
+            log_alpha = alphas.step(log_alpha, slope)
+        for name in followed:
+            aim = targets[name]
+            hand[aim] = {k: 0.9 * x + 0.1 * hand[name][k] for k, x in hand[aim].items()}
+
+        nets, metrics = step(nets, GradientStep(jnp.int32(count - 1), jnp.float32(1), key, dual))
+        np.testing.assert_allclose(metrics["train/critic_loss"], critic_loss, rtol=1e-5)
+        if lam is not None:
+            np.testing.assert_allclose(metrics["train/critic_loss_c"], critic_loss_c, rtol=1e-5)
+        if method == "sac":
+            np.testing.assert_allclose(nets.params["log_alpha"], log_alpha["a"], atol=1e-6)
+        found = {name: nets.params[name] for name in trained}
+        found |= {targets[name]: nets.params["targets"][name] for name in followed}
+        assert found.keys() == hand.keys()
+        for name, params in found.items():
+            for leaf, x in hand[name].items():
+                np.testing.assert_allclose(dense(params)[leaf], x, rtol=1e-6, atol=2e-6)
+        for name in trained:  # Adam's first steps have one size: this is the gradient's own
+            seen = dense(nets.opt_state[name][1][0].mu)
+            for leaf, x in adams[name].mu.items():
+                np.testing.assert_allclose(seen[leaf], x, rtol=1e-5, atol=1e-6)
+
+
+def test_named_limits_on_the_same_cost_make_the_step_of_one():
+    """Two constraints on one cost, each at half the price."""
+    learner = actor_critic(Lever(), sac.soft_actor(2), lagrangian)
+    small: dict[str, Any] = {"hidden": (), "cost_reduce": "max"}
+    one = jax.tree.map(jnp.float32, sac.SACLagConfig(**small))
+    two = dataclasses.replace(one, cost_limits={"lever": jnp.float32(1), "too": jnp.float32(2)})
+    lever = dataclasses.replace(Lever(), cost_names=("lever", "too"))
+    learner_2 = actor_critic(lever, sac.soft_actor(2), lagrangian)
+    begin = jax.jit(lambda key: (learner.init(key, 3, 2, one), learner_2.init(key, 3, 2, two)))
+    nets, nets_2 = begin(jax.random.key(0))
+
+    def doubled(params, like):
+        """Both constraints have the critics of the one."""
+        critics = jax.tree.map(lambda x: jnp.stack([x, x]), params["critic_c"])
+        chex.assert_trees_all_equal_shapes(critics, like["critic_c"])
+        return params | {"critic_c": critics}
+
+    params = doubled(nets.params, nets_2.params)
+    params["targets"] = doubled(nets.params["targets"], nets_2.params["targets"])
+    nets_2 = nets_2._replace(params=params)
+    batch = drawn_batch()
+    batch = jax.tree.map(lambda x: jnp.asarray(x, NARROW.get(x.dtype.kind, x.dtype)), batch)
+    both = batch._replace(costs=jnp.repeat(batch.costs, 2, axis=1))
+    at = GradientStep(jnp.int32(0), jnp.float32(1), jax.random.key(1))
+    prices = Multiplier(jnp.float32(0.8), ()), Multiplier(jnp.array([0.4, 0.4]), ())
+
+    @functools.partial(jax.jit, compiler_options=FAST)
+    def steps(nets, nets_2):
+        return (
+            learner.step(nets, batch, at._replace(dual=prices[0]), one, None),
+            learner_2.step(nets_2, both, at._replace(dual=prices[1]), two, None),
+        )
+
+    (alone, m), (together, m_2) = steps(nets, nets_2)
+    chex.assert_trees_all_close(alone.params["actor"], together.params["actor"], atol=1e-6)
+    np.testing.assert_allclose(m["train/q_c"], m_2["train/q_c_too"], rtol=1e-6)
+    np.testing.assert_allclose(m["train/critic_loss_c"], m_2["train/critic_loss_c_lever"], rtol=1e-6)
+
+
+def test_a_delayed_policy_and_its_targets_move_at_every_second_step():
+    cfg = jax.tree.map(jnp.float32, sac.SACConfig(hidden=(), policy_delay=2))
+    learner = actor_critic(Lever(), sac.soft_actor(2), no_treatment)
+    nets = learner.init(jax.random.key(0), 3, 2, cfg)
+    batch = drawn_batch()
+    batch = jax.tree.map(lambda x: jnp.asarray(x, NARROW.get(x.dtype.kind, x.dtype)), batch)
+    step = jax.jit(lambda nets, at: learner.step(nets, batch, at, cfg, None)[0], compiler_options=FAST)
+    for count in range(4):
+        before = nets
+        at = GradientStep(jnp.int32(count), jnp.float32(1), jax.random.key(count))
+        nets = step(nets, at)
+        moved = {
+            name: any(
+                bool((x != y).any())
+                for x, y in zip(
+                    jax.tree.leaves(before.params[name]), jax.tree.leaves(params), strict=True
+                )
+            )
+            for name, params in nets.params.items()
+        }
+        due = count % 2 == 1
+        assert moved == {"actor": due, "log_alpha": due, "targets": due, "critic_r": True}
+
+
+# ---- values ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Chain:
+    """States 0, 1, 2 as one-hot observations, one after the other; leaving state i earns i + 1 and
+    costs 3 - i.
+
+    Beyond state 2 it terminates or, if it is a circle, begins anew at 0. Ignores actions.
+    """
+
+    circle: bool
+    episode_length: int
+    obs_size: int = 3
+    action_size: int = 1
+    cost_names: tuple[str, ...] = ("a",)
+
+    def reset(self, key: jax.Array) -> State:
+        place = jax.random.randint(key, (), 0, 3)
+        return self._at(place, jnp.float32(0), jnp.float32(0), jnp.bool_(False))
+
+    def step(self, state: State, action: jax.Array) -> State:
+        place = (state.physics + 1) % 3
+        earned, paid = state.physics + 1.0, 3.0 - state.physics
+        return self._at(place, earned, paid, (place == 0) & (not self.circle))
+
+    def _at(self, place: jax.Array, reward: jax.Array, cost: jax.Array, end: jax.Array) -> State:
+        return State(place, jax.nn.one_hot(place, 3), reward, cost, cost[None], end, {})
+
+
+def value(earned: np.ndarray, discount: float, circle: bool) -> np.ndarray:
+    """Of the three states: v = r + discount P v."""
+    forward = np.eye(3, k=1)
+    forward[2, 0] = circle
+    return np.linalg.solve(np.eye(3) - discount * forward, earned)
+
+
+@pytest.mark.parametrize(
+    "name, circle, n_step", [("sac", False, 1), ("td3_lag", True, 3), ("ddpg_lag", False, 2)]
+)
+def test_the_critics_find_the_values_of_a_chain(name, circle, n_step):
+    """Episodes of the circle are cut after 2 steps, which takes nothing from their values."""
+    env = Chain(circle, episode_length=2 if circle else 9)
+    settings: dict[str, Any] = {
+        "num_envs": 8, "horizon": 6, "learn_every": 2, "batch_size": 32, "replay_size": 8 * 18,
+        "learning_starts": 8 * 7, "hidden": (), "obs_normalize": False, "layer_norm": False,
+        "discount": 0.5, "cost_discount": 0.75, "critic_lr": 0.02, "tau": 0.2, "n_step": n_step,
+        "replay_ratio": 32,
+    }  # fmt: skip
+    settings |= {"alpha_init": 1e-6, "alpha_lr": 0.0} if name == "sac" else {"policy_delay": 1}
+    row = ALGOS[name]
+    cfg, algo = row.config(**settings), row.make(env)
+
+    def train(key):
+        ts = algo.init(key, cfg, START)
+        return jax.lax.scan(lambda ts, i: algo.update(ts, Shared(i)), ts, jnp.arange(150))
+
+    ts, metrics = jax.jit(train, compiler_options=FAST)(jax.random.key(0))
+    expected = {"critic_r": value(np.array([1.0, 2, 3]), 0.5, circle)}
+    if row.holds == "average":
+        expected["critic_c"] = value(np.array([3.0, 2, 1]), 0.75, circle)
+    for critic, values in expected.items():
+        for action in (-0.9, 0.0, 0.9):
+            q = q_values(ts.params[critic], jnp.eye(3), jnp.full((3, 1), action), ts.config)
+            np.testing.assert_allclose(q, np.stack([values] * len(q)), atol=2e-2)
+    assert metrics["train/nonfinite"].sum() == 0
+
+
+# ---- the clock of the price --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("num_envs, horizon", [(1, 50), (8, 25), (500, 4), (1000, 16)])
+def test_the_price_moves_by_environment_steps_alone(num_envs, horizon):
+    """J_c is 10 above its limit, so that each of Adam's moves is dual_lr: 0.1 for each 1,000 steps."""
+    cfg = jax.tree.map(
+        jnp.float32, sac.SACLagConfig(cost_limit=10.0, dual_every=1000, dual_starts=16_000, lam_init=0)
+    )
+    real = jnp.ones((horizon, num_envs), bool).at[0].set(False)  # the first of them are resets
+    cost = jnp.where(real, 0.2, 7.0)
+
+    @jax.jit
+    def iteration(dual, bill):
+        bill = charge(bill, cost, real, None)
+        return settle(lagrangian, dual, bill, jnp.float32(100.0), cfg, jnp.int32(0))
+
+    dual, bill, steps = lagrangian.init(cfg), empty_bill(cfg, ()), 0
+    while steps < 48_000:
+        dual, bill, stuck = iteration(dual, bill)
+        steps += num_envs * horizon
+        assert not stuck
+        if steps in (16_000, 32_000, 48_000):
+            np.testing.assert_allclose(dual.lam, 0.1 * (steps - 16_000) / 1000, rtol=1e-3, atol=1e-6)
+    assert steps == 48_000 and bill.age == 0 and bill.steps == 0
+
+
+def test_below_the_limit_the_price_falls_to_zero_and_stays():
+    cfg = jax.tree.map(
+        jnp.float32, sac.SACLagConfig(cost_limit=10.0, dual_every=100, lam_init=0.35, dual_lr=0.1)
+    )
+    dual, bill = lagrangian.init(cfg), empty_bill(cfg, ())
+    seen = []
+    for _ in range(6):
+        bill = charge(bill, jnp.full((10, 10), 0.05), jnp.ones((10, 10), bool), None)
+        dual, bill, _ = settle(lagrangian, dual, bill, jnp.float32(100.0), cfg, jnp.int32(0))
+        seen.append(float(dual.lam))
+    np.testing.assert_allclose(seen, [0.25, 0.15, 0.05, 0, 0, 0], atol=1e-3)
+
+
+def test_a_bill_is_the_cost_of_real_steps_since_the_last_move_for_each_constraint():
+    """An episode of 5 steps costs 2.5 and 7.5 by name; bad steps and resets do not count."""
+    env: Env = Ticker(episode_length=5)
+    settings: dict[str, Any] = {
+        "num_envs": 4, "horizon": 12, "learn_every": 6, "batch_size": 8, "replay_ratio": 1,
+        "replay_size": 96, "learning_starts": 10_000, "hidden": (4,), "stagger": False,
+        "dual_every": 48, "lam_init": 1.0, "dual_lr": 0.5, "cost_limits": {"a": 2.0, "b": 8.0},
+    }  # fmt: skip
+    cfg, algo = ALGOS["td3_lag"].config(**settings), ALGOS["td3_lag"].make(env)
+
+    def first_update(key):
+        return algo.update(algo.init(key, cfg, START), START)
+
+    ts, metrics = jax.jit(first_update, compiler_options=FAST)(jax.random.key(0))
+    np.testing.assert_allclose(metrics["train/cost_estimate_a"], 2.5, rtol=1e-6)
+    np.testing.assert_allclose(metrics["train/cost_estimate_b"], 7.5, rtol=1e-6)
+    np.testing.assert_allclose(metrics["train/cost_estimate"], 10.0, rtol=1e-6)
+    np.testing.assert_allclose(ts.dual.lam, [1.5, 0.5], rtol=1e-4)  # one above its limit, one below
+    assert metrics["train/lam_a"] == ts.dual.lam[0] and ts.bill.age == 0
