@@ -25,7 +25,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from jaxsafe import algos, envs
-from jaxsafe.config import ConfigError, convert, describe
+from jaxsafe.config import ConfigError, convert, kind_in_words
 from jaxsafe.run import distributed
 from jaxsafe.run.settings import (
     COST_LIMITS,
@@ -333,7 +333,7 @@ def number(kind: Any) -> Callable[[str], Any]:
         try:
             return convert(value, kind, "")
         except ConfigError as error:
-            raise argparse.ArgumentTypeError(f"{text}: expected {describe(kind)}") from error
+            raise argparse.ArgumentTypeError(f"{text}: expected {kind_in_words(kind)}") from error
 
     return read
 

@@ -522,7 +522,7 @@ def differences(a: dict[str, Any], b: dict[str, Any]) -> dict[str, tuple[Any, An
     return {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
 
 
-def unusual(settings: Settings, most: int = 4) -> str:
+def unusual_in_words(settings: Settings, most: int = 4) -> str:
     """The settings of environment and algorithm that are not the defaults, the most unusual first."""
     names = {"env": {"name": settings.env_name}, "algo": {"name": settings.algo_name}}
     chosen = {"preset": settings.train.preset, "compat": settings.train.compat}
