@@ -127,7 +127,7 @@ def test_a_grid_over_named_limits_is_side_by_side_too():
     assert run[2].setting == "algo.clip=0.1, algo.cost_limits.hazards=10"
     plain = settings.plain()
     assert plain["algo"]["cost_limits"] == {"hazards": [5.0, 10.0, 5.0, 10.0], "vases_contact": 25.0}
-    assert settings_from_config(plain)._replace(env=settings.env) == settings
+    assert settings_from_config(plain)._replace(env_entry=settings.env_entry) == settings
     one = compose(
         ["env=point_goal2", "algo.cost_limits.hazards=5", "algo.cost_limits={vases_contact: 3}"]
     )
