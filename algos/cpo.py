@@ -1,7 +1,6 @@
 """CPO, and the trust-region step between reward and cost that PCPO shares with it."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
 import jax
@@ -190,8 +189,47 @@ def solution(p: Problem, cfg: Any) -> Direction:
     return Direction(step, case > RETURN, metrics)
 
 
+class Gradients(NamedTuple):
+    """What the problem is made of, in the letters above, and how well it is solved for.
+
+    b is [P] or, of several constraints, [K, P]; `residual_g` and `residual_b`, [] or [K], are those of
+    the conjugate gradients for h_g and h_b.
+    """
+
+    g: jax.Array
+    b: jax.Array
+    h_g: jax.Array
+    h_b: jax.Array
+    residual_g: jax.Array
+    residual_b: jax.Array
+
+
+def gradients(actor: PyTree, objectives: Pair, batch: Any, context: Context) -> Gradients:
+    cfg, axis_name = context.cfg, context.axis_name
+    start, unravel = ravel_pytree(actor)
+    g = pmean(jax.grad(lambda params: objectives.reward(unravel(params), batch)[0])(start), axis_name)
+    gradient = jax.jacrev if jnp.ndim(context.violation) else jax.grad  # [K, P], or [P]
+    b = pmean(gradient(lambda params: objectives.cost(unravel(params), batch)[0])(start), axis_name)
+    product = fisher_product(
+        lambda params: policy(unravel(params), batch.obs, cfg), start, batch.old, cfg, axis_name
+    )
+    solve = jax.vmap(lambda v: conjugate_gradient(product, v, cfg.cg_iterations))
+    h, residual = solve(jnp.concatenate([g[None], b.reshape(-1, g.size)]))
+    residual_b = residual[1:].reshape(jnp.shape(context.violation))
+    return Gradients(g, b, h[0], h[1:].reshape(b.shape), residual[0], residual_b)
+
+
 class Margin(NamedTuple):
+    """The state of the step. It is no treatment's dual: the step alone reads it."""
+
     margin: jax.Array  # float [] or [K], in the violation's unit, >= 0
+
+
+def next_margin(old: jax.Array, violation: jax.Array, s: jax.Array, cfg: Any) -> jax.Array:
+    """margin <- clip(margin + margin_lr v, 0, margin_max sqrt(2 delta s)), if that is finite."""
+    reach = jnp.sqrt(2 * cfg.target_kl * jnp.maximum(s if s.ndim == 0 else jnp.diag(s), 0.0))
+    new = jnp.clip(old + cfg.margin_lr * violation, 0.0, cfg.margin_max * reach)
+    return jnp.where(jnp.isfinite(new), new, old)
 
 
 def step_by(rule: Rule) -> PolicyStep:
@@ -200,70 +238,54 @@ def step_by(rule: Rule) -> PolicyStep:
     def init(actor: PyTree, cfg: Any) -> Margin:
         return Margin(jnp.zeros(jnp.shape(limit(cfg, constrained_costs(cfg)))))
 
-    return PolicyStep(init, partial(update, rule), require_separate_trunk)
+    def update(
+        actor: PyTree, opt_state: Margin, objectives: Pair, batch: Any, context: Context
+    ) -> tuple[PyTree, Margin, Metrics]:
+        cfg, axis_name = context.cfg, context.axis_name
+        start, unravel = ravel_pytree(actor)
+        violation = context.violation / (context.episode_length if cfg.per_step else 1.0)
 
+        def evaluate(params: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+            actor = unravel(params)
+            both = objectives.reward(actor, batch)[0], objectives.cost(actor, batch)[0]
+            reward, cost = pmean(both, axis_name)
+            return reward, cost, distance(batch.old, policy(actor, batch.obs, cfg), cfg, axis_name)
 
-def update(
-    rule: Rule,
-    actor: PyTree,
-    opt_state: Margin,
-    objectives: Pair,
-    batch: Any,
-    context: Context,
-) -> tuple[PyTree, Margin, Metrics]:
-    cfg, axis_name = context.cfg, context.axis_name
-    start, unravel = ravel_pytree(actor)
-    violation = context.violation / (context.episode_length if cfg.per_step else 1.0)
-    delta = cfg.target_kl
+        found = gradients(actor, objectives, batch, context)
+        g, b, h_g, h_b = found.g, found.b, found.h_g, found.h_b
+        q, r, s = dot(g, h_g), dot(h_b, g), dot(b, h_b.T)
+        margin = next_margin(opt_state.margin, violation, s, cfg)
+        c = cfg.violation_gain * violation + margin
+        step, earns, metrics = rule(Problem(g, h_g, h_b, q, r, s, c, cfg.target_kl), cfg)
+        reward, cost, _ = evaluate(start)
 
-    def evaluate(params: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        actor = unravel(params)
-        both = objectives.reward(actor, batch)[0], objectives.cost(actor, batch)[0]
-        reward, cost = pmean(both, axis_name)
-        return reward, cost, distance(batch.old, policy(actor, batch.obs, cfg), cfg, axis_name)
+        def accept(params: jax.Array) -> jax.Array:
+            new_reward, new_cost, divergence = evaluate(params)
+            good = (new_reward >= reward) | (~earns & jnp.isfinite(new_reward))
+            safe = jnp.all(new_cost - cost <= jnp.maximum(-c, 0.0))
+            return good & safe & (divergence <= cfg.target_kl)
 
-    g = pmean(jax.grad(lambda params: objectives.reward(unravel(params), batch)[0])(start), axis_name)
-    gradient = jax.jacrev if violation.ndim else jax.grad  # [K, P], or [P]
-    b = pmean(gradient(lambda params: objectives.cost(unravel(params), batch)[0])(start), axis_name)
-    product = fisher_product(
-        lambda params: policy(unravel(params), batch.obs, cfg), start, batch.old, cfg, axis_name
-    )
-    solve = jax.vmap(lambda v: conjugate_gradient(product, v, cfg.cg_iterations))
-    h, residual = solve(jnp.concatenate([g[None], b.reshape(-1, g.size)]))
-    h_g, h_b = h[0], h[1:].reshape(b.shape)
-    q, r, s = dot(g, h_g), dot(h_b, g), dot(b, h_b.T)
-    reach = jnp.sqrt(2 * delta * jnp.maximum(s if s.ndim == 0 else jnp.diag(s), 0.0))
-    margin = jnp.clip(opt_state.margin + cfg.margin_lr * violation, 0.0, cfg.margin_max * reach)
-    margin = jnp.where(jnp.isfinite(margin), margin, opt_state.margin)
-    c = cfg.violation_gain * violation + margin
-    step, earns, metrics = rule(Problem(g, h_g, h_b, q, r, s, c, delta), cfg)
-    reward, cost, _ = evaluate(start)
+        end = line_search(accept, start, step, cfg.line_search_tries, cfg.line_search_shrink)
+        new_reward, new_cost, divergence = evaluate(end.params)
+        return (
+            unravel(end.params),
+            Margin(margin),
+            {
+                "train/kl": divergence,
+                "train/objective": new_reward - reward,
+                "train/objective_c": new_cost - cost,  # cost per step
+                "train/violation": violation,  # cost per step, as the margin, or per episode
+                "train/margin": margin,
+                "train/accepted": end.accepted,
+                "train/line_search": end.tried,
+                "train/cg_residual_r": found.residual_g,
+                "train/cg_residual_c": found.residual_b,
+                "train/nonfinite": ~all_finite((g, b, step)),
+                **metrics,
+            },
+        )
 
-    def accept(params: jax.Array) -> jax.Array:
-        new_reward, new_cost, divergence = evaluate(params)
-        good = (new_reward >= reward) | (~earns & jnp.isfinite(new_reward))
-        safe = jnp.all(new_cost - cost <= jnp.maximum(-c, 0.0))
-        return good & safe & (divergence <= delta)
-
-    found = line_search(accept, start, step, cfg.line_search_tries, cfg.line_search_shrink)
-    new_reward, new_cost, divergence = evaluate(found.params)
-    return (
-        unravel(found.params),
-        Margin(margin),
-        {
-            "train/kl": divergence,
-            "train/objective": new_reward - reward,
-            "train/objective_c": new_cost - cost,  # cost per step
-            "train/violation": violation,  # cost per step, as the margin, or per episode
-            "train/margin": margin,
-            "train/accepted": found.accepted,
-            "train/line_search": found.tried,
-            "train/cg_residual_r": residual[0],
-            "train/cg_residual_c": residual[1:].reshape(violation.shape),
-            "train/nonfinite": ~all_finite((g, b, step)),
-            **metrics,
-        },
-    )
+    return PolicyStep(init, update, require_separate_trunk)
 
 
 cpo_step = step_by(solution)

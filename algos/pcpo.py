@@ -48,7 +48,7 @@ class PCPOConfig(cpo.CPOConfig):
     margin_max: Weight = 5.0
 
 
-def projection(p: cpo.Problem, cfg: Any) -> cpo.Direction:
+def projected_step(p: cpo.Problem, cfg: Any) -> cpo.Direction:
     """The reward's step, moved back along H^-1 b to where b'x + c = 0, if it lies beyond."""
     scale = jnp.sqrt(2 * p.delta / jnp.maximum(p.q, 1e-20))
     back = (projection_multipliers if p.c.ndim else projection_multiplier)(scale * p.r + p.c, p.s)
@@ -70,7 +70,7 @@ def projection_multipliers(overshoot: jax.Array, s: jax.Array) -> jax.Array:
 
 def make(env: Env, axis_name: str | None = None) -> Algorithm:
     return on_policy_pair(
-        env, plain, cpo.step_by(projection), axis_name, constrained_costs=constrained_costs
+        env, plain, cpo.step_by(projected_step), axis_name, constrained_costs=constrained_costs
     )
 
 

@@ -166,7 +166,7 @@ class Run:
             ConfigError: no such policy, or no checkpoint yet.
         """
         self._opened.actor(index)
-        return self._act(self._opened.params, index, obs, key)
+        return self._act(self._opened.learned, index, obs, key)
 
     def player(self, index: int = 0) -> Player:
         """A trained policy with its memory: `carry = player.begin()`, then at each step
@@ -176,7 +176,7 @@ class Run:
             index: which policy.
 
         Returns:
-            The policy, with its parameters and `task`, the environment that it meets.
+            The policy, with what it has learned and `task`, the environment that it meets.
 
         Raises:
             ConfigError: no such policy, or no checkpoint yet.
@@ -210,8 +210,8 @@ class Run:
         algo = self._opened.algo
 
         def act(every: PyTree, index: Any, obs: jax.Array, key: jax.Array | None) -> jax.Array:
-            params = jax.tree.map(lambda x: x[index], every)
-            return algo.policy.act(params, algo.policy.init(params), obs, key)[0]
+            learned = jax.tree.map(lambda x: x[index], every)
+            return algo.policy.act(learned, algo.policy.init(learned), obs, key)[0]
 
         return jax.jit(act)
 

@@ -195,7 +195,7 @@ def convert(value: Any, kind: Any, name: str) -> Any:
         return value
     elif (number := as_number(value, kind)) is not None:
         return number
-    raise ConfigError(f"{name}={shown(value)}: expected {describe(kind)}")
+    raise ConfigError(f"{name}={shown(value)}: expected {kind_in_words(kind)}")
 
 
 def as_number(value: Any, kind: Any) -> Any:
@@ -218,19 +218,19 @@ def shown(value: Any) -> str:
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 
-def describe(kind: Any) -> str:
+def kind_in_words(kind: Any) -> str:
     """The annotated type in a user's words."""
     origin, args = typing.get_origin(kind), typing.get_args(kind)
     if origin is Annotated:
-        return f"{describe(args[0])} {args[1]}"
+        return f"{kind_in_words(args[0])} {args[1]}"
     if origin in (typing.Union, types.UnionType):
-        return " or ".join("null" if a is type(None) else describe(a) for a in args)
+        return " or ".join("null" if a is type(None) else kind_in_words(a) for a in args)
     if origin is tuple and args[-1] is Ellipsis:
-        return f"a list of {describe(args[0])}"
+        return f"a list of {kind_in_words(args[0])}"
     if origin is dict:
-        return f"names with {describe(args[1])} each, as in {{name: 5}}"
+        return f"names with {kind_in_words(args[1])} each, as in {{name: 5}}"
     if origin is tuple:
-        return f"{len(args)} values ({', '.join(map(describe, args))})"
+        return f"{len(args)} values ({', '.join(map(kind_in_words, args))})"
     return {int: "a whole number", float: "a number", str: "a string", bool: "true or false"}.get(
         kind, str(kind)
     )

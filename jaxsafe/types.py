@@ -63,9 +63,11 @@ class Env(Protocol):
 class Policy(NamedTuple):
     """All that evaluation, films, the live view, adapters and `init_from` know of an algorithm.
 
-    init(params) -> carry, what the policy remembers at the start of an episode: () for a policy
+    `learned` is what `Algorithm.learned` gives: all that the policy is made of.
+
+    init(learned) -> carry, what the policy remembers at the start of an episode: () for a policy
         that only sees the present observation.
-    act(params, carry, obs, key) -> (action [A], carry, extras): one step in one environment, without a
+    act(learned, carry, obs, key) -> (action [A], carry, extras): one step in one environment, without a
         batch axis. `key` None asks for the mean action. extras is a dict of what a policy reports
         beside its action, as whether a shield overruled it; most report nothing.
     privileged: `act` takes the environment's `State` for `obs`: the policy looks into the simulator, as
@@ -108,10 +110,11 @@ class Algorithm(NamedTuple):
     init(key, cfg, shared) -> ts, a train state: a dataclass whose `config` is `cfg`, with its floats as
         arrays.
     update(ts, shared) -> (ts, metrics).
-    policy: see `Policy`; its `params` are those of the next line.
-    params(ts) -> pytree, the policy's parameters, from which another run can start, too: networks,
-        normaliser, config. No optimiser and no replay.
-    task(params) -> the Env whose observations the policy takes.
+    policy: see `Policy`.
+    learned(ts) -> pytree, all that the policy is made of: networks, normaliser, and `config`, with
+        `discount` and `cost_discount`, which evaluation reads. No optimiser and no replay. It is what a
+        run folder keeps in policy/, and what another run can start from. See `learn.acting.Learned`.
+    task(learned) -> the Env whose observations the policy takes.
     clocks(cfg) -> Clocks. Raises ConfigError for sizes that do not fit each other. Where an update
         takes no environment steps, the algorithm learns from the data set in `Shared`; elsewhere its
         config has `num_envs`.
@@ -120,6 +123,6 @@ class Algorithm(NamedTuple):
     init: Callable[[jax.Array, Any, Shared], PyTree]
     update: Callable[[PyTree, Shared], tuple[PyTree, Metrics]]
     policy: Policy
-    params: Callable[[PyTree], PyTree]
+    learned: Callable[[PyTree], PyTree]
     task: Callable[[PyTree], Env]
     clocks: Callable[[Any], Clocks]

@@ -43,7 +43,7 @@ def states(env: envs.SafetyGym, small: scenes.Scene, worlds: int) -> dict[str, n
         return jax.vmap(env.step)(state, action), None
 
     def awake(p):
-        chosen = {k: sleeping.nearest(p, env.scene, small, k) for k in sleeping.SLEEPERS}
+        chosen = {k: sleeping.awake_objects(p, env.scene, small, k) for k in sleeping.SLEEPERS}
         at = sleeping.places(env.scene, chosen)
         velocity, warmstart = p.qvel[at.qvel], p.warmstart[at.qvel]
         return p.qpos[at.qpos], velocity, warmstart, p.mocap_pos[at.mocap], p.mocap_quat[at.mocap]
@@ -52,7 +52,7 @@ def states(env: envs.SafetyGym, small: scenes.Scene, worlds: int) -> dict[str, n
     keys = jax.random.split(jax.random.key(1), 60)
     end = jax.jit(lambda state: jax.lax.scan(step, state, keys)[0])(begin)
     names = ("qpos", "qvel", "qacc_warmstart", "mocap_pos", "mocap_quat")
-    arrays = jax.device_get(jax.jit(jax.vmap(awake))(end.physics.physics))
+    arrays = jax.device_get(jax.jit(jax.vmap(awake))(end.physics.bodies))
     return {name: x for name, x in zip(names, arrays, strict=True) if x.size}
 
 

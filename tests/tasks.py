@@ -52,13 +52,13 @@ def task(name: str, engine: str = "c", **overrides: Any) -> Task:
 
 def change(state: State, physics: dict[str, Any] | None = None, **world: Any) -> State:
     """`state` with fields of its world, and of the physics in it, replaced."""
-    new = state.physics.replace(physics=state.physics.physics.replace(**physics or {}), **world)
+    new = state.physics.replace(bodies=state.physics.bodies.replace(**physics or {}), **world)
     return state.replace(physics=new)  # type: ignore[attr-defined]
 
 
 def with_qpos(state: State, columns: slice, values: Any) -> State:
     """`state` with some columns of qpos [n, nq] replaced."""
-    return change(state, {"qpos": state.physics.physics.qpos.at[:, columns].set(jnp.asarray(values))})
+    return change(state, {"qpos": state.physics.bodies.qpos.at[:, columns].set(jnp.asarray(values))})
 
 
 def put(t: Task, state: State, name: str, xy: Any) -> State:

@@ -37,7 +37,7 @@ def context(
 
 def reflex(act: Callable[[jax.Array], jax.Array], task: Env) -> Player:
     """A player that remembers nothing, from a function: obs [O] -> action [A]."""
-    policy = Policy(lambda params: (), lambda params, carry, obs, key: (act(obs), (), {}))
+    policy = Policy(lambda learned: (), lambda learned, carry, obs, key: (act(obs), (), {}))
     return Player(policy, (), task)
 
 

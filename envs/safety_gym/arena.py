@@ -18,12 +18,14 @@ from jaxsafe.envs.safety_gym.config import SafetyGymConfig
 class World:
     """What an episode remembers between two steps.
 
+    bodies: what moves, in the engine's terms.
     layout [n, 2]: where each object of the placement was put; the goal's row is the current goal.
     start [3]: the robot's first x, y (m) and heading (rad).
-    last_dist_goal, last_dist_box, last_box_goal (m), last_com [3]: what rewards compare with.
+    last_dist_goal, last_dist_box, last_box_goal (m), last_com [3]: what rewards compare with, as it
+        was last measured.
     """
 
-    physics: Physics
+    bodies: Physics
     layout: jax.Array
     start: jax.Array
     goal_button: jax.Array
@@ -79,7 +81,7 @@ class Arena:
             mocap = mocap.at[rows, 3:].set(jnp.array([1.0, 0.0, 0.0, 0.0]))
         zero, none = jnp.zeros(()), jnp.int32(0)
         return World(
-            physics=Physics(
+            bodies=Physics(
                 # no empty part, no constant to overwrite: jax 0.11 crashes on them within shard_map
                 qpos=jnp.concatenate([x for x in qpos if x.size]),
                 qvel=jnp.zeros(scene.model.nv),
@@ -102,7 +104,7 @@ class Arena:
 
     def robot_pose(self, world: World) -> tuple[jax.Array, jax.Array]:
         """Position [3] and rotation [3, 3] (columns are the body's axes) of the robot."""
-        qpos = world.physics.qpos
+        qpos = world.bodies.qpos
         if self.scene.planar:
             c, s = jnp.cos(qpos[2]), jnp.sin(qpos[2])
             zero, one = jnp.zeros(()), jnp.ones(())
@@ -113,11 +115,11 @@ class Arena:
     def positions(self, world: World, kind: str) -> jax.Array:
         """Current positions [n, 2] of the objects of a kind (m)."""
         if kind in self.scene.frees:
-            return world.physics.qpos[self.scene.qpos_slice(kind)].reshape(-1, 7)[:, :2]
+            return world.bodies.qpos[self.scene.qpos_slice(kind)].reshape(-1, 7)[:, :2]
         return world.layout[self.place.slice(kind)]
 
     def box_position(self, world: World) -> jax.Array:
-        return world.physics.qpos[self.scene.qpos_slice("box")][:3]
+        return world.bodies.qpos[self.scene.qpos_slice("box")][:3]
 
     def goal_position(self, world: World) -> jax.Array:
         """Position [3] of the goal, or of the button to press; the origin where there is neither."""

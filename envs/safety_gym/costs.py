@@ -35,7 +35,7 @@ def vases_displace(arena: Arena, world: World, readings: Readings) -> jax.Array:
 
 
 def vases_velocity(arena: Arena, world: World, readings: Readings) -> jax.Array:
-    speed = norm(world.physics.qvel[arena.scene.qvel_slice("vases")].reshape(-1, 6)[:, :3])
+    speed = norm(world.bodies.qvel[arena.scene.qvel_slice("vases")].reshape(-1, 6)[:, :3])
     counted = speed >= arena.config.vases_velocity_threshold
     return arena.config.vases_velocity_cost * jnp.where(counted, speed, 0).sum()
 

@@ -126,7 +126,7 @@ def areas_of(cfg: SafetyGymConfig, kind: str, number: int) -> list[Rectangle]:
     return kept
 
 
-def draw(key: jax.Array, areas: jax.Array, weights: jax.Array, count: int) -> jax.Array:
+def draw_positions(key: jax.Array, areas: jax.Array, weights: jax.Array, count: int) -> jax.Array:
     """`count` positions [count, 2] of one object, from rectangles [r, 4] of given weights [r]."""
     choice_key, place_key = jax.random.split(key)
     if areas.shape[0] == 1:
@@ -169,7 +169,7 @@ def sample_layout(place: Placement, key: jax.Array) -> tuple[jax.Array, jax.Arra
     def place_next(lane: Lane) -> Lane:
         xy, i, draws, number, key = lane
         key, draw_key = jax.random.split(key)
-        candidates = draw(draw_key, areas[i], weights[i], DRAWS_AT_ONCE)
+        candidates = draw_positions(draw_key, areas[i], weights[i], DRAWS_AT_ONCE)
         free = jnp.all(clear(candidates, xy, apart[i]) | (jnp.arange(n) >= i), axis=1)
         found, draws = free.any() & (i < n), draws + DRAWS_AT_ONCE
         failed = ~found & (i < n) & (draws >= DRAWS_PER_OBJECT)
@@ -248,7 +248,7 @@ def sample_goal(
 
     def batch(now: GoalSearch) -> GoalSearch:
         key, draw_key = jax.random.split(now.key)
-        candidates = draw(
+        candidates = draw_positions(
             draw_key, jnp.asarray(place.areas[goal]), jnp.asarray(place.weights[goal]), GOAL_BATCH
         )
         free = jnp.all(clear(candidates, xy, apart) | ~others, axis=1)

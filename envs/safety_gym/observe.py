@@ -59,13 +59,13 @@ def components(
     if cfg.observe_remaining:
         parts["remaining"] = (world.steps / cfg.num_steps)[None]
     if cfg.observe_qpos:
-        parts["qpos"] = from_start(arena, world, world.physics.qpos, 3)
+        parts["qpos"] = from_start(arena, world, world.bodies.qpos, 3)
     if cfg.observe_qvel:
-        parts["qvel"] = from_start(arena, world, world.physics.qvel, 2)
+        parts["qvel"] = from_start(arena, world, world.bodies.qvel, 2)
     if cfg.observe_ctrl:
         parts["ctrl"] = ctrl
     if cfg.observe_freejoint:
-        parts["freejoint"] = world.physics.qpos[:7]
+        parts["freejoint"] = world.bodies.qpos[:7]
     if cfg.observe_com:
         parts["com"] = arena.sensor(readings, "subtreecom")
     return {name: parts[name] for name in in_order(arena, parts)}
@@ -149,7 +149,7 @@ def shapes_of(arena: Arena, world: World, readings: Readings) -> sensing.Shapes:
         size = (cfg.hazards_size, 0.01, 0)
         extra.append((cylinder, size, scenes.GROUP["hazard"], jnp.append(xy, 0.02), jnp.eye(3)))
     if cfg.gremlins_num:
-        physics, timestep = world.physics, model.opt.timestep
+        physics, timestep = world.bodies, model.opt.timestep
         last = (physics.substeps - 1) * timestep
         guides = engines.mocap_at(physics.mocap_pos, arena.scene.orbit, last, jnp)
         resting = physics.mocap_pos - jnp.array([0.0, 0.0, cfg.gremlins_size])

@@ -53,8 +53,8 @@ class Recording:
         return self.arrays.get(key, np.full(len(self.rows), default))
 
 
-class Given(NamedTuple):
-    """What the recorded step led to, by chance."""
+class NextGoal(NamedTuple):
+    """The goal that followed the recorded step. The environment would draw it."""
 
     goal: Any  # [2], m
     button: Any  # int32 []
@@ -73,7 +73,7 @@ class Replay(SafetyGym):
         return scenes.with_soft_gremlins(super()._build_scene(cfg, mjx))
 
     def after(
-        self, world: World, given: Given, drive: Drive, moved: Physics, readings: Readings
+        self, world: World, given: NextGoal, drive: Drive, moved: Physics, readings: Readings
     ) -> State:
         """The state after a step whose physics made `moved` and `readings`."""
         self._given = given.goal, given.button
@@ -125,7 +125,7 @@ def worlds(env: SafetyGym, recording: Recording) -> World:
     com = recording.arrays.get("state.last_robot_com")
     timestep = env.scene.model.opt.timestep
     return World(
-        physics=Physics(
+        bodies=Physics(
             qpos=f32(state["qpos"]),
             qvel=f32(state["qvel"]),
             warmstart=f32(state["qacc_warmstart"]),
@@ -243,18 +243,18 @@ def replay(env: Replay, recording: Recording, before: World) -> State:
     @jax.jit
     @jax.vmap
     def state_after(
-        world: World, given: Given, drive: Drive, moved: Physics, readings: Readings
+        world: World, given: NextGoal, drive: Drive, moved: Physics, readings: Readings
     ) -> State:
         after = env.after(world, given, drive, moved, readings)
         return after.replace(physics=after.physics.replace(key=world.key))
 
     run, _ = physics_of(env._engine)
 
-    def step(world: World, action: jax.Array, given: Given) -> State:
+    def step(world: World, action: jax.Array, given: NextGoal) -> State:
         driven = drive(world, action)
-        return state_after(world, given, driven, *run(world.physics, driven.ctrl, driven.substeps))
+        return state_after(world, given, driven, *run(world.bodies, driven.ctrl, driven.substeps))
 
-    inputs = (before, f32(recording["step.action"]), Given(goal, button))
+    inputs = (before, f32(recording["step.action"]), NextGoal(goal, button))
     count = len(rows)
     padding = -count % BATCH
     inputs = jax.tree.map(lambda x: np.concatenate([x, np.repeat(x[-1:], padding, 0)]), inputs)
@@ -270,7 +270,7 @@ def compare_states(
 ) -> Comparison:
     """Set the states after each step beside the recorded ones; grazing lidar bins are left out."""
     robot, after = recording.meta["robot"], recording.rows + 1
-    world, physics = result.physics, result.physics.physics
+    world, physics = result.physics, result.physics.bodies
     nq, nv = recording.meta["robot_nq"], recording.meta["robot_nv"]
     qpos, qvel = np.asarray(physics.qpos, np.float64), np.asarray(physics.qvel, np.float64)
     if env.scene.planar:

@@ -10,6 +10,7 @@ import dataclasses
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -145,70 +146,24 @@ def build(cfg: SafetyGymConfig, mjx: bool = False, drawn: bool = False) -> Scene
     Raises:
         ConfigError: an unknown robot, sensor or body.
     """
-    path = robot_file(cfg.robot_base)
-    try:
-        spec = mujoco.MjSpec.from_file(str(path))
-        robot = spec.compile()
-    except ValueError as error:
-        raise ConfigError(f"env.robot_base={cfg.robot_base!r}: {str(error).splitlines()[0]}") from error
-    body = spec.body("robot")
-    if body is None or not any(site.name == "robot" for site in spec.sites):
-        raise ConfigError(f"env.robot_base={cfg.robot_base!r}: it has no body and site named 'robot'")
-    planar = robot.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE
+    spec, robot = read_robot(cfg)
     check_robot(cfg, robot)
-
-    world = spec.worldbody
     half = max(map(abs, cfg.placements_extents)) + 0.1 if cfg.floor_display_mode else 3.5
     fixed = OBJECT | ({"contype": 0} if mjx else {})
-    floor = world.add_geom(
+    floor = spec.worldbody.add_geom(
         name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(half, half, 0.1), **fixed
     )
     if drawn:
         decorate(spec, floor)
-    frees = {
-        "vases": cfg.vases_num,
-        "gremlins": cfg.gremlins_num,
-        "box": int(cfg.task == "push"),
-    }
-    mocaps = {
-        "gremlins": cfg.gremlins_num,
-        "pillars": cfg.pillars_num,
-        "walls": cfg.walls_num,
-        "buttons": cfg.buttons_num,
-    }
-    for i in range(cfg.vases_num):
-        add_cube(spec, f"vase{i}", "vase", cfg.vases_size, cfg.vases_density)
-    for i in range(cfg.gremlins_num):
-        add_cube(spec, f"gremlin{i}obj", "gremlin", cfg.gremlins_size, cfg.gremlins_density)
-    if cfg.task == "push":
-        add_box(spec, cfg)
+    add_free_objects(spec, cfg)
     for i in range(cfg.gremlins_num):
         add_gremlin_guide(spec, i, cfg.gremlins_size, drawn)
-    for i in range(cfg.pillars_num):
-        size = (cfg.pillars_size, cfg.pillars_height, 0)
-        shape = mujoco.mjtGeom.mjGEOM_CAPSULE if mjx else mujoco.mjtGeom.mjGEOM_CYLINDER
-        add_fixed(spec, f"pillar{i}", "pillar", fixed, shape, size)
-    for i in range(cfg.walls_num):
-        add_fixed(spec, f"wall{i}", "wall", fixed, mujoco.mjtGeom.mjGEOM_BOX, (cfg.walls_size,) * 3)
-    for i in range(cfg.buttons_num):
-        add_fixed(
-            spec, f"button{i}", "button", fixed, mujoco.mjtGeom.mjGEOM_SPHERE, (cfg.buttons_size, 0, 0)
-        )
-
+    pillar = mujoco.mjtGeom.mjGEOM_CAPSULE if mjx else mujoco.mjtGeom.mjGEOM_CYLINDER
+    add_fixed_objects(spec, cfg, pillar, fixed)
     kept = needed_sensors(cfg)
     for sensor in list(spec.sensors):
         if sensor.name not in kept and not sensor.name.startswith(("jointpos_", "jointvel_", "ball")):
             spec.delete(sensor)
-    watched = {
-        "vases": [f"vase{i}" for i in range(cfg.vases_num)] if cfg.constrain_vases else [],
-        "pillars": [f"pillar{i}" for i in range(cfg.pillars_num)] if cfg.constrain_pillars else [],
-        "gremlins": [f"gremlin{i}obj" for i in range(cfg.gremlins_num)]
-        if cfg.constrain_gremlins
-        else [],
-        "buttons": [f"button{i}" for i in range(cfg.buttons_num)]
-        if cfg.constrain_buttons or cfg.task == "button"
-        else [],
-    }
     if mjx:
         for name, value in MJX_LIMITS.items():
             spec.add_numeric(name=name, data=[value], size=1)
@@ -218,15 +173,76 @@ def build(cfg: SafetyGymConfig, mjx: bool = False, drawn: bool = False) -> Scene
     return Scene(
         spec=spec,
         model=model,
-        planar=bool(planar),
+        planar=bool(robot.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE),
         robot_height=float(robot.body("robot").pos[2]),
         robot_nq=robot.nq,
         robot_nv=robot.nv,
-        frees=frees,
-        mocaps=mocaps,
+        frees={"vases": cfg.vases_num, "gremlins": cfg.gremlins_num, "box": int(cfg.task == "push")},
+        mocaps={kind: getattr(cfg, f"{kind}_num") for kind in MOCAPS},
         orbit=orbit,
-        watched=watched,
+        watched=watched_bodies(cfg),
     )
+
+
+def read_robot(cfg: SafetyGymConfig) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
+    """The robot's file, and the robot alone, compiled."""
+    path = robot_file(cfg.robot_base)
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+        robot = spec.compile()
+    except ValueError as error:
+        raise ConfigError(f"env.robot_base={cfg.robot_base!r}: {str(error).splitlines()[0]}") from error
+    if spec.body("robot") is None or not any(site.name == "robot" for site in spec.sites):
+        raise ConfigError(f"env.robot_base={cfg.robot_base!r}: it has no body and site named 'robot'")
+    return spec, robot
+
+
+def add_free_objects(spec: mujoco.MjSpec, cfg: SafetyGymConfig) -> None:
+    """Vases, gremlins and the box, in the order of `FREES`."""
+    for i in range(cfg.vases_num):
+        add_cube(spec, f"vase{i}", "vase", cfg.vases_size, cfg.vases_density)
+    for i in range(cfg.gremlins_num):
+        add_cube(spec, f"gremlin{i}obj", "gremlin", cfg.gremlins_size, cfg.gremlins_density)
+    if cfg.task == "push":
+        add_box(spec, cfg)
+
+
+def add_fixed_objects(
+    spec: mujoco.MjSpec, cfg: SafetyGymConfig, pillar: mujoco.mjtGeom, fixed: dict[str, Any]
+) -> None:
+    """Pillars, walls and buttons, in the order of `MOCAPS`.
+
+    Args:
+        pillar: the shape of a pillar.
+        fixed: options of the geoms of what is fixed.
+    """
+    box, sphere = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_SPHERE
+    sizes = {
+        "pillar": (cfg.pillars_size, cfg.pillars_height, 0),
+        "wall": (cfg.walls_size,) * 3,
+        "button": (cfg.buttons_size, 0, 0),
+    }
+    for kind, shape in {"pillar": pillar, "wall": box, "button": sphere}.items():
+        for i in range(getattr(cfg, f"{kind}s_num")):
+            body = spec.worldbody.add_body(name=f"{kind}{i}", mocap=True)
+            body.add_geom(name=f"{kind}{i}", type=shape, size=sizes[kind], **fixed, **look(kind))
+
+
+def watched_bodies(cfg: SafetyGymConfig) -> dict[str, list[str]]:
+    """By kind, the bodies whose contacts with the robot are counted."""
+    on = {
+        "vases": cfg.constrain_vases,
+        "pillars": cfg.constrain_pillars,
+        "gremlins": cfg.constrain_gremlins,
+        "buttons": cfg.constrain_buttons or cfg.task == "button",
+    }
+    end = {"gremlins": "obj"}  # the other body of a gremlin is its guide
+    return {
+        kind: [f"{kind[:-1]}{i}{end.get(kind, '')}" for i in range(getattr(cfg, f"{kind}_num"))]
+        if watched
+        else []
+        for kind, watched in on.items()
+    }
 
 
 def check_robot(cfg: SafetyGymConfig, robot: mujoco.MjModel) -> None:
@@ -319,13 +335,6 @@ def with_soft_gremlins(scene: Scene) -> Scene:
     for weld in spec.equalities:
         weld.data = [*weld.data[:TORQUESCALE], 1, *weld.data[TORQUESCALE + 1 :]]
     return dataclasses.replace(scene, spec=spec, model=spec.compile())
-
-
-def add_fixed(
-    spec: mujoco.MjSpec, name: str, kind: str, options: dict, shape: mujoco.mjtGeom, size: tuple
-) -> None:
-    body = spec.worldbody.add_body(name=name, mocap=True)
-    body.add_geom(name=name, type=shape, size=size, **options, **look(kind))
 
 
 def decorate(spec: mujoco.MjSpec, floor: mujoco.MjsGeom) -> None:

@@ -60,7 +60,7 @@ def with_sleepers(engine: Engine, small: Scene, scene: Scene, cfg: SafetyGymConf
 
     def wake(run: PhysicsCall) -> PhysicsCall:
         def woken(physics: Physics, ctrl: jax.Array, substeps: jax.Array) -> tuple[Physics, Readings]:
-            chosen = {kind: nearest(physics, scene, small, kind, moving) for kind in SLEEPERS}
+            chosen = {kind: awake_objects(physics, scene, small, kind, moving) for kind in SLEEPERS}
             at = places(scene, chosen)
             few = physics.replace(
                 qpos=physics.qpos[at.qpos],
@@ -118,7 +118,7 @@ def places(scene: Scene, awake: dict[str, jax.Array]) -> Places:
     )
 
 
-def nearest(
+def awake_objects(
     physics: Physics, scene: Scene, small: Scene, kind: str, moving: float = MOVING
 ) -> jax.Array:
     """The objects of a kind that are awake, int [k], in their order: vases at least as fast as `moving`

@@ -80,7 +80,7 @@ class SafetyGym:
 
         def shown(key: jax.Array) -> dict[str, jax.Array]:
             world, ctrl = self.begin(key)
-            _, readings = self._engine.forward(world.physics, ctrl)
+            _, readings = self._engine.forward(world.bodies, ctrl)
             return observe.components(self.arena, world, readings, ctrl)
 
         with jax.ensure_compile_time_eval():
@@ -124,11 +124,11 @@ class SafetyGym:
 
     def reset(self, key: jax.Array) -> State:
         world, ctrl = self.begin(key)
-        return self.begun(world, ctrl, *self._engine.forward(world.physics, ctrl))
+        return self.begun(world, ctrl, *self._engine.forward(world.bodies, ctrl))
 
     def step(self, state: State, action: jax.Array) -> State:
         drive = self.drive(state.physics, action)
-        run = self._engine.run(state.physics.physics, drive.ctrl, drive.substeps)
+        run = self._engine.run(state.physics.bodies, drive.ctrl, drive.substeps)
         return self.judge(state, drive, *run)
 
     def begin(self, key: jax.Array) -> tuple[World, jax.Array]:
@@ -153,7 +153,7 @@ class SafetyGym:
 
     def begun(self, world: World, ctrl: jax.Array, physics: Physics, readings: Readings) -> State:
         """What comes after the physics of a reset."""
-        world = world.replace(physics=physics)
+        world = world.replace(bodies=physics)
         if "subtreecom" in self.arena.sensors:
             world = world.replace(last_com=self.arena.sensor(readings, "subtreecom"))
         zero = jnp.zeros(())
@@ -184,8 +184,8 @@ class SafetyGym:
     def judge(self, state: State, drive: Drive, physics: Physics, readings: Readings) -> State:
         """What comes after the physics of a step: reward, costs, next goal, observation."""
         cfg, world, key = self.config, state.physics, drive.key
-        moved = world.replace(physics=physics, key=key)
-        reward, moved = rewards.reward(self.arena, moved, readings)
+        moved = rewards.measured(self.arena, world.replace(bodies=physics, key=key), readings)
+        reward = rewards.reward(self.arena, world, moved, readings)
         costs, cost = constraints.costs(self.arena, moved, readings)
         moved = moved.replace(
             buttons_timer=jnp.maximum(0, moved.buttons_timer - 1), steps=world.steps + 1
@@ -257,11 +257,11 @@ def in_parts(env: SafetyGym, **options: Any) -> tuple[Callable, Callable]:
 
     def reset(keys: jax.Array) -> State:
         world, ctrl = begin(keys)
-        return begun(world, ctrl, *forward(world.physics, ctrl))
+        return begun(world, ctrl, *forward(world.bodies, ctrl))
 
     def step(state: State, action: jax.Array) -> State:
         given = drive(state.physics, action)
-        return judge(state, given, *run(state.physics.physics, given.ctrl, given.substeps))
+        return judge(state, given, *run(state.physics.bodies, given.ctrl, given.substeps))
 
     return reset, step
 

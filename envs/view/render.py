@@ -68,7 +68,7 @@ class Stage:
 
     def move(self, world: World) -> None:
         """Put the model's bodies where they are in `world`."""
-        physics, data = world.physics, self.data
+        physics, data = world.bodies, self.data
         time = np.maximum(physics.substeps - 1, 0) * self.model.opt.timestep
         orbit = self.scene.orbit * (physics.substeps > 0)  # gremlins start at their circles' centres
         data.qpos[:] = physics.qpos

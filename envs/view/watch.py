@@ -1,6 +1,6 @@
 """Watch a policy, or drive a robot by keys, as it happens: in MuJoCo's window or a page for browsers.
 
-A `Session` plays episodes; `open_window` and `serve_page` show it, and hand it what is pressed.
+A `Playback` plays episodes; `open_window` and `serve_page` show it, and hand it what is pressed.
 """
 
 import io
@@ -10,6 +10,7 @@ import threading
 import time
 import webbrowser
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
@@ -142,14 +143,14 @@ def pushed(held: set[str]) -> tuple[int, int]:
     return int(forward), int(turn)
 
 
-def figures(session: Playback) -> dict[str, str]:
+def figures(playback: Playback) -> dict[str, str]:
     """What an episode has come to so far, by name."""
-    named = zip(session.env.cost_names, session.costs, strict=True)
+    named = zip(playback.env.cost_names, playback.costs, strict=True)
     return {
-        "seed": f"{session.seed}",
-        "step": f"{session.steps} of {session.limit}",
-        "return": f"{session.ret:.2f}",
-        "cost": f"{session.cost:.0f}",
+        "seed": f"{playback.seed}",
+        "step": f"{playback.steps} of {playback.limit}",
+        "return": f"{playback.ret:.2f}",
+        "cost": f"{playback.cost:.0f}",
         **{f"cost {name}": f"{value:.4g}" for name, value in named},
     }
 
@@ -166,22 +167,22 @@ def has_display() -> bool:
     return sys.platform != "darwin" and render.works("glfw")
 
 
-def open_window(session: Playback) -> None:
+def open_window(playback: Playback) -> None:
     """Play in MuJoCo's own viewer until its window is closed."""
     import mujoco.viewer
 
-    stage, presses = render.Stage(session.env), dict[str, float]()
+    stage, presses = render.Stage(playback.env), dict[str, float]()
 
     def press(code: int) -> None:
         if code in CODES:
             presses[CODES[code]] = time.monotonic()
         elif code == SPACE:
-            session.playing = not session.playing
+            playback.playing = not playback.playing
         elif code in (BACKSPACE, PAGE_DOWN):
-            session.reset(session.seed + (code == PAGE_DOWN))
+            playback.reset(playback.seed + (code == PAGE_DOWN))
 
     print("arrows drive, space pauses, backspace resets, page down goes to the next seed", flush=True)
-    stage.move(session.state.physics)
+    stage.move(playback.state.physics)
     with mujoco.viewer.launch_passive(
         stage.model, stage.data, key_callback=press, show_left_ui=False, show_right_ui=False
     ) as viewer:
@@ -195,17 +196,17 @@ def open_window(session: Playback) -> None:
 
         def show() -> None:
             now = time.monotonic()
-            session.held = {key for key, pressed in presses.items() if now - pressed < TAP}
-            state = session.state
+            playback.held = {key for key, pressed in presses.items() if now - pressed < TAP}
+            state = playback.state
             with viewer.lock():
                 stage.move(state.physics)
                 marks.ngeom = 0
                 stage.mark(marks, state)
-            names, values = zip(*figures(session).items(), strict=True)
+            names, values = zip(*figures(playback).items(), strict=True)
             viewer.set_texts((None, None, "\n".join(names), "\n".join(values)))
             viewer.sync()
 
-        session.play(show, lambda: not viewer.is_running())
+        playback.play(show, lambda: not viewer.is_running())
 
 
 # A page ----------------------------------------------------------------------------------------------
@@ -245,84 +246,50 @@ def is_free(port: int) -> bool:
     return True
 
 
-def serve_page(session: Playback, title: str, port: int, open_browser: bool) -> None:
+@dataclass
+class Frame:
+    """What the page and the thread that plays share: the camera to look through, and what it saw."""
+
+    camera: str = "track"
+    jpeg: bytes = b""
+
+
+def serve_page(playback: Playback, title: str, port: int, open_browser: bool) -> None:
     """Play in a page on this machine's `port` until Ctrl-C.
 
     Raises:
         NoDisplay: nothing to render with.
     """
     from fastapi import Response
-    from nicegui import app, events, ui
+    from nicegui import app, ui
 
     render.find_backend()
-    camera, picture_of, stopped = ["track"], [b""], threading.Event()
+    frame, stopped = Frame(), threading.Event()
     failures: list[Exception] = []
 
     def play() -> None:
         try:
-            renderer = render.Renderer(session.env)  # here: OpenGL minds the thread
+            renderer = render.Renderer(playback.env)  # here: OpenGL minds the thread
 
             def show() -> None:
-                renderer.camera = render.named_camera(renderer.stage.model, camera[0])
-                picture_of[0] = as_jpeg(renderer.frame(session.state))
+                renderer.camera = render.named_camera(renderer.stage.model, frame.camera)
+                frame.jpeg = as_jpeg(renderer.frame(playback.state))
 
-            session.play(show, stopped.is_set)
+            playback.play(show, stopped.is_set)
         except Exception as error:  # raised again below, in the thread of whoever called
             failures.append(error)
             app.shutdown()
 
-    def on_key(event: events.KeyEventArguments) -> None:
-        if event.key.code in KEYS:
-            (session.held.add if event.action.keydown else session.held.discard)(event.key.code)
-        elif event.key.code == "Space" and event.action.keydown:
-            pause()
-
-    def pause() -> None:
-        session.playing = not session.playing
-
-    def root() -> None:
-        ui.add_head_html(RELEASED)
-        ui.on("released", lambda: session.held.clear())
-        ui.keyboard(on_key, repeating=False, ignore=["input", "select"])
-        with ui.row(wrap=False):
-            with ui.column():
-                picture = ui.interactive_image().style("width: 640px; height: 480px")
-                lidars = ui.html(sanitize=False)
-            with ui.column():
-                ui.label(title).classes("text-h6")
-                with ui.row():
-                    button = ui.button("Pause", on_click=pause)
-                    ui.button("Reset", on_click=lambda: session.reset(session.seed))
-                    ui.button("Next", on_click=lambda: session.reset(session.seed + 1))
-                with ui.row():
-                    seed = ui.number("Seed", value=session.seed, min=0, max=2**31 - 1, precision=0)
-                    seed.style("width: 90px")
-                    seed.on("change", lambda: session.reset(int(seed.value or 0)))
-                    view = ui.select(list(CAMERAS), value=camera[0], label="Camera").style(
-                        "width: 110px"
-                    )
-                    view.on_value_change(lambda event: camera.__setitem__(0, event.value))
-                numbers = ui.html(sanitize=False)
-                ui.label("Drive: arrow keys or W A S D. Pause: space.").classes("text-caption")
-
-        def describe() -> None:
-            button.text = "Pause" if session.playing else "Play"
-            numbers.content = as_table(session)
-            lidars.content = as_bars(session.env, session.state)
-
-        ui.timer(1 / FPS, lambda: picture.set_source(f"/frame?{time.monotonic()}"))
-        ui.timer(0.1, describe)
-
     @app.get("/frame")
-    def frame() -> Response:
-        return Response(picture_of[0], media_type="image/jpeg", headers={"Cache-Control": "no-store"})
+    def newest() -> Response:
+        return Response(frame.jpeg, media_type="image/jpeg", headers={"Cache-Control": "no-store"})
 
     thread = threading.Thread(target=play, daemon=True)
     app.on_startup(thread.start)
     print(f"http://localhost:{port} shows it in a browser; Ctrl-C ends", flush=True)
     try:
         ui.run(
-            root,
+            lambda: lay_out_page(playback, title, frame),
             host="127.0.0.1",
             port=port,
             title=title,
@@ -337,21 +304,68 @@ def serve_page(session: Playback, title: str, port: int, open_browser: bool) -> 
         raise error
 
 
+def lay_out_page(playback: Playback, title: str, frame: Frame) -> None:
+    """The picture, the lidars, the controls and the figures, which follow `playback`."""
+    from nicegui import events, ui
+
+    def on_key(event: events.KeyEventArguments) -> None:
+        if event.key.code in KEYS:
+            (playback.held.add if event.action.keydown else playback.held.discard)(event.key.code)
+        elif event.key.code == "Space" and event.action.keydown:
+            pause()
+
+    def pause() -> None:
+        playback.playing = not playback.playing
+
+    def look_through(camera: str) -> None:
+        frame.camera = camera
+
+    ui.add_head_html(RELEASED)
+    ui.on("released", lambda: playback.held.clear())
+    ui.keyboard(on_key, repeating=False, ignore=["input", "select"])
+    with ui.row(wrap=False):
+        with ui.column():
+            picture = ui.interactive_image().style("width: 640px; height: 480px")
+            lidars = ui.html(sanitize=False)
+        with ui.column():
+            ui.label(title).classes("text-h6")
+            with ui.row():
+                button = ui.button("Pause", on_click=pause)
+                ui.button("Reset", on_click=lambda: playback.reset(playback.seed))
+                ui.button("Next", on_click=lambda: playback.reset(playback.seed + 1))
+            with ui.row():
+                seed = ui.number("Seed", value=playback.seed, min=0, max=2**31 - 1, precision=0)
+                seed.style("width: 90px")
+                seed.on("change", lambda: playback.reset(int(seed.value or 0)))
+                view = ui.select(list(CAMERAS), value=frame.camera, label="Camera")
+                view.style("width: 110px").on_value_change(lambda event: look_through(event.value))
+            numbers = ui.html(sanitize=False)
+            ui.label("Drive: arrow keys or W A S D. Pause: space.").classes("text-caption")
+
+    def follow() -> None:
+        button.text = "Pause" if playback.playing else "Play"
+        numbers.content = as_table(playback)
+        lidars.content = as_bars(playback.env, playback.state)
+
+    ui.timer(1 / FPS, lambda: picture.set_source(f"/frame?{time.monotonic()}"))
+    ui.timer(0.1, follow)
+
+
 def as_jpeg(frame: np.ndarray) -> bytes:
     file = io.BytesIO()
     Image.fromarray(frame).save(file, "jpeg", quality=85)
     return file.getvalue()
 
 
-def as_table(session: Playback) -> str:
+def as_table(playback: Playback) -> str:
     """The figures of the episode and of the last ones, as HTML."""
-    rows = [f"<tr><td>{name}</td><td>{value}</td></tr>" for name, value in figures(session).items()]
+    rows = [f"<tr><td>{name}</td><td>{value}</td></tr>" for name, value in figures(playback).items()]
     now = f"<table {STYLE}>{''.join(rows)}</table>"
-    if not session.ended:
+    if not playback.ended:
         return now
     rows = [
         f"<tr><td>{e.seed}</td><td>{e.steps}</td><td>{e.ret:.2f}</td><td>{e.cost:.0f}</td></tr>"
-        for e in session.ended
+        for e in playback.ended
     ]
     head = "<tr><td>ended: seed</td><td>steps</td><td>return</td><td>cost</td></tr>"
     return f"{now}<hr><table {STYLE}>{head}{''.join(rows)}</table>"

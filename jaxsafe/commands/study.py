@@ -195,7 +195,7 @@ def work(study: Study, args: argparse.Namespace, train: Callable[[list[str], Pla
             thread.start()
         for thread in threads:
             thread.join()
-    if len(unfinished) + len(failed) < len(asked) and study_files.there(study.folder):
+    if len(unfinished) + len(failed) < len(asked) and study_files.holds_study(study.folder):
         studies.write_page(study)
     print(f"left to do: {', '.join(unfinished + failed) or 'nothing'}")
     return 1 if failed else 130 if unfinished else 0

@@ -11,7 +11,7 @@ from jaxsafe.types import Env, Policy, PyTree, State
 
 @flax.struct.dataclass
 class Learned:
-    """The policy's parameters: `config`, `params`, `dual` and `normaliser` of a train state."""
+    """All that a policy is made of: these fields of a train state. `params` are its networks."""
 
     config: Any
     params: dict[str, PyTree]
@@ -20,20 +20,20 @@ class Learned:
 
 
 def learned_of(ts: Any) -> Learned:
-    """The policy's parameters, of a train state that has these fields."""
+    """What the policy of a train state is made of, for states that have these fields."""
     return Learned(ts.config, ts.params, ts.dual, ts.normaliser)
 
 
 class Player(NamedTuple):
-    """A policy with its parameters, in the environment whose observations it takes."""
+    """A policy with what it has learned, in the environment whose observations it takes."""
 
     policy: Policy
-    params: PyTree
+    learned: PyTree
     task: Env
 
     def begin(self) -> PyTree:
         """The carry at the start of an episode."""
-        return self.policy.init(self.params)
+        return self.policy.init(self.learned)
 
     def act(
         self, carry: PyTree, state: State, key: jax.Array | None = None
@@ -44,10 +44,10 @@ class Player(NamedTuple):
             key: to sample with; None is the mean action.
         """
         obs = state if self.policy.privileged else state.obs
-        action, carry, _ = self.policy.act(self.params, carry, obs, key)
+        action, carry, _ = self.policy.act(self.learned, carry, obs, key)
         return action, carry
 
 
-def reset_carry(policy: Policy, params: PyTree, carry: PyTree, first: jax.Array) -> PyTree:
+def reset_carry(policy: Policy, learned: PyTree, carry: PyTree, first: jax.Array) -> PyTree:
     """`carry` [N, ...], with that of a new episode where `first` [N] holds."""
-    return select_rows(first, policy.init(params), carry)
+    return select_rows(first, policy.init(learned), carry)

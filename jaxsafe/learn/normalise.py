@@ -35,14 +35,17 @@ def merge(
     stats: Normaliser,
     x: jax.Array,
     axis_name: str | None = None,
-    share: jax.Array | float = 1.0,
+    weight: jax.Array | float = 1.0,
 ) -> Normaliser:
-    """`stats` with the samples `x` [..., O] of all devices added. One in `share` of them counts, and
-    the others are 0."""
+    """`stats` with the samples `x` [..., O] of all devices added.
+
+    weight: float [], of each sample that counts. The others are 0, and weigh nothing; on average a
+        sample weighs 1.
+    """
     x = x.reshape(-1, x.shape[-1])
-    mean = batch_mean(x, axis_name, axis=0) * share
+    mean = batch_mean(x, axis_name, axis=0) * weight
     var = batch_mean((x - mean) ** 2, axis_name, axis=0)
-    var = (var - (1 - 1 / share) * mean**2) * share
+    var = (var - (1 - 1 / weight) * mean**2) * weight
     n = psum(jnp.float32(x.shape[0]), axis_name)
     w = n / (stats.count + n)
     d = mean - stats.mean

@@ -144,14 +144,17 @@ def offline(env: Env, learner: Learner) -> Algorithm:
 
 
 def batch_at(data: DataSet, rows: jax.Array, cfg: Any, normaliser: PyTree) -> Transitions:
-    """The transitions of some rows [B], with observations as the networks see them."""
+    """The transitions of some rows [B], with observations as the networks see them.
+
+    A data set knows one cost alone, so `costs` has no entries: it is [B, 0].
+    """
     obs, action, reward, cost, next_obs, terminated = (jnp.asarray(x)[rows] for x in data)
     return Transitions(
         obs=network_inputs(normaliser, obs),
         action=action,
         reward=reward,
         cost=cost,
-        costs=cost[:, None],
+        costs=jnp.zeros((len(rows), 0)),
         next_obs=network_inputs(normaliser, next_obs),
         steps=jnp.ones(len(rows), jnp.int32),
         terminated=terminated,

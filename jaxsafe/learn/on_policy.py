@@ -31,15 +31,7 @@ from jaxsafe.config import (
 )
 from jaxsafe.learn.acting import Learned, learned_of, reset_carry
 from jaxsafe.learn.augment import Augmentation, no_augmentation
-from jaxsafe.learn.batch import (
-    all_finite,
-    batch_mean,
-    centre,
-    device_key,
-    psum,
-    select,
-    standardise,
-)
+from jaxsafe.learn.batch import all_finite, batch_mean, device_key, psum, select
 from jaxsafe.learn.constraints import (
     Names,
     check_cost_names,
@@ -50,16 +42,24 @@ from jaxsafe.learn.constraints import (
     total_cost_alone,
 )
 from jaxsafe.learn.conventions import Convention
-from jaxsafe.learn.metrics import episode_metrics, explained_variance, world_metrics
-from jaxsafe.learn.normalise import init_normaliser, merge, network_inputs, normalise
-from jaxsafe.learn.returns import Estimator, Window, advantages, empty_window, mean_length, window_mean
-from jaxsafe.learn.rollout import Bad, RolloutState, Trajectory, check_steps, collect, init_rollout
+from jaxsafe.learn.estimates import (
+    Batch,
+    Experience,
+    Signals,
+    estimate_batch,
+    init_signal_normaliser,
+    scaled,
+    weights,
+)
+from jaxsafe.learn.metrics import episode_metrics, world_metrics
+from jaxsafe.learn.normalise import init_normaliser, merge, network_inputs
+from jaxsafe.learn.returns import Estimator, Window, empty_window, mean_length, window_mean
+from jaxsafe.learn.rollout import RolloutState, Trajectory, check_steps, collect, init_rollout
 from jaxsafe.learn.steps import Context, Pair, PolicyStep, Trainable, adam, fit_critic, stops_critics
 from jaxsafe.learn.surrogates import Surrogate, with_entropy
 from jaxsafe.learn.treatments import Treatment
 from jaxsafe.nn.gaussian import Gaussian, entropy, log_prob, sample
 from jaxsafe.nn.networks import (
-    apply_to_rollout,
     init_params,
     init_recurrent,
     policy,
@@ -164,7 +164,8 @@ class TrainState:
     opt_state: {'actor': the step's, 'critics': Adam's for all critics, stacked, or ()}.
     dual: the treatment's state.
     normaliser: Normaliser, or () without `obs_normalize`.
-    signals: Normaliser of [reward, costs ...], or () without `reward_normalize` and `cost_normalize`.
+    signal_normaliser: Normaliser of [reward, costs ...], or () without `reward_normalize` and
+        `cost_normalize`.
     rollout: this device's environments.
     episode_length: float [], running mean length of an episode, in steps.
     past_costs: Window of J_c of the last `cost_window` iterations, [W] or [W, K].
@@ -175,36 +176,15 @@ class TrainState:
     opt_state: dict[str, PyTree]
     dual: PyTree
     normaliser: PyTree
-    signals: PyTree
+    signal_normaliser: PyTree
     rollout: RolloutState
     episode_length: jax.Array
     past_costs: Window
     key: jax.Array
 
 
-@flax.struct.dataclass
-class Batch:
-    """B = T * N transitions, as the policy sees them: observations are normalised. With a memory N
-    sequences of T, and [N, T] stands for [B].
-
-    obs [B, O], or `Sequences`; action [B, A]; log_prob [B] and old (Gaussian [B, A]) of the policy
-    that acted; adv_r standardised, adv_c only centred, in cost units or, with `cost_normalize`, in
-    standard deviations of a step's; ret_r, ret_c: the critics' targets [B]. Of several constraints
-    adv_c and ret_c are [B, K].
-    """
-
-    obs: PyTree
-    action: jax.Array
-    log_prob: jax.Array
-    old: Gaussian
-    adv_r: jax.Array
-    adv_c: jax.Array
-    ret_r: jax.Array
-    ret_c: jax.Array
-
-
 class Improved(NamedTuple):
-    """The policy's parameters after an iteration, with their optimiser, the dual and metrics."""
+    """What an iteration makes of the policy: its networks, their optimiser, the dual, and metrics."""
 
     actor: PyTree
     opt_state: PyTree
@@ -333,7 +313,7 @@ def on_policy_loop(env: Env, method: Method, axis_name: str | None) -> Algorithm
             },
             dual=dual,
             normaliser=init_normaliser(env.obs_size) if cfg.obs_normalize else (),
-            signals=init_signals(cfg, len(names) or 1),
+            signal_normaliser=init_signal_normaliser(cfg, len(names) or 1),
             rollout=dataclasses.replace(rollout, carry=carry),
             episode_length=jnp.float32(env.episode_length),
             past_costs=empty_window(cfg.cost_window, jnp.shape(limit(cfg, names))),
@@ -343,10 +323,8 @@ def on_policy_loop(env: Env, method: Method, axis_name: str | None) -> Algorithm
     def task(learned: Learned | TrainState) -> Env:
         return augmentation.wrap(env, learned.config, learned.dual)
 
-    def update(ts: TrainState, shared: Shared) -> tuple[TrainState, Metrics]:
-        cfg = ts.config
-        key, rollout_key, step_key, critic_key = jax.random.split(ts.key, 4)
-
+    def play(ts: TrainState, key: jax.Array) -> tuple[RolloutState, Trajectory]:
+        """A rollout of the policy, in the task as the augmentation makes it."""
         learned = learned_of(ts)
 
         def behave(
@@ -357,71 +335,62 @@ def on_policy_loop(env: Env, method: Method, axis_name: str | None) -> Algorithm
             action = sample(dist, key)
             return action, log_prob(dist, action), carry
 
-        pool = augmentation.renew(ts.rollout.pool, cfg, ts.dual)
-        rollout, traj = collect(
-            task(ts),
+        pool = augmentation.renew(ts.rollout.pool, ts.config, ts.dual)
+        return collect(
+            task(learned),
             behave,
             dataclasses.replace(ts.rollout, pool=pool),
-            device_key(rollout_key, axis_name),
-            cfg.horizon,
-            lambda episode: augmentation.stop(episode, cfg),
+            device_key(key, axis_name),
+            ts.config.horizon,
+            lambda episode: augmentation.stop(episode, ts.config),
         )
-        names = constrained_costs(cfg)
-        charged = signal(env, traj, names)
-        share = weights(traj.bad, axis_name).max()  # of a good step; bad ones earn and cost 0 here
-        signals = scaled_signals(ts, augmentation.reward(traj, cfg), charged, axis_name, share)
-        augmented = dataclasses.replace(traj, next_obs=augmentation.last_obs(traj, cfg))
-        batch, explained = estimate(ts, augmented, signals, names, axis_name)
-        length = mean_length(ts.episode_length, traj.ended, traj.length, axis_name)
-        cost_rate = batch_mean(traj.cost, axis_name) * share
-        episode_cost = batch_mean(charged, axis_name, (0, 1)) * share * length
-        recent, past_costs = window_mean(ts.past_costs, episode_cost)
 
-        violation = recent - limit(cfg, names)
-        context = Context(shared.iteration, cfg, step_key, axis_name, recent, violation, length)
-        actor, opt_actor, dual, metrics = method.improve(ts, batch, context)
-        critics, opt_critics, skipped = {}, (), 0
+    def update(ts: TrainState, shared: Shared) -> tuple[TrainState, Metrics]:
+        cfg, names = ts.config, constrained_costs(ts.config)
+        key, rollout_key, step_key, critic_key = jax.random.split(ts.key, 4)
+        rollout, traj = play(ts, rollout_key)
+        weight = weights(traj.bad, axis_name).max()  # of a good step; bad ones earn and cost 0 here
+        charged = signal(env, traj, names)
+        raw = Signals(augmentation.reward(traj, cfg), charged, ts.signal_normaliser)
+        signals = scaled(raw, cfg, axis_name, weight)
+        augmented = dataclasses.replace(traj, next_obs=augmentation.last_obs(traj, cfg))
+        seen = Experience(augmented, signals, ts.rollout.carry)
+        batch, explained = estimate_batch(learned_of(ts), seen, names, axis_name)
+        cost = episode_cost(ts, traj, charged, weight, axis_name)
+
+        violation = cost.recent - limit(cfg, names)
+        context = Context(
+            shared.iteration, cfg, step_key, axis_name, cost.recent, violation, cost.length
+        )
+        improved = method.improve(ts, batch, context)
+        fitted = FittedCritics({}, (), 0, {})
         if cfg.trunk == "separate":
-            passes = metrics["train/passes"] if stops_critics(cfg) else cfg.critic_epochs
-            critics, opt_critics, skipped, fitted = fit_critics(
-                ts, batch, passes, critic_key, axis_name
-            )
-            metrics |= fitted
+            passes = improved.metrics["train/passes"] if stops_critics(cfg) else cfg.critic_epochs
+            fitted = fit_critics(ts, batch, passes, critic_key, axis_name)
         raw_obs = traj.obs[..., : env.obs_size]
         normaliser = merge(ts.normaliser, raw_obs, axis_name) if cfg.obs_normalize else ()
-        # parameters are guarded step by step; what is not a step of a gradient is guarded here
-        finite = (
-            psum(~all_finite((batch, normaliser, signals.normaliser, episode_cost)), axis_name) == 0
-        )
-        dual, normaliser, signal_stats, length, past_costs = select(
-            finite,
-            (dual, normaliser, signals.normaliser, length, past_costs),
-            (ts.dual, ts.normaliser, ts.signals, ts.episode_length, ts.past_costs),
-        )
-        # of several constraints, J_c of each; that of the total cost is among the next metrics
-        metrics |= explained | ({"train/cost_estimate": episode_cost} if names else {})
-        metrics = metrics_by_constraint(metrics, names) | episode_metrics(env, traj, axis_name)
-        metrics |= world_metrics(traj.bad, axis_name)
-        metrics |= {
-            "train/cost_rate": cost_rate,  # per environment step
-            "train/cost_estimate": cost_rate * length,  # J_c of this iteration
-            "train/return_estimate": batch_mean(traj.reward, axis_name) * share * length,  # likewise
-            "train/entropy": batch_mean(entropy(policy(actor, batch.obs, cfg)), axis_name),
-            "train/nonfinite": metrics["train/nonfinite"] + skipped + ~finite,
-        }
-        ts = dataclasses.replace(
-            ts,
-            params={"actor": actor, **critics},
-            opt_state={"actor": opt_actor, "critics": opt_critics},
-            dual=dual,
+        after = TrainState(
+            config=cfg,
+            params={"actor": improved.actor, **fitted.params},
+            opt_state={"actor": improved.opt_state, "critics": fitted.opt_state},
+            dual=improved.dual,
             normaliser=normaliser,
-            signals=signal_stats,
+            signal_normaliser=signals.normaliser,
             rollout=rollout,
-            episode_length=length,
-            past_costs=past_costs,
+            episode_length=cost.length,
+            past_costs=cost.past,
             key=key,
         )
-        return ts, jax.tree.map(jnp.float32, metrics)
+        computed = (batch, normaliser, signals.normaliser, cost.of_iteration)
+        after, finite = guarded(ts, after, computed, axis_name)
+
+        metrics = metrics_by_constraint(improved.metrics | fitted.metrics | explained, names)
+        metrics["train/nonfinite"] += fitted.skipped + ~finite
+        metrics |= {f"train/cost_estimate_{name}": cost.of_iteration[k] for k, name in enumerate(names)}
+        metrics |= rollout_metrics(env, traj, weight, after.episode_length, axis_name)
+        dist = policy(improved.actor, batch.obs, cfg)
+        metrics["train/entropy"] = batch_mean(entropy(dist), axis_name)
+        return after, jax.tree.map(jnp.float32, metrics)
 
     def act(
         learned: Learned, carry: PyTree, obs: jax.Array, key: jax.Array | None
@@ -469,11 +438,81 @@ def initial_carry(learned: Learned) -> PyTree:
     return jnp.zeros(learned.config.hidden[-1]) if learned.config.trunk == "gru" else ()
 
 
+class EpisodeCost(NamedTuple):
+    """J_c, the undiscounted cost of an episode: [] or, of several constraints, [K].
+
+    of_iteration: this iteration's estimate, the mean cost of a step times `length`.
+    recent: the mean of the estimates in `past`, which is what the method gets.
+    past: Window of the last `cost_window` estimates, this one included.
+    length: float [], running mean length of an episode, in steps.
+    """
+
+    of_iteration: jax.Array
+    recent: jax.Array
+    past: Window
+    length: jax.Array
+
+
+def episode_cost(
+    ts: TrainState,
+    traj: Trajectory,
+    charged: jax.Array,
+    weight: jax.Array,
+    axis_name: str | None,
+) -> EpisodeCost:
+    """J_c after a rollout.
+
+    Args:
+        ts: the train state before it.
+        charged: float [T, N] or [T, N, K], what is held under the limit, 0 in bad steps.
+        weight: float [], of a good step.
+    """
+    length = mean_length(ts.episode_length, traj.ended, traj.length, axis_name)
+    of_iteration = batch_mean(charged, axis_name, (0, 1)) * weight * length
+    recent, past = window_mean(ts.past_costs, of_iteration)
+    return EpisodeCost(of_iteration, recent, past, length)
+
+
+def guarded(
+    before: TrainState, after: TrainState, computed: PyTree, axis_name: str | None
+) -> tuple[TrainState, jax.Array]:
+    """`after`, with the statistics and the dual of `before` unless all of `computed` is finite on every
+    device; and whether it is, bool []. Parameters are guarded step by step, where they are moved."""
+    finite = psum(~all_finite(computed), axis_name) == 0
+    names = ("dual", "normaliser", "signal_normaliser", "episode_length", "past_costs")
+    kept = {name: select(finite, getattr(after, name), getattr(before, name)) for name in names}
+    return dataclasses.replace(after, **kept), finite
+
+
+def rollout_metrics(
+    env: Env, traj: Trajectory, weight: jax.Array, length: jax.Array, axis_name: str | None
+) -> Metrics:
+    """What a rollout earned and cost. `weight` is of a good step, `length` of an episode (steps)."""
+    cost_rate = batch_mean(traj.cost, axis_name) * weight
+    return {
+        **episode_metrics(env, traj, axis_name),
+        **world_metrics(traj.bad, axis_name),
+        "train/cost_rate": cost_rate,  # per environment step
+        "train/cost_estimate": cost_rate * length,  # of an episode, this iteration's
+        "train/return_estimate": batch_mean(traj.reward, axis_name) * weight * length,  # likewise
+    }
+
+
+class FittedCritics(NamedTuple):
+    """params: {'critic_r', 'critic_c'}, or {} where they share the policy's trunk.
+    skipped: int32 [], steps whose gradient was not finite.
+    """
+
+    params: dict[str, PyTree]
+    opt_state: PyTree
+    skipped: jax.Array | int
+    metrics: Metrics
+
+
 def fit_critics(
     ts: TrainState, batch: Batch, passes: jax.Array | int, key: jax.Array, axis_name: str | None
-) -> tuple[dict[str, PyTree], PyTree, jax.Array, Metrics]:
-    """All critics fitted to their targets at once: {'critic_r', 'critic_c'}, opt_state, the number of
-    steps skipped, and metrics."""
+) -> FittedCritics:
+    """All critics fitted to their targets at once."""
 
     def fit(critic: Trainable, target: jax.Array) -> tuple[Trainable, jax.Array, jax.Array]:
         return fit_critic(critic, (batch.obs, target), passes, key, ts.config, axis_name)
@@ -490,46 +529,7 @@ def fit_critics(
         "train/value_loss_r": errors[0],
         "train/value_loss_c": errors[1:].reshape(batch.ret_c.shape[1:]),
     }
-    return params, critics.opt_state, skipped.sum(), metrics
-
-
-def init_signals(cfg: Any, costs: int) -> PyTree:
-    return init_normaliser(1 + costs) if cfg.reward_normalize or cfg.cost_normalize else ()
-
-
-class Signals(NamedTuple):
-    """Reward [T, N] and cost, [T, N] or [T, N, K], as the learner sees them, and the statistics by
-    which they are scaled."""
-
-    reward: jax.Array
-    cost: jax.Array
-    normaliser: PyTree
-
-
-def scaled_signals(
-    ts: TrainState,
-    reward: jax.Array,
-    cost: jax.Array,
-    axis_name: str | None,
-    share: jax.Array | float = 1.0,
-) -> Signals:
-    """Reward and cost scaled as the config asks, by statistics that include one in `share` of them.
-
-    Observations are normalised by what was known when the policy acted on them. Rewards and costs are
-    normalised with their own batch, as in OmniSafe, so that the critics' first targets have the scale
-    of all others.
-    """
-    cfg = ts.config
-    if not (cfg.reward_normalize or cfg.cost_normalize):
-        return Signals(reward, cost, ())
-    all_of_them = jnp.concatenate([reward[..., None], cost.reshape(*reward.shape, -1)], -1)
-    normaliser = merge(ts.signals, all_of_them, axis_name, share)
-    scaled = normalise(normaliser, all_of_them)
-    return Signals(
-        scaled[..., 0] if cfg.reward_normalize else reward,
-        scaled[..., 1:].reshape(cost.shape) if cfg.cost_normalize else cost,
-        normaliser,
-    )
+    return FittedCritics(params, critics.opt_state, skipped.sum(), metrics)
 
 
 def check_sizes(cfg: Any) -> None:
@@ -546,83 +546,3 @@ def check_sizes(cfg: Any) -> None:
             f"minibatches={cfg.minibatches}: expected a divisor of {rows} = {size}; "
             f"the nearest is {divisor}"
         )
-
-
-class Estimate(NamedTuple):
-    """Of one signal, float [T, N]: advantages, the critic's targets, and their errors."""
-
-    advantage: jax.Array
-    target: jax.Array
-    error: jax.Array
-
-
-def estimate(
-    ts: TrainState, traj: Trajectory, signals: Signals, names: Names, axis_name: str | None
-) -> tuple[Batch, Metrics]:
-    """The batch: advantages and targets of reward and cost, under the parameters that acted.
-
-    A bad step says nothing: its advantages are 0, and its targets are what the critics say already.
-
-    Args:
-        ts: the train state before the rollout.
-        traj: the rollout; `next_obs` is what each step's value bootstraps from.
-        names: the costs that have a limit each, on the last axis of `signals.cost`.
-
-    A bad step says nothing: its advantages are 0, and its targets are what the critics say already.
-    """
-    cfg, bad, weight = ts.config, traj.bad.any, weights(traj.bad, axis_name)
-    obs, next_obs = (network_inputs(ts.normaliser, x) for x in (traj.obs, traj.next_obs))
-    found = apply_to_rollout(ts.params, obs, next_obs, traj.first, ts.rollout.carry, cfg)
-    ratio = jnp.exp(log_prob(found.dist, traj.action) - traj.log_prob)  # 1: the policy has not moved
-    shape = signals.cost.shape
-    v_c, next_v_c = (x[..., 1:].reshape(shape) for x in (found.value, found.next_value))
-
-    def of_signal(x: jax.Array, v: jax.Array, next_v: jax.Array, discount: Any, decay: Any) -> Estimate:
-        ends = traj.terminated | bad, traj.done
-        x = jnp.where(bad, v, x)  # whose difference to v is 0
-        advantage, error = advantages(
-            cfg.estimator, x, v, next_v, *ends, ratio, discount=discount, decay=decay
-        )
-        return Estimate(advantage, error + v, error)
-
-    v_r, next_v_r = found.value[..., 0], found.next_value[..., 0]
-    of_reward = of_signal(signals.reward, v_r, next_v_r, cfg.discount, cfg.gae_lambda)
-    of_costs = jax.vmap(of_signal, (-1, -1, -1, None, None), -1) if names else of_signal
-    of_cost = of_costs(signals.cost, v_c, next_v_c, cfg.cost_discount, cfg.cost_gae_lambda)
-    # a minibatch has single steps or, for a policy with a memory, whole sequences of an environment
-    lay_out = by_env if cfg.trunk == "gru" else by_step
-    batch = Batch(
-        obs=found.inputs if cfg.trunk == "gru" else by_step(found.inputs),
-        action=lay_out(traj.action),
-        log_prob=lay_out(traj.log_prob),
-        old=jax.tree.map(lay_out, found.dist),
-        adv_r=lay_out(standardise(of_reward.advantage, axis_name) * weight),
-        adv_c=lay_out(each(lambda x: centre(x, axis_name) * weight, names)(of_cost.advantage)),
-        ret_r=lay_out(of_reward.target),
-        ret_c=lay_out(of_cost.target),
-    )
-
-    def explained(error: jax.Array, target: jax.Array) -> jax.Array:
-        return explained_variance(error, target, axis_name)
-
-    metrics = {
-        "train/explained_variance_r": explained(of_reward.error, of_reward.target),
-        "train/explained_variance_c": each(explained, names)(of_cost.error, of_cost.target),
-    }
-    return batch, metrics
-
-
-def weights(bad: Bad, axis_name: str | None) -> jax.Array:
-    """What a step counts, [T, N]: 0 where it is bad, and 1 on average. NaN where all are bad."""
-    good, size = psum(((~bad.any).sum(), jnp.float32(bad.obs.size)), axis_name)
-    return jnp.where(good > 0, jnp.where(bad.any, 0.0, size / jnp.maximum(good, 1)), jnp.nan)
-
-
-def by_step(x: jax.Array) -> jax.Array:
-    """[T * N, ...] of [T, N, ...]."""
-    return x.reshape(-1, *x.shape[2:])
-
-
-def by_env(x: jax.Array) -> jax.Array:
-    """[N, T, ...] of [T, N, ...]."""
-    return jnp.swapaxes(x, 0, 1)

@@ -34,15 +34,15 @@ def evaluate(run: RunPolicies, num: int, seed: int) -> list[Scores]:
     settings = run.settings
     policies = len(settings.configs) * settings.train.num_seeds
     memory.check_episodes(run.env, num, policies)
-    episodes = run_episodes(run.algo, run.params, num, seed)
+    episodes = run_episodes(run.algo, run.learned, num, seed)
     tables = list(run_folder.by_setting(run_folder.read_metrics(run.folder)).values())
-    cost_names = run.algo.task(jax.tree.map(lambda x: x[0], run.params)).cost_names
+    cost_names = run.algo.task(jax.tree.map(lambda x: x[0], run.learned)).cost_names
     seeds, scores = settings.train.num_seeds, []
     for i, member in enumerate(members(settings.configs, settings.train)[::seeds]):
         own = Episodes(*(x[i * seeds : (i + 1) * seeds] for x in episodes))
-        limits, metrics = limits_of(member.algo), tables[i] if i < len(tables) else {}
+        limits, metrics = limits_of(member.config), tables[i] if i < len(tables) else {}
         found = measures(own, cost_names, limits)
-        rows = summary(settings.env_name, found, float(member.algo.cost_limit), metrics)
+        rows = summary(settings.env_name, found, float(member.config.cost_limit), metrics)
         by_seed = {name: values.mean(1).tolist() for name, values in found.items()}
         scores.append(Scores(member.setting, limits, own.ret.size, rows, by_seed))
     return scores
@@ -55,7 +55,7 @@ def summary(
     metrics: dict[str, np.ndarray],
 ) -> dict[str, Estimate]:
     """The rows of the table: `measures`, then the cost rate of training and normalised scores."""
-    rows = {name: estimate(values) for name, values in found.items()}
+    rows = {name: estimate_over_seeds(values) for name, values in found.items()}
     rate = cost_rate(metrics)
     if rate is not None:
         rows["cost rate (training)"] = stats.estimate(rate)
@@ -73,7 +73,7 @@ def summary(
     return rows
 
 
-def estimate(values: np.ndarray) -> Estimate:
+def estimate_over_seeds(values: np.ndarray) -> Estimate:
     """Mean of `values` [S, N] and its interval over seeds, whose means hold the spread of episodes too.
 
     With one seed the interval covers the episodes alone, not what another seed would give.

@@ -69,7 +69,7 @@ def curves(
         for i, (setting, table) in enumerate(settings.items()):
             if name in table and len(table["steps"]):
                 column, estimated = drawn_of(table, name)
-                draw(axes, *by_seed(table, column), f"C{i % 10}", setting, estimated)
+                draw_setting(axes, *by_seed(table, column), f"C{i % 10}", setting, estimated)
             for end, (called, marker) in EVALUATED.items():
                 if (column := name.replace("train/", "eval/") + end) in table:
                     look = {"marker": marker, "mfc": "none" if end else None, "color": f"C{i % 10}"}
@@ -107,7 +107,7 @@ def axis_of(metrics: Mapping[str, np.ndarray]) -> str:
     return "gradient steps" if known else "environment steps"
 
 
-def draw(
+def draw_setting(
     axes: Axes,
     steps: np.ndarray,
     values: np.ndarray,

@@ -109,7 +109,7 @@ def run_folders_under(path: Path) -> list[Path]:
 
 def read_one(folder: Path, extras: Extras = NO_EXTRAS) -> list[SettingRun]:
     """The settings of a run folder, none if it has no iteration yet; or the runs of a study."""
-    if study_files.there(folder):
+    if study_files.holds_study(folder):
         return read_study(folder)
     plain = run_folder.read_config(folder)
     try:

@@ -29,7 +29,7 @@ import scipy  # scipy.stats takes a second to import, and is imported at its fir
 
 DRAWS = 10_000
 CONFIDENCE = 0.95
-ROOM = 10_000_000  # numbers drawn at once
+DRAWN_AT_ONCE = 10_000_000  # numbers drawn at once
 
 
 class Estimate(NamedTuple):
@@ -99,7 +99,7 @@ def bootstrapped(
         statistic,
         n_resamples=draws,
         confidence_level=CONFIDENCE,
-        batch=max(1, ROOM // sum(x.size for x in columns)),
+        batch=max(1, DRAWN_AT_ONCE // sum(x.size for x in columns)),
         vectorized=True,
         axis=0,
         method="percentile",

@@ -55,7 +55,7 @@ class Condensed(NamedTuple):
         return [name for name in names if name not in ROW and name not in Origin._fields]
 
 
-def there(folder: Path) -> bool:
+def holds_study(folder: Path) -> bool:
     return files.there(folder / "final.csv")
 
 
@@ -71,7 +71,7 @@ def read(folder: Path) -> Condensed:
     Raises:
         ConfigError: the files cannot be read, or do not belong together.
     """
-    if not there(folder):
+    if not holds_study(folder):
         return Condensed([], {}, {})
     text = files.read_text(folder / "final.csv")
     found = files.read_arrays(folder / "curves.npz")

@@ -25,7 +25,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from jaxsafe import algos, envs
-from jaxsafe.config import ConfigError, convert, describe
+from jaxsafe.config import ConfigError, convert, kind_in_words
 from jaxsafe.run import distributed
 from jaxsafe.run.settings import (
     COST_LIMITS,
@@ -239,22 +239,9 @@ def check_arguments(argv: list[str]) -> Request:
         for a in names["algo"]
     ]
     chosen = {kind: {each[kind]["name"]: each[kind] for each in known} for kind in DEFAULT}
-    texts = []
     for override in overrides:
-        text = override.input_line or ""
-        if text.startswith("hydra/") and not isinstance(override.value(), str):
-            raise ConfigError(f"{text}: expected a name")
-        if not override.is_hydra_override():
-            check_kind(override)
-            for each in known:
-                check_option(override.key_or_group, each)
-            if override.is_sweep_override() and not args.multirun:
-                raise ConfigError(
-                    f"{text}: several values need --multirun (-m); a list is written [a,b]"
-                )
-            if override.key_or_group in DEFAULT:
-                text = f"{override.key_or_group}={','.join(chosen[override.key_or_group])}"
-        texts.append(text)
+        check_override(override, known, args.multirun)
+    texts = [as_hydra_reads(override, chosen) for override in overrides]
     values = {name: o.value() for name, o in given.items() if not o.is_sweep_override()}
     check_agreement(values)
     # Hydra adds a name to a dict, or to what was null, only if told to, and after the dict itself
@@ -266,15 +253,42 @@ def check_arguments(argv: list[str]) -> Request:
         return Request([*flags, *texts], base, chosen, texts, bool(args.cfg))
     # Hydra copies every entry again and again, so one that nobody chooses is known by its name only
     sweeper = any(o.key_or_group.startswith(("hydra.sweeper", "hydra/sweeper")) for o in overrides)
-    entries = {
-        "env": {name: env_options(name) if sweeper else {} for name in envs.ENVS},
-        "algo": {
-            name: {"name": name, **algo_options(row, base["preset"], base["compat"])} if sweeper else {}
-            for name, row in algos.ALGOS.items()
-        },
-    }
+    bare = {"env": {name: {} for name in envs.ENVS}, "algo": {name: {} for name in algos.ALGOS}}
+    entries = every_entry(base) if sweeper else bare
     groups = {kind: entries[kind] | chosen[kind] for kind in DEFAULT}
     return Request([*flags, *texts], base, groups, texts, bool(args.cfg))
+
+
+def check_override(override: Override, known: list[dict[str, Any]], multirun: bool) -> None:
+    """Raise ConfigError for an option that one of the `known` defaults lacks, or that Hydra would read
+    otherwise than it is meant."""
+    text = override.input_line or ""
+    if text.startswith("hydra/") and not isinstance(override.value(), str):
+        raise ConfigError(f"{text}: expected a name")
+    if override.is_hydra_override():
+        return
+    check_kind(override)
+    for each in known:
+        check_option(override.key_or_group, each)
+    if override.is_sweep_override() and not multirun:
+        raise ConfigError(f"{text}: several values need --multirun (-m); a list is written [a,b]")
+
+
+def as_hydra_reads(override: Override, chosen: dict[str, dict[str, dict[str, Any]]]) -> str:
+    """An argument as Hydra takes it, with the registered names of environments and algorithms."""
+    kind = override.key_or_group
+    if kind in DEFAULT and not override.is_hydra_override():
+        return f"{kind}={','.join(chosen[kind])}"
+    return override.input_line or ""
+
+
+def every_entry(base: dict[str, Any]) -> dict[str, dict[str, dict[str, Any]]]:
+    """Every environment and algorithm with its options, for a sweeper that chooses among them."""
+    rows = {
+        name: {"name": name, **algo_options(row, base["preset"], base["compat"])}
+        for name, row in algos.ALGOS.items()
+    }
+    return {"env": {name: env_options(name) for name in envs.ENVS}, "algo": rows}
 
 
 def env_options(name: str) -> dict[str, Any]:
@@ -333,7 +347,7 @@ def number(kind: Any) -> Callable[[str], Any]:
         try:
             return convert(value, kind, "")
         except ConfigError as error:
-            raise argparse.ArgumentTypeError(f"{text}: expected {describe(kind)}") from error
+            raise argparse.ArgumentTypeError(f"{text}: expected {kind_in_words(kind)}") from error
 
     return read
 

@@ -185,7 +185,8 @@ def restore(
         want = (str(expected[name].dtype), tuple(expected[name].shape)) if name in expected else None
         if (have := manifest.leaves.get(name)) != want:
             raise CheckpointError(
-                f"{folder} has another train state: {name} is {describe(have)}, not {describe(want)}"
+                f"{folder} has another train state: {name} is {leaf_in_words(have)}, "
+                f"not {leaf_in_words(want)}"
             )
     return from_arrays(like, arrays), manifest
 
@@ -199,7 +200,7 @@ def load(
         try:
             manifest = read_manifest(path)
             verify(path, manifest)
-            return read_arrays(path, manifest), manifest
+            return read_leaves(path, manifest), manifest
         except Exception as error:  # Orbax and TensorStore raise many kinds
             problems.append(f"{path} is corrupt ({reason(error)})")
             (warn or (lambda line: print(line, file=sys.stderr)))(
@@ -227,7 +228,7 @@ def read_manifest(path: Path) -> Manifest:
         raise ConfigError(f"{file}: expected an iteration and steps of at least 0")
     for name, (dtype, shape) in leaves.items():
         if not NAME.fullmatch(name) or not NUMBER.fullmatch(dtype) or min(shape, default=0) < 0:
-            raise ConfigError(f"{file}: {name} is {describe((dtype, shape))}; expected numbers")
+            raise ConfigError(f"{file}: {name} is {leaf_in_words((dtype, shape))}; expected numbers")
     return manifest
 
 
@@ -280,7 +281,7 @@ def check_stored(state: Path, leaves: Mapping[str, tuple[str, tuple[int, ...]]],
             raise CheckpointError(f"{name} is stored in parts larger than itself")
 
 
-def read_arrays(path: Path, manifest: Manifest) -> dict[str, np.ndarray]:
+def read_leaves(path: Path, manifest: Manifest) -> dict[str, np.ndarray]:
     """Read exactly the arrays that the manifest lists, as host arrays of those shapes and dtypes."""
     empty = {
         k: np.zeros(shape, dtype_of(dtype))
@@ -298,7 +299,7 @@ def read_arrays(path: Path, manifest: Manifest) -> dict[str, np.ndarray]:
     for name, (dtype, shape) in manifest.leaves.items():
         if name in like and (str(restored[name].dtype), restored[name].shape) != (dtype, shape):
             raise CheckpointError(
-                f"{name} is {describe((str(restored[name].dtype), restored[name].shape))}"
+                f"{name} is {leaf_in_words((str(restored[name].dtype), restored[name].shape))}"
             )
     return {**empty, **restored}
 
@@ -328,7 +329,7 @@ def sync(path: Path) -> None:
         os.close(handle)
 
 
-def describe(leaf: tuple[str, tuple[int, ...]] | None) -> str:
+def leaf_in_words(leaf: tuple[str, tuple[int, ...]] | None) -> str:
     return "absent" if leaf is None else f"{leaf[0]}{list(leaf[1])}"
 
 

@@ -62,43 +62,43 @@ def episode(
 def make_evaluation(
     algo: Algorithm, num_episodes: int, seed: int, sampled: bool = False
 ) -> Callable[[PyTree], Episodes]:
-    """What plays `num_episodes` fresh episodes with each of S policies: params [S, ...] -> Episodes.
+    """What plays `num_episodes` fresh episodes with each of S policies: learned [S, ...] -> Episodes.
 
     Every policy meets the same episodes, so that seeds differ by their policy alone. It compiles once.
     """
     keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), 0x6576616C), num_episodes)
 
-    def one_seed(params: PyTree) -> Episodes:
-        player = Player(algo.policy, params, algo.task(params))
-        discounts = params.config.discount, params.config.cost_discount
+    def one_seed(learned: PyTree) -> Episodes:
+        player = Player(algo.policy, learned, algo.task(learned))
+        discounts = learned.config.discount, learned.config.cost_discount
         return jax.vmap(lambda key: episode(player, key, *discounts, sampled))(keys)
 
     play = jax.jit(jax.vmap(one_seed))
-    return lambda params: jax.tree.map(np.asarray, play(params))
+    return lambda learned: jax.tree.map(np.asarray, play(learned))
 
 
 def run_episodes(
-    algo: Algorithm, params: PyTree, num_episodes: int, seed: int, sampled: bool = False
+    algo: Algorithm, learned: PyTree, num_episodes: int, seed: int, sampled: bool = False
 ) -> Episodes:
-    """`num_episodes` fresh episodes for each of the S policies in `params` (leading axis).
+    """`num_episodes` fresh episodes for each of the S policies in `learned` (leading axis).
 
     Actions are the mean ones, or `sampled`. See `make_evaluation`.
     """
-    return make_evaluation(algo, num_episodes, seed, sampled)(params)
+    return make_evaluation(algo, num_episodes, seed, sampled)(learned)
 
 
 def make_training_evaluation(
     algo: Algorithm, num_episodes: int, seed: int
 ) -> Callable[[PyTree], dict[str, np.ndarray]]:
-    """What evaluates S policies during training: params [S, ...] -> {name of a column: means [S]}.
+    """What evaluates S policies during training: learned [S, ...] -> {name of a column: means [S]}.
 
     The programs with mean and with sampled actions run one after the other, as two that call the host
     at once can wait for each other.
     """
     players = [make_evaluation(algo, num_episodes, seed, sampled) for sampled in (False, True)]
 
-    def evaluate(params: PyTree) -> dict[str, np.ndarray]:
-        played = [play(params) for play in players]
+    def evaluate(learned: PyTree) -> dict[str, np.ndarray]:
+        played = [play(learned) for play in players]
         means = [x.mean(1) for episodes in played for x in (episodes.ret, episodes.cost)]
         return dict(zip(COLUMNS, means, strict=True))
 

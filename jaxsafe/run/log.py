@@ -4,6 +4,7 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -12,9 +13,8 @@ from jaxsafe.learn.metrics import BAD
 from jaxsafe.run import clock, files, run_folder
 from jaxsafe.run.divergence import KINDS, Health, Watch
 from jaxsafe.run.loggers import Callback
-from jaxsafe.run.programs import Member
+from jaxsafe.run.programs import Member, Program
 from jaxsafe.run.progress import Reporter
-from jaxsafe.types import Clocks
 
 OVERFLOW = "train/overflow"  # steps of an episode in which engine warp ran out of room
 
@@ -27,26 +27,32 @@ SHOWN = {  # what the progress report shows: the first of these that is known
 UNKNOWN = np.full(1, np.nan)
 
 
+class Outputs(NamedTuple):
+    """Where the metrics of an iteration go."""
+
+    folder: Path  # the run folder, for metrics.csv and TensorBoard's files
+    report: Reporter
+    watch: Watch
+    callbacks: Sequence[Callback] = ()
+
+
 class Log:
     """Metrics to metrics.csv, TensorBoard and the progress report, the files by a thread.
 
     What goes wrong in the thread is raised by the next call.
+
+    Args:
+        outputs: where metrics go.
+        program: whose metrics they are.
+        names: of the metrics, which are columns of metrics.csv.
+        iteration: how far the run is; later rows of an earlier start are dropped.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        names: list[str],
-        members: list[Member],
-        iteration: int,
-        clocks: Clocks,
-        report: Reporter,
-        watch: Watch,
-        callbacks: Sequence[Callback] = (),
-    ):
-        self.watch, self.bad, self.callbacks = watch, False, callbacks
-        self.seeds, self.clocks, self.warned = [m.seed for m in members], clocks, False
-        self.report, self.unit = report, clock.unit(clocks)
+    def __init__(self, outputs: Outputs, program: Program, names: list[str], iteration: int):
+        folder, self.report, self.watch, self.callbacks = outputs
+        members, self.clocks = program.members, program.clocks
+        self.warned_of_bad = self.warned_of_overflow = False
+        self.seeds, self.unit = [m.seed for m in members], clock.unit(program.clocks)
         self.swept = {name: np.array([m.swept[name] for m in members]) for name in members[0].swept}
         self.csv = run_folder.Metrics(folder, [*self.swept, *names], iteration)
         self.begun = time.perf_counter() - self.csv.seconds
@@ -103,16 +109,17 @@ class Log:
         for line in self.watch(f"{shown:,} {self.unit.name}", values, health):
             if not self.watch.over:  # else the run ends, and says it
                 self.report.line(f"warning: {line}; the others go on")
-        if not self.bad and (values.get(BAD[0], np.zeros(())) > 0).any():
-            self.bad = True
+        if not self.warned_of_bad and (values.get(BAD[0], np.zeros(())) > 0).any():
+            self.warned_of_bad = True
             kinds = [word for k, word in KINDS.items() if (values[f"train/bad_{k}"] > 0).any()]
             self.report.line(
                 f"warning: {values[BAD[0]].sum():.0f} worlds had a step that is not finite "
                 f"({', '.join(kinds)}) by {shown:,} {self.unit.name}; such worlds are reset, and the "
                 f"step does not count ({BAD[0]} in metrics.csv)"
             )
-        if not self.warned and (values.get(OVERFLOW, np.zeros(())) > 0).any():  # NaN: nothing ended
-            self.warned = True
+        # NaN where no episode ended
+        if not self.warned_of_overflow and (values.get(OVERFLOW, np.zeros(())) > 0).any():
+            self.warned_of_overflow = True
             self.report.line(
                 f"warning: contacts found no room in some steps ({OVERFLOW} in metrics.csv); "
                 "raise env.contact_room"
@@ -123,7 +130,7 @@ class Log:
             shown,
             len(self.seeds),
             **{
-                short: mean(next((values[name] for name in names if name in values), UNKNOWN))
+                short: mean_of_known(next((values[name] for name in names if name in values), UNKNOWN))
                 for short, names in SHOWN.items()
             },
         )
@@ -141,7 +148,7 @@ def board_of(member: Member) -> list[str]:
     return ["tensorboard", *([setting] if setting else []), f"seed{member.seed}"]
 
 
-def mean(values: np.ndarray) -> float:
+def mean_of_known(values: np.ndarray) -> float:
     """Over the seeds that have a value."""
     finite = values[np.isfinite(values)]
     return float(finite.mean()) if len(finite) else float("nan")

@@ -18,7 +18,7 @@ from jaxsafe.run import checkpoint, clock, distributed, divergence, files, progr
 from jaxsafe.run.divergence import Diverged
 from jaxsafe.run.evaluate import COLUMNS
 from jaxsafe.run.interrupts import Interrupts
-from jaxsafe.run.log import Log
+from jaxsafe.run.log import Log, Outputs
 from jaxsafe.run.loggers import Callback
 from jaxsafe.run.programs import Member, Program
 from jaxsafe.run.progress import Reporter
@@ -29,17 +29,27 @@ from jaxsafe.types import PyTree
 class Hooks(NamedTuple):
     """What a session adds to the loop.
 
+    resume_command: the command that continues the run, printed when it is stopped early.
     adapt(ts) -> ts changes a fresh train state, to start from another policy; not used on resumption.
-    evaluate(params) -> {name: [M]} measures the policies of all members, for the columns
+    evaluate(learned) -> {name: [M]} measures the policies of all members, for the columns
         `evaluate.COLUMNS`; process 0 calls it. None: they are not measured.
     about(member) says what is unusual in the settings of a member that diverged.
     callbacks(clock, metrics) are called by process 0 once the files have an iteration.
     """
 
+    resume_command: str
     adapt: Callable[[PyTree], PyTree] = lambda ts: ts
     evaluate: Callable[[PyTree], dict[str, np.ndarray]] | None = None
     about: Callable[[Member], str] = str
     callbacks: tuple[Callback, ...] = ()
+
+
+class Start(NamedTuple):
+    """Where the loop begins: a train state, its iteration, and that from which its replay is whole."""
+
+    ts: PyTree
+    iteration: int = 0
+    since: int = 0
 
 
 class Outcome(NamedTuple):
@@ -49,22 +59,16 @@ class Outcome(NamedTuple):
 
 
 def train(
-    program: Program,
-    train_cfg: TrainConfig,
-    folder: Path,
-    report: Reporter,
-    resume_command: str,
-    hooks: Hooks = Hooks(),  # noqa: B008
+    program: Program, train_cfg: TrainConfig, folder: Path, report: Reporter, hooks: Hooks
 ) -> Outcome:
     """Train to the end that `train_cfg` gives, from the newest checkpoint in `folder` if there is one.
 
     Args:
         program: from `build`.
         train_cfg: those it was built with.
-        folder: the run folder; gets metrics.csv, tensorboard/ and checkpoints/.
+        folder: the run folder; gets metrics.csv, tensorboard/, checkpoints/ and policy/.
         report: where progress goes.
-        resume_command: printed when the run is stopped early.
-        hooks: what is done beside.
+        hooks: what the session adds.
     Returns:
         The train state, with its leading axis, and how far it is.
     Raises:
@@ -72,92 +76,55 @@ def train(
         divergence.Diverged: no member learns any more; likewise.
     """
     iterations, unit = clock.iterations(train_cfg, program.clocks), clock.unit(program.clocks)
-    store, acting_store = files.inside(folder, "checkpoints"), files.inside(folder, "policy")
+    store = files.inside(folder, "checkpoints")
     resuming = bool(distributed.from_process_0(np.array(bool(checkpoint.checkpoints(store)))))
     with report, Interrupts(report.line, report.hosted) as stop:
-        stop.nothing_to_save = (
-            f"stopped before the first update; {resume_command if resuming else 'nothing to save'}"
-        )
+        nothing = hooks.resume_command if resuming else "nothing to save"
+        stop.nothing_to_save = f"stopped before the first update; {nothing}"
         begun = time.perf_counter()
-        iteration = since = 0
         program = program._replace(data=distributed.place(program.data, program.everywhere))
-        like = jax.eval_shape(program.init, program.start, program.shared())
-        keeps_replay = checkpoint.keeps_replay(like, train_cfg.checkpoint_replay)
-        if resuming:
-            ts, iteration, since = restored(store, like, report)
-            # the run may have a new end, from which rates that decay are counted
-            ts = dataclasses.replace(ts, config=program.start[1])
-            ts = distributed.place(ts, program.sharding)
-            empty = ", with an empty replay" if iteration and since == iteration else ""
-            report.line(f"resuming at {unit.at(iteration):,} {unit.name}{empty}")
-        else:
-            start = distributed.place(program.start, program.sharding)
-            ts = jax.jit(program.init)(start, program.shared())
-            ts = distributed.place(hooks.adapt(ts), program.sharding)
-        if iteration >= iterations:
+        start = resumed(program, store, report) if resuming else fresh(program, hooks)
+        if start.iteration >= iterations:
             report.line("nothing left to train")
-            return Outcome(ts, iteration, False)
-        names = sorted(jax.eval_shape(program.update, ts, program.shared())[1])
+            return Outcome(start.ts, start.iteration, False)
+        names = sorted(jax.eval_shape(program.update, start.ts, program.shared())[1])
         names += COLUMNS if hooks.evaluate else ()
-        update = programs.compiled(program, ts)
+        update = programs.compiled(program, start.ts)
         report.line(f"compiled in {time.perf_counter() - begun:.1f} s")
         stop.nothing_to_save = ""
 
-        vote, health = distributed.Vote(program.sharding), jax.jit(divergence.health)
         watch = divergence.Watch(program.members, hooks.about)
+        outputs = Outputs(folder, report, watch, hooks.callbacks)
+        leads = distributed.leads()
         with (
-            Log(
-                folder,
-                names,
-                program.members,
-                iteration,
-                program.clocks,
-                report,
-                watch,
-                hooks.callbacks,
-            )
-            if distributed.leads()
-            else contextlib.nullcontext()
-        ) as log:
-            limits = [m.algo.cost_limit for m in program.members if not limits_by_name(m.algo)]
-            report.start(unit.at(iterations), unit.at(iteration), limits, unit.name)
-            saved_at, pause, evaluated = time.perf_counter(), train_cfg.checkpoint_every, False
+            Log(outputs, program, names, start.iteration) if leads else contextlib.nullcontext() as log
+        ):
+            limits = [m.config.cost_limit for m in program.members if not limits_by_name(m.config)]
+            report.start(unit.at(iterations), unit.at(start.iteration), limits, unit.name)
+            saver = Saver(folder, program, train_cfg, start)
+            vote, health = distributed.Vote(program.sharding), jax.jit(divergence.health)
+            (ts, iteration, since), evaluated = start, False
+            del start  # the first update takes its arrays
             while iteration < iterations:
                 ts, metrics = update(ts, program.shared(iteration, since))
-                found = health(program.params(ts))
+                found = health(program.learned(ts))
                 (metrics, found), iteration = distributed.whole((metrics, found)), iteration + 1
                 due = unit.crosses(train_cfg.eval_every, iteration) or iteration == iterations
                 if hooks.evaluate and due:
-                    acting = distributed.whole(program.params(ts))
+                    learned = distributed.whole(program.learned(ts))
                     if log and not evaluated:
-                        report.line(
-                            f"compiling the evaluation of {train_cfg.eval_episodes} episodes ..."
-                        )
+                        episodes = train_cfg.eval_episodes
+                        report.line(f"compiling the evaluation of {episodes} episodes ...")
                         evaluated = True
                     if log:
-                        metrics |= hooks.evaluate(of_members(program, acting))
+                        metrics |= hooks.evaluate(of_members(program, learned))
                 if log:
                     log.append(iteration, metrics, found)
-                by_count = (
-                    train_cfg.checkpoint_iterations and iteration % train_cfg.checkpoint_iterations == 0
-                )
-                late = time.perf_counter() - saved_at >= pause
-                stopping, by_time, over = vote(stop.requested, late, watch.over)
+                stopping, late, over = vote(stop.requested, saver.late(), watch.over)
                 if over:
                     break
-                if stopping or by_count or by_time or iteration == iterations:
-                    saving = time.perf_counter()
-                    state = distributed.whole(ts)
-                    at = clock.after(iteration, program.clocks)
-                    if log:
-                        log.sync()
-                    if log and not watch.over:
-                        checkpoint.save(store, state, at, since, keeps_replay)
-                        acting = of_members(program, program.params(state))
-                        checkpoint.save(acting_store, acting, at)
-                    saved_at = time.perf_counter()
-                    if keeps_replay and checkpoint.replay_bytes(like):  # at most 5% of the time
-                        pause = max(train_cfg.checkpoint_every, 19 * (saved_at - saving))
+                if stopping or late or saver.at_count(iteration) or iteration == iterations:
+                    saver.save(ts, iteration, log)
                 if stopping:
                     break
         report.stop()
@@ -167,16 +134,79 @@ def train(
         interrupted = iteration < iterations
         if interrupted:
             done = f"{unit.at(iteration):,} {unit.name}"
-            report.line(f"stopped at {done}; continue with: {resume_command}")
+            report.line(f"stopped at {done}; continue with: {hooks.resume_command}")
     return Outcome(ts, iteration, interrupted)
 
 
-def of_members(program: Program, params: PyTree) -> PyTree:
-    """The policy's parameters of each member, [M, ...], on one device.
+def fresh(program: Program, hooks: Hooks) -> Start:
+    """The train state before the first update."""
+    given = distributed.place(program.start, program.sharding)
+    ts = jax.jit(program.init)(given, program.shared())
+    return Start(distributed.place(hooks.adapt(ts), program.sharding))
+
+
+def resumed(program: Program, store: Path, report: Reporter) -> Start:
+    """The train state of the newest sound checkpoint in `store`."""
+    like = jax.eval_shape(program.init, program.start, program.shared())
+    ts, iteration, since = restored(store, like, report)
+    # the run may have a new end, from which rates that decay are counted
+    ts = dataclasses.replace(ts, config=program.start[1])
+    unit = clock.unit(program.clocks)
+    empty = ", with an empty replay" if iteration and since == iteration else ""
+    report.line(f"resuming at {unit.at(iteration):,} {unit.name}{empty}")
+    return Start(distributed.place(ts, program.sharding), iteration, since)
+
+
+class Saver:
+    """When the loop saves, and what.
+
+    Args:
+        folder: the run folder.
+        program, train_cfg: the run's.
+        start: where the loop began.
+    """
+
+    def __init__(self, folder: Path, program: Program, train_cfg: TrainConfig, start: Start):
+        self.program, self.since = program, start.since
+        self.store, self.policies = (files.inside(folder, name) for name in ("checkpoints", "policy"))
+        self.every, self.count = train_cfg.checkpoint_every, train_cfg.checkpoint_iterations
+        self.keeps_replay = checkpoint.keeps_replay(start.ts, train_cfg.checkpoint_replay)
+        self.saves_replay = self.keeps_replay and checkpoint.replay_bytes(start.ts) > 0
+        self.pause, self.saved_at = self.every, time.perf_counter()
+
+    def late(self) -> bool:
+        """Whether the last checkpoint is old enough for another one."""
+        return time.perf_counter() - self.saved_at >= self.pause
+
+    def at_count(self, iteration: int) -> bool:
+        """Whether a checkpoint was asked for at this iteration."""
+        return self.count > 0 and iteration % self.count == 0
+
+    def save(self, ts: PyTree, iteration: int, log: Log | None) -> None:
+        """Write a checkpoint and the policies, once all rows are on the disk.
+
+        All processes call it. The one with a log writes, unless the run turns out to have diverged.
+        """
+        begun = time.perf_counter()
+        state = distributed.whole(ts)
+        at = clock.after(iteration, self.program.clocks)
+        if log:
+            log.sync()
+        if log and not log.watch.over:
+            checkpoint.save(self.store, state, at, self.since, self.keeps_replay)
+            policies = of_members(self.program, self.program.learned(state))
+            checkpoint.save(self.policies, policies, at)
+        self.saved_at = time.perf_counter()
+        if self.saves_replay:  # at most 5% of the time
+            self.pause = max(self.every, 19 * (self.saved_at - begun))
+
+
+def of_members(program: Program, learned: PyTree) -> PyTree:
+    """What the policy of each member has learned, [M, ...], on one device.
 
     A member that is split over devices has equal copies; the first is taken.
     """
-    own = jax.tree.map(lambda x: x[: len(program.members)], params)
+    own = jax.tree.map(lambda x: x[: len(program.members)], learned)
     return jax.device_put(own, jax.local_devices()[0])
 
 

@@ -12,7 +12,7 @@ from jaxsafe.run.programs import Program
 from jaxsafe.run.settings import Settings, TrainConfig
 from jaxsafe.types import Env
 
-ROOM = 0.8  # of the memory that a program may take by `capacity`
+PROGRAM_SHARE = 0.8  # of the memory that a program may take by `capacity`
 
 
 class TooLarge(ConfigError):
@@ -75,7 +75,7 @@ def capacity(program: Program) -> int:
     )
     used: Any = programs.compiled(program, like).memory_analysis()
     need = used.temp_size_in_bytes + used.argument_size_in_bytes + used.output_size_in_bytes
-    share = ROOM * device_memory()[0] / (need - used.alias_size_in_bytes)  # of the members
+    share = PROGRAM_SHARE * device_memory()[0] / (need - used.alias_size_in_bytes)  # of the members
     return max(1, int(min(1.0, share) * len(program.members)))
 
 

@@ -31,21 +31,21 @@ from jaxsafe.types import Algorithm, Env, PyTree, Shared
 
 ROBOT = "env.robot_base"
 CODE = ("env=MODULE:NAME", "algo=MODULE:NAME", f"{ROBOT}=PATH")  # what a user gives beside a run folder
-POLICY = ("params", "normaliser")  # the parts of a policy's parameters that another run can start from
+POLICY = ("params", "normaliser")  # what another run can start from, of all that is learned
 
 
 class RunPolicies(NamedTuple):
     """The policies of a run folder, ready to act.
 
-    `params` are their parameters, with a leading axis over policies: every seed of the first setting,
-    then of the next.
+    `learned` is what they are made of, with a leading axis over policies: every seed of the first
+    setting, then of the next.
     """
 
     folder: Path
     settings: Settings
     env: Env
     algo: Algorithm
-    params: PyTree
+    learned: PyTree
 
     def actor(self, index: int) -> "Actor":
         """One of the policies.
@@ -56,8 +56,8 @@ class RunPolicies(NamedTuple):
         count = len(self.settings.configs) * self.settings.train.num_seeds
         if not 0 <= index < count:
             raise ConfigError(f"index {index}: the run has {count} policies, from 0, in {self.folder}")
-        params = jax.tree.map(lambda x: x[index], self.params)
-        return Actor(self.settings, self.env, self.algo, params)
+        learned = jax.tree.map(lambda x: x[index], self.learned)
+        return Actor(self.settings, self.env, self.algo, learned)
 
 
 def open_run(folder: Path, code: Sequence[str] = (), extras: Extras = NO_EXTRAS) -> RunPolicies:
@@ -90,32 +90,32 @@ def open_run(folder: Path, code: Sequence[str] = (), extras: Extras = NO_EXTRAS)
 
 
 class Actor(NamedTuple):
-    """One policy of a run, ready to act, with its parameters."""
+    """One policy of a run, ready to act."""
 
     settings: Settings
     env: Env
     algo: Algorithm
-    params: PyTree
+    learned: PyTree
 
     @property
     def player(self) -> Player:
-        return Player(self.algo.policy, self.params, self.algo.task(self.params))
+        return Player(self.algo.policy, self.learned, self.algo.task(self.learned))
 
 
 def policy_of(settings: Settings, env: Env, folder: Path) -> tuple[Algorithm, PyTree]:
-    """The algorithm, and the newest parameters of each member's policy, [S, ...]."""
+    """The algorithm, and what each member's policy has learned by the newest checkpoint, [S, ...]."""
     algo = settings.row.make(env, None)
     offline = not algo.clocks(settings.algo).steps  # shapes alone count, so that no data set is read
     shared = Shared(np.int32(0), data=data_set_like(env) if offline else ())
 
-    def initial_params(cfg: Any) -> PyTree:
-        return algo.params(algo.init(jax.random.key(0), cfg, shared))
+    def untrained(cfg: Any) -> PyTree:
+        return algo.learned(algo.init(jax.random.key(0), cfg, shared))
 
     run = members(settings.configs, settings.train)
-    floats = jax.tree.map(lambda *x: np.array(x, np.float32), *[m.algo for m in run])
-    like = jax.eval_shape(initial_params, jax.tree.map(lambda x: x[0], floats))
+    floats = jax.tree.map(lambda *x: np.array(x, np.float32), *[m.config for m in run])
+    like = jax.eval_shape(untrained, jax.tree.map(lambda x: x[0], floats))
     arrays = read_policy(folder, len(run))
-    return algo, policy_params(like, arrays, floats, folder)
+    return algo, learned_from(like, arrays, floats, folder)
 
 
 def policy_folder(folder: Path) -> Path:
@@ -140,11 +140,11 @@ def read_policy(
     return policy
 
 
-def policy_params(like: PyTree, policy: dict[str, np.ndarray], configs: PyTree, source: Path) -> PyTree:
-    """The parameters of S policies, [S, ...].
+def learned_from(like: PyTree, policy: dict[str, np.ndarray], configs: PyTree, source: Path) -> PyTree:
+    """What S policies have learned, [S, ...].
 
     Args:
-        like: of one, without that axis.
+        like: that of one, without the axis, or its shapes.
         policy: from `read_policy`.
         configs: the algorithm's, floats [S], from config.yaml.
         source: the run folder, for messages.
@@ -156,10 +156,10 @@ def policy_params(like: PyTree, policy: dict[str, np.ndarray], configs: PyTree, 
     check_policy(like, policy, source)
     arrays = policy | checkpoint.to_arrays({"config": configs})
     for name, want in checkpoint.as_data(like).items():
-        have = checkpoint.describe(
+        have = checkpoint.leaf_in_words(
             (str(arrays[name].dtype), arrays[name].shape) if name in arrays else None
         )
-        if have != (expected := checkpoint.describe((str(want.dtype), want.shape))):
+        if have != (expected := checkpoint.leaf_in_words((str(want.dtype), want.shape))):
             raise ConfigError(
                 f"the policy of {source} does not fit: {name} is {have}, expected {expected}"
             )

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import AxisType, NamedSharding, PartitionSpec
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from jaxsafe.config import ConfigError, flat
 from jaxsafe.envs.wrap import raw_steps
@@ -26,7 +26,7 @@ AXIS = "devices"
 class Member(NamedTuple):
     """One of the runs that train side by side: a setting of the algorithm with a seed."""
 
-    algo: Any  # its config
+    config: Any  # of the algorithm
     seed: int
     swept: dict[str, float]  # those of its floats in which the settings differ, as algo.<field>
 
@@ -47,19 +47,27 @@ def members(configs: Sequence[Any], train_cfg: TrainConfig) -> list[Member]:
 
 
 class Program(NamedTuple):
-    """`init(start, shared) -> ts` and `update(ts, shared) -> (ts, metrics)` over the leading axis, not
-    yet compiled. `params(ts)` are the policies' parameters, on the same axis. `clocks` are of one seed.
+    """An algorithm over the leading axis, not yet compiled.
+
+    init(start, shared) -> ts.
+    update(ts, shared) -> (ts, metrics).
+    learned(ts) -> what the policies are made of, on the same axis.
+    clocks: what one update takes of one seed.
+    start: (keys, config), [M], or [devices] for one split member.
+    members: on the axis, in order.
+    sharding, everywhere: of the train state, and of what members share.
+    data: the data set, or ().
     """
 
     init: Callable[[PyTree, Shared], PyTree]
     update: Callable[[PyTree, Shared], tuple[PyTree, dict[str, jax.Array]]]
-    params: Callable[[PyTree], PyTree]
+    learned: Callable[[PyTree], PyTree]
     clocks: Clocks
-    start: PyTree  # (keys, config): [M], or [devices] for one split member
+    start: PyTree
     members: list[Member]
     sharding: jax.sharding.Sharding
-    everywhere: jax.sharding.Sharding  # of what members share
-    data: PyTree = ()  # the data set
+    everywhere: jax.sharding.Sharding
+    data: PyTree = ()
 
     def shared(self, iteration: int = 0, since: int = 0) -> Shared:
         return Shared(np.int32(iteration), np.int32(since), self.data)
@@ -81,76 +89,92 @@ def build(
             data set that is missing, or that the algorithm has no use for.
     """
     devices, run = train_cfg.devices, members(configs, train_cfg)
-    share = devices if len(run) == 1 else 1  # devices among which the environments of one are split
-    if len(run) % devices and share == 1:
+    split = len(run) == 1 and devices > 1  # the environments of a lone member, over the devices
+    if len(run) % devices and not split:
         raise ConfigError(
             f"{len(run)} seeds do not split over devices={devices}: "
             f"expected a multiple of {devices}, or 1"
         )
-    algo: Algorithm = make(env, AXIS if share > 1 else None)
+    algo: Algorithm = make(env, AXIS if split else None)
     clocks = algo.clocks(configs[0])
     clocks = clocks._replace(steps=clocks.steps * raw_steps(env))
-    if data and clocks.steps:
-        raise ConfigError(f"dataset={train_cfg.dataset}: this algorithm learns from no data set")
-    if not data and not clocks.steps:
-        raise ConfigError("an offline algorithm learns from a data set: give dataset=PATH")
-    if share > 1 and not clocks.steps:
-        raise ConfigError(
-            f"devices={devices}: a lone seed has no environments to split over them; use num_seeds"
-        )
-    if share > 1 and configs[0].num_envs % share:
-        raise ConfigError(f"num_envs={configs[0].num_envs} does not split over devices={devices}")
+    check_data(clocks, data, train_cfg)
+    if split:
+        check_split(clocks, configs[0], devices)
     iterations = float(clock.iterations(train_cfg, clocks))
 
     def settled(cfg: Any) -> Any:
         ends = iterations if math.isinf(cfg.total_iterations) else cfg.total_iterations
-        part = {"num_envs": cfg.num_envs // share} if share > 1 else {}
+        part = {"num_envs": cfg.num_envs // devices} if split else {}
         return dataclasses.replace(cfg, total_iterations=ends, **part)
 
     # A split seed has one key for all its devices: the algorithm folds the device's index in.
-    keys = jax.vmap(jax.random.key)(np.array([m.seed for m in run] * share, np.uint32))
-    floats = jax.tree.map(lambda *x: np.array(x, np.float32), *[settled(m.algo) for m in run * share])
+    each = run * (devices if split else 1)
+    keys = jax.vmap(jax.random.key)(np.array([m.seed for m in each], np.uint32))
+    floats = jax.tree.map(lambda *x: np.array(x, np.float32), *[settled(m.config) for m in each])
     rows = max(1, len(run) // devices)  # on each device
     init = over_rows(lambda start, shared: algo.init(start[0], start[1], shared), rows)
     update = over_rows(algo.update, rows)
     if devices == 1:
         one = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
-        return Program(init, update, algo.params, clocks, (keys, floats), run, one, one, data)
+        return Program(init, update, algo.learned, clocks, (keys, floats), run, one, one, data)
     mesh = jax.make_mesh(
         (devices,), (AXIS,), devices=jax.devices()[:devices], axis_types=(AxisType.Auto,)
     )
-    spec = PartitionSpec(AXIS)
+    return Program(
+        init=over_devices(init, mesh),
+        update=over_devices(update, mesh),
+        learned=algo.learned,
+        clocks=clocks,
+        start=(keys, floats),
+        members=run,
+        sharding=NamedSharding(mesh, PartitionSpec(AXIS)),
+        everywhere=NamedSharding(mesh, PartitionSpec()),
+        data=data,
+    )
 
-    def split(fn: Callable) -> Callable:
-        def parted(tree: PyTree, shared: Shared) -> PyTree:
-            leaves, treedef = jax.tree.flatten(tree)
 
-            def own_part(full: list[jax.Array], shared: Shared) -> PyTree:
-                given = iter(full)
-                tree = treedef.unflatten([next(given) if x.size else empty(x) for x in leaves])
-                return fn(tree, shared)
+def check_data(clocks: Clocks, data: PyTree, train_cfg: TrainConfig) -> None:
+    """Raise ConfigError for a data set that is missing, or that the algorithm has no use for."""
+    if data and clocks.steps:
+        raise ConfigError(f"dataset={train_cfg.dataset}: this algorithm learns from no data set")
+    if not data and not clocks.steps:
+        raise ConfigError("an offline algorithm learns from a data set: give dataset=PATH")
 
-            # arrays without elements stay outside: jax 0.11 crashes on them as inputs
-            full = [x for x in leaves if x.size]
-            specs = {"in_specs": (spec, PartitionSpec()), "out_specs": spec}
-            return jax.shard_map(own_part, mesh=mesh, **specs, check_vma=False)(full, shared)
 
-        return parted
+def check_split(clocks: Clocks, cfg: Any, devices: int) -> None:
+    """Raise ConfigError where a lone member has no environments that split over the devices."""
+    if not clocks.steps:
+        raise ConfigError(
+            f"devices={devices}: a lone seed has no environments to split over them; use num_seeds"
+        )
+    if cfg.num_envs % devices:
+        raise ConfigError(f"num_envs={cfg.num_envs} does not split over devices={devices}")
+
+
+def over_devices(
+    fn: Callable[[PyTree, Shared], PyTree], mesh: Mesh
+) -> Callable[[PyTree, Shared], PyTree]:
+    """`fn` on each device, with its part of the leading axis."""
+    spec, devices = PartitionSpec(AXIS), mesh.size
 
     def empty(x: jax.Array) -> jax.Array:
         return jnp.zeros((x.shape[0] // devices, *x.shape[1:]), x.dtype)
 
-    return Program(
-        init=split(init),
-        update=split(update),
-        params=algo.params,
-        clocks=clocks,
-        start=(keys, floats),
-        members=run,
-        sharding=NamedSharding(mesh, spec),
-        everywhere=NamedSharding(mesh, PartitionSpec()),
-        data=data,
-    )
+    def parted(tree: PyTree, shared: Shared) -> PyTree:
+        leaves, treedef = jax.tree.flatten(tree)
+
+        def own_part(full: list[jax.Array], shared: Shared) -> PyTree:
+            given = iter(full)
+            tree = treedef.unflatten([next(given) if x.size else empty(x) for x in leaves])
+            return fn(tree, shared)
+
+        # arrays without elements stay outside: jax 0.11 crashes on them as inputs
+        full = [x for x in leaves if x.size]
+        specs = {"in_specs": (spec, PartitionSpec()), "out_specs": spec}
+        return jax.shard_map(own_part, mesh=mesh, **specs, check_vma=False)(full, shared)
+
+    return parted
 
 
 def over_rows(fn: Callable[[PyTree, Shared], PyTree], rows: int) -> Callable[[PyTree, Shared], PyTree]:

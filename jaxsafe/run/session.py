@@ -29,7 +29,7 @@ from jaxsafe.run.settings import (
     differences,
     make_env,
     settings_from_config,
-    unusual,
+    unusual_in_words,
 )
 from jaxsafe.types import Env
 
@@ -170,7 +170,9 @@ def run(session: Session, report: Reporter, finish: Finish) -> int:
     """
     settings, folder, env, program, resume_command, callbacks = session
     train, cfg = settings.train, settings.algo
-    hooks = loop.Hooks(about=lambda member: unusual(settings._replace(configs=(member.algo,))))
+    hooks = loop.Hooks(
+        resume_command, about=lambda m: unusual_in_words(settings._replace(configs=(m.config,)))
+    )
     if train.eval_every:
         algo = settings.row.make(env, None)
         hooks = hooks._replace(evaluate=make_training_evaluation(algo, train.eval_episodes, train.seed))
@@ -206,7 +208,7 @@ def run(session: Session, report: Reporter, finish: Finish) -> int:
     )
     if line := about_replay(program, train):
         report.line(line)
-    outcome = loop.train(program, train, folder, report, resume_command, hooks)
+    outcome = loop.train(program, train, folder, report, hooks)
     distributed.part()
     if outcome.interrupted:
         return 130

@@ -122,7 +122,7 @@ class Settings(NamedTuple):
     """Everything a run is made of, checked, with the extras that its names were resolved to."""
 
     env_name: str
-    env: EnvEntry
+    env_entry: EnvEntry
     env_options: dict[str, Any]  # all of them
     algo_name: str
     row: Row
@@ -142,7 +142,7 @@ class Settings(NamedTuple):
     @property
     def extras(self) -> Extras:
         """What another run folder with the same names is resolved with."""
-        return Extras({self.env_name: self.env}, {self.algo_name: self.row})
+        return Extras({self.env_name: self.env_entry}, {self.algo_name: self.row})
 
     def plain(self) -> dict[str, Any]:
         """As config.yaml has it: a float in which the settings differ is a list of one a setting."""
@@ -293,7 +293,7 @@ def files_named(settings: Settings) -> dict[str, Any]:
     """The options that name a file or folder to read, beside our own robots."""
     plain = flat(settings.plain())
     robot = plain.get("env.robot_base")
-    if robot == settings.env.defaults.get("robot_base") or scene.built_in(str(robot)):
+    if robot == settings.env_entry.defaults.get("robot_base") or scene.built_in(str(robot)):
         plain["env.robot_base"] = None
     return {name: plain[name] for name in READ_FROM if plain.get(name) is not None}
 
@@ -352,7 +352,7 @@ def changed_options(options: dict[str, Any], entry: EnvEntry) -> dict[str, Any]:
 
 
 def make_env(settings: Settings) -> Env:
-    env = settings.env.make(**changed_options(settings.env_options, settings.env))
+    env = settings.env_entry.make(**changed_options(settings.env_options, settings.env_entry))
     check_cost_names(limits_by_name(settings.algo), env)
     return env
 
@@ -522,7 +522,7 @@ def differences(a: dict[str, Any], b: dict[str, Any]) -> dict[str, tuple[Any, An
     return {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
 
 
-def unusual(settings: Settings, most: int = 4) -> str:
+def unusual_in_words(settings: Settings, most: int = 4) -> str:
     """The settings of environment and algorithm that are not the defaults, the most unusual first."""
     names = {"env": {"name": settings.env_name}, "algo": {"name": settings.algo_name}}
     chosen = {"preset": settings.train.preset, "compat": settings.train.compat}

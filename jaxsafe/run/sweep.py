@@ -205,7 +205,7 @@ def slices(count: int, most: int) -> list[slice]:
     return [slice(a, b) for a, b in itertools.pairwise(ends)]
 
 
-def fitting(settings: Settings, most: int | None) -> tuple[int, Program]:
+def members_at_once(settings: Settings, most: int | None) -> tuple[int, Program]:
     """How many members run at once, `most` or what the memory holds; and the first part's program."""
     members = len(settings.configs) * settings.train.num_seeds
     parallel = min(members, most or members)
@@ -253,7 +253,7 @@ def train(sweep: Sweep, resume_command: str, report: Reporter, after: After) -> 
                 stop.nothing_to_save = f"stopped before the first update; {resume_command}"
                 if not sweep.max_parallel:
                     report.line(f"{name}: compiling, to see how many members fit the memory ...")
-                known[name], program = fitting(settings, sweep.max_parallel)
+                known[name], program = members_at_once(settings, sweep.max_parallel)
             programs[len(program.members)] = program
             write_folder(sweep, known)
         elif sweep.max_parallel not in (None, known[name]) and known[name] < members:

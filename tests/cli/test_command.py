@@ -290,16 +290,18 @@ def test_the_policy_of_a_run_is_read_whatever_its_minibatches_divide(tmp_path, n
     program = programs.build(env, run.row.make, run.configs, run.train)
     ones = jax.tree.map(
         lambda x: np.ones(x.shape, x.dtype),
-        program.params(jax.eval_shape(program.init, program.start, START)),
+        program.learned(jax.eval_shape(program.init, program.start, START)),
     )
     run_folder.write_config(tmp_path, run.plain())
     checkpoint.save(tmp_path / "policy", ones, checkpoint.Progress(1, 40, 4))
-    algo, params = policies.policy_of(run, env, tmp_path)
-    params = jax.tree.map(lambda x: x[0], params)
-    action, _, _ = algo.policy.act(params, (), jnp.zeros(algo.task(params).obs_size), None)
+    algo, learned = policies.policy_of(run, env, tmp_path)
+    learned = jax.tree.map(lambda x: x[0], learned)
+    action, _, _ = algo.policy.act(learned, (), jnp.zeros(algo.task(learned).obs_size), None)
     assert action.shape == (env.action_size,)
-    assert params.config.cost_limit == 25.0  # `task` may need the settings, and the dual
-    assert all((x == 1).all() for x in jax.tree.leaves((params.params, params.normaliser, params.dual)))
+    assert learned.config.cost_limit == 25.0  # `task` may need the settings, and the dual
+    assert all(
+        (x == 1).all() for x in jax.tree.leaves((learned.params, learned.normaliser, learned.dual))
+    )
 
 
 def test_evaluate_render_and_watch_refuse_a_bad_folder_in_one_line(tmp_path, capsys):

@@ -61,13 +61,13 @@ def test_a_run_counts_gradient_steps_and_needs_no_data_to_be_evaluated(whole, da
     copy = whole.parent / "copy"
     shutil.copytree(whole, copy)
     run_folder.write_config(copy, config)
-    assert open_run(copy, (TOY,)).params.normaliser.mean.shape == (2, 4)
+    assert open_run(copy, (TOY,)).learned.normaliser.mean.shape == (2, 4)
     assert typed("evaluate", str(copy), TOY, "--episodes", "2") == 0
     assert "return" in capsys.readouterr().out
 
 
 def test_the_normaliser_that_acts_is_that_of_the_data(whole):
-    params = open_run(whole, (TOY,)).params
+    params = open_run(whole, (TOY,)).learned
     np.testing.assert_allclose(params.normaliser.mean[1], make_data().obs.mean(0), atol=1e-5)
 
 

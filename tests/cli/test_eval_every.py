@@ -46,7 +46,7 @@ def test_the_last_row_is_what_fresh_episodes_of_the_policies_make(watched):
     run = open_run(watched, ("env=toys:Corridor",))
     table = run_folder.read_metrics(watched)
     for end, sampled in (("", False), ("_sampled", True)):
-        found = run_episodes(run.algo, run.params, 2, 0, sampled)
+        found = run_episodes(run.algo, run.learned, 2, 0, sampled)
         np.testing.assert_allclose(table[f"eval/return{end}"][-2:], found.ret.mean(1), rtol=1e-5)
         np.testing.assert_allclose(table[f"eval/cost{end}"][-2:], found.cost.mean(1), rtol=1e-5)
     assert (table["eval/return"][-2:] != table["eval/return_sampled"][-2:]).all()

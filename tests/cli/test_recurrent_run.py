@@ -36,7 +36,7 @@ def test_stopped_and_resumed_it_ends_bit_for_bit_as_if_uninterrupted(trained, tm
 
 def test_evaluated_and_filmed_it_remembers(trained):
     run = open_run(trained, ("env=toys:Corridor",))
-    whole = run_episodes(run.algo, run.params, 2, 0)
+    whole = run_episodes(run.algo, run.learned, 2, 0)
     player = run.actor(0).player
     states = render.run_episode(player, jax.random.key(0), run.env.episode_length)
     assert np.isfinite(whole.ret).all() and np.isfinite(states.obs).all()

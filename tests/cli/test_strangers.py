@@ -551,7 +551,7 @@ def test_a_study_is_read_from_plain_files_only(place, capsys):
     study = place.run.parent / "study"
     study.mkdir()
     (study / "final.csv").symlink_to(place.outside / "precious")
-    assert study_files.there(study) and typed("plot", str(study), "--out", "out") == 2
+    assert study_files.holds_study(study) and typed("plot", str(study), "--out", "out") == 2
     assert "is a link" in capsys.readouterr().err
 
 

@@ -270,7 +270,7 @@ def test_real_training_is_stopped_and_continued(tmp_path):
         assert process.poll() is None
         time.sleep(0.05)
     process.send_signal(signal.SIGINT)
-    assert process.wait() == 130 and not study_files.there(folder)
+    assert process.wait() == 130 and not study_files.holds_study(folder)
     done = subprocess.run(words, env=environ, text=True, capture_output=True)
     assert done.returncode == 0 and "left to do: nothing" in done.stdout, done.stdout + done.stderr
     assert "resuming at" in (runs / "toy" / "ppo.log").read_text()

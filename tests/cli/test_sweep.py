@@ -127,7 +127,7 @@ def test_a_grid_over_named_limits_is_side_by_side_too():
     assert run[2].setting == "algo.clip=0.1, algo.cost_limits.hazards=10"
     plain = settings.plain()
     assert plain["algo"]["cost_limits"] == {"hazards": [5.0, 10.0, 5.0, 10.0], "vases_contact": 25.0}
-    assert settings_from_config(plain)._replace(env=settings.env) == settings
+    assert settings_from_config(plain)._replace(env_entry=settings.env_entry) == settings
     one = compose(
         ["env=point_goal2", "algo.cost_limits.hazards=5", "algo.cost_limits={vases_contact: 3}"]
     )
@@ -268,16 +268,18 @@ def test_an_interrupted_sweep_goes_on_and_ends_bit_for_bit_as_if_uninterrupted(t
 def test_the_memory_decides_how_many_members_run_at_once(monkeypatch):
     asked = planned(*SMALL, *GRID)
     (settings,) = asked.groups.values()
-    parallel, program = sweep.fitting(settings, None)
+    parallel, program = sweep.members_at_once(settings, None)
     assert parallel == len(program.members) == 8
     like = jax.eval_shape(program.init, program.start, START)
     used = programs.compiled(program, like).memory_analysis()
     need = used.temp_size_in_bytes + used.output_size_in_bytes  # arguments are reused for the output
-    monkeypatch.setattr(memory, "device_memory", lambda: (need * 0.5 / memory.ROOM, "this machine"))
+    monkeypatch.setattr(
+        memory, "device_memory", lambda: (need * 0.5 / memory.PROGRAM_SHARE, "this machine")
+    )
     assert 3 <= memory.capacity(program) <= 4
     monkeypatch.setattr(memory, "device_memory", lambda: (1.0, "this machine"))
     with pytest.raises(ConfigError, match="this machine has"):
-        sweep.fitting(settings, None)
+        sweep.members_at_once(settings, None)
 
 
 def test_a_folder_of_another_sweep_is_refused_and_a_longer_one_is_not(finished, tmp_path):
@@ -307,7 +309,7 @@ def test_the_policies_of_a_group_are_evaluated_setting_by_setting(finished):
         for rate in (0.01, 1.0)
     ]
     for i, s in enumerate(found):
-        own = jax.tree.map(lambda x, i=i: x[2 * i : 2 * i + 2], run.params)
+        own = jax.tree.map(lambda x, i=i: x[2 * i : 2 * i + 2], run.learned)
         alone = run_episodes(run.algo, own, 3, 0)
         assert s.rows["return"].mean == pytest.approx(alone.ret.mean(), rel=1e-5)
 

@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 from toys import context
 
 from jaxsafe.algos import cpo, cup, focops, p3o, pcpo
-from jaxsafe.learn.on_policy import Batch
+from jaxsafe.learn.estimates import Batch
 from jaxsafe.learn.steps import Pair, adam_epochs
 from jaxsafe.learn.surrogates import clipped, near_old, pessimistic, plain
 from jaxsafe.nn.gaussian import Gaussian, kl, log_prob, sample
@@ -90,7 +90,7 @@ def test_the_projection_is_scipys(seed, c):
     h_g, h_b = np.linalg.solve(h, g), np.linalg.solve(h, b)
     delta = 0.02
     arrays = (g, h_g, h_b, g @ h_g, g @ h_b, b @ h_b, c, delta)
-    step = pcpo.projection(cpo.Problem(*map(jnp.float32, arrays)), pcpo.PCPOConfig()).step
+    step = pcpo.projected_step(cpo.Problem(*map(jnp.float32, arrays)), pcpo.PCPOConfig()).step
     reward = np.sqrt(2 * delta / (g @ h_g)) * h_g
     oracle = minimize(
         lambda x: (x - reward) @ h @ (x - reward),
@@ -105,7 +105,7 @@ def test_the_projection_is_scipys(seed, c):
 def test_omnisafes_pcpo_steps_along_the_plain_gradient():
     h_g, h_b = jnp.array([1.0, 2.0]), jnp.array([0.5, 0.0])
     p = cpo.Problem(jnp.array([2.0, 8.0]), h_g, h_b, *map(jnp.float32, (18.0, 1.0, 0.25, 0.3, 0.04)))
-    step = pcpo.projection(p, pcpo.PCPOConfig(natural=False)).step
+    step = pcpo.projected_step(p, pcpo.PCPOConfig(natural=False)).step
     scale = (2 * 0.04 / 18) ** 0.5
     np.testing.assert_allclose(step, scale * p.g - (scale * 1.0 + 0.3) / 0.25 * h_b, rtol=1e-6)
 

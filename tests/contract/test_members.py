@@ -43,7 +43,7 @@ from jax.sharding import AxisType, PartitionSpec as P
 from compiling import FAST
 from toys import START, Corridor, updated
 from jaxsafe.algos import ALGOS
-from jaxsafe.learn.on_policy import scaled_signals
+from jaxsafe.learn.estimates import Signals, scaled
 
 mesh = jax.make_mesh((2,), ("devices",), axis_types=(AxisType.Auto,))
 def split(fn):
@@ -63,7 +63,7 @@ for name in sys.argv[2:]:
     update = split(updated(algo))
     for _ in range(2):
         ts, metrics = update(ts)
-        statistics = (ts.normaliser, ts.signals, ts.episode_length)
+        statistics = (ts.normaliser, ts.signal_normaliser, ts.episode_length)
         shared = (ts.params, ts.opt_state, ts.dual, statistics, metrics)
         for x in jax.tree.leaves(shared):
             np.testing.assert_array_equal(x[0], x[1])  # the devices agree
@@ -73,14 +73,16 @@ for name in sys.argv[2:]:
 
 keys = jax.random.split(jax.random.key(1))  # rewards and costs of 2 x 4 environments, by both at once
 reward, cost = (jax.random.normal(key, (2, 10, 4)) for key in keys)
-halves = split(lambda x: scaled_signals(*x, "devices"))((ts, reward, cost))
+def of(ts, reward, cost, axis_name=None):
+    return scaled(Signals(reward, cost, ts.signal_normaliser), ts.config, axis_name)
+halves = split(lambda x: of(*x, "devices"))((ts, reward, cost))
 one, flat = jax.tree.map(lambda x: x[0], ts), lambda x: jnp.concatenate(list(x), 1)
-whole = scaled_signals(one, flat(reward), flat(cost), None)
+whole = of(one, flat(reward), flat(cost))
 np.testing.assert_allclose(flat(halves[0]), whole[0], rtol=1e-4, atol=1e-5)
 for x, y in zip(jax.tree.leaves(halves[2]), jax.tree.leaves(whole[2])):
     np.testing.assert_allclose(x[0], y, rtol=1e-5)
     np.testing.assert_array_equal(x[0], x[1])
-assert whole[2].count == one.signals.count + 80
+assert whole[2].count == one.signal_normaliser.count + 80
 print("learned ok")
 """
 

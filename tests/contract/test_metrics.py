@@ -7,7 +7,7 @@ import numpy as np
 from learners import begin, compiled
 from toys import Ticker
 
-from jaxsafe.learn.on_policy import scaled_signals
+from jaxsafe.learn.estimates import Signals, scaled
 from jaxsafe.learn.returns import Window
 
 FIVE_STEPS = {"stagger": False, "horizon": 5}
@@ -17,17 +17,18 @@ def test_what_the_learner_sees_is_normalised_by_all_batches_up_to_this_one():
     reward = jnp.array([[[1.0, 3.0]], [[5.0, 11.0]]])  # two batches of [T, N] = [1, 2]
     cost = jnp.array([[[0.0, 1.0]], [[1.0, 0.0]]])
     ts = begin("pdo", reward_normalize=True, cost_normalize=True)
-    a, _, signals = scaled_signals(ts, reward[0], cost[0], None)
+    cfg, start = ts.config, ts.signal_normaliser
+    a, _, normaliser = scaled(Signals(reward[0], cost[0], start), cfg, None)
     np.testing.assert_allclose(a, [[-1, 1]], rtol=1e-6)  # mean 2, standard deviation 1
-    a, b, signals = scaled_signals(dataclasses.replace(ts, signals=signals), reward[1], cost[1], None)
+    a, b, normaliser = scaled(Signals(reward[1], cost[1], normaliser), cfg, None)
     # 1, 3, 5, 11: mean 5, variance (16 + 4 + 0 + 36) / 4 = 14; 0, 1, 1, 0: mean and deviation 1/2
     np.testing.assert_allclose(a, [[0, 6 / 14**0.5]], rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(b, [[1, -1]], rtol=1e-6)
-    np.testing.assert_allclose(signals.mean, [5, 0.5])
-    np.testing.assert_allclose(signals.var, [14, 0.25], rtol=1e-6)
+    np.testing.assert_allclose(normaliser.mean, [5, 0.5])
+    np.testing.assert_allclose(normaliser.var, [14, 0.25], rtol=1e-6)
     for reward_too, cost_too in ((True, False), (False, True)):
         cfg = dataclasses.replace(ts.config, reward_normalize=reward_too, cost_normalize=cost_too)
-        a, b, _ = scaled_signals(dataclasses.replace(ts, config=cfg), reward[0], cost[0], None)
+        a, b, _ = scaled(Signals(reward[0], cost[0], start), cfg, None)
         assert (a == reward[0]).all() == (not reward_too) and (b == cost[0]).all() == (not cost_too)
 
 

@@ -185,7 +185,7 @@ def test_a_world_that_is_not_finite_costs_the_others_nothing_and_is_counted(name
 @pytest.mark.parametrize("name", [*QUICK, *OTHERS])
 def test_what_acts_is_small_and_its_mean_action_needs_no_key(name):
     algo = ALGOS[name].make(Corridor())
-    learned = algo.params(start(name))
+    learned = algo.learned(start(name))
     player = Player(algo.policy, learned, algo.task(learned))
     state = Corridor().reset(jax.random.key(0))
     mean, carry = player.act(player.begin(), state)

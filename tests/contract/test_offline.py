@@ -124,5 +124,5 @@ def test_bc_recovers_the_actions_of_a_linear_policy():
     assert metrics["train/actor_loss"] < 0.01
     rng = np.random.default_rng(1)
     obs = rng.normal(0.3, [0.5, 1.0, 2.0, 1.0], (200, 4)).astype(np.float32)
-    action = jax.vmap(lambda x: algo.policy.act(algo.params(ts), (), x, None)[0])(obs)
+    action = jax.vmap(lambda x: algo.policy.act(algo.learned(ts), (), x, None)[0])(obs)
     assert np.abs(action - np.clip(obs @ GAIN.T, -0.9, 0.9)).mean() < 0.05

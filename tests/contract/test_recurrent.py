@@ -40,21 +40,21 @@ def trained():
 
 def test_what_was_shown_at_the_first_step_is_remembered_to_the_last(trained):
     algo, ts = trained
-    whole = evaluate.run_episodes(algo, jax.vmap(algo.params)(ts), 50, seed=0)
+    whole = evaluate.run_episodes(algo, jax.vmap(algo.learned)(ts), 50, seed=0)
     assert (whole.ret.mean(1) > 4).all()  # 6 at best, and 1 without memory
 
 
 def test_a_player_forgets_at_the_start_of_an_episode(trained):
     algo, ts = trained
-    params = algo.params(jax.tree.map(lambda x: x[0], ts))
-    player = Player(algo.policy, params, Recall())
+    learned = algo.learned(jax.tree.map(lambda x: x[0], ts))
+    player = Player(algo.policy, learned, Recall())
     shown = [player.task.reset(jax.random.key(i)) for i in range(8)]
     left, right = (next(s for s in shown if s.physics == sign) for sign in (-1, 1))
     blank = player.task.step(left, jnp.zeros(1))  # the same observation whatever was shown
     answers = [player.act(player.act(player.begin(), first)[1], blank)[0] for first in (left, right)]
     assert answers[0] < 0 < answers[1]
     carry = jnp.stack([player.act(player.begin(), left)[1]] * 2)
-    anew = reset_carry(algo.policy, params, carry, jnp.array([True, False]))
+    anew = reset_carry(algo.policy, learned, carry, jnp.array([True, False]))
     assert not anew[0].any() and (anew[1] == carry[1]).all()
 
 

@@ -11,8 +11,8 @@ from compiling import FAST
 from toys import START, Lever, Ticker
 
 from jaxsafe.algos import ALGOS
+from jaxsafe.learn.estimates import Batch
 from jaxsafe.learn.normalise import normalise
-from jaxsafe.learn.on_policy import Batch
 from jaxsafe.learn.steps import with_values
 from jaxsafe.learn.surrogates import clipped
 from jaxsafe.nn.gaussian import log_prob, sample

@@ -101,7 +101,7 @@ def test_acting_normalises_and_is_the_mean_without_a_key(name):
     obs = jax.random.normal(jax.random.key(1), (500, size))
 
     def act(ts, obs, key=None):
-        return algo.policy.act(algo.params(ts), (), obs, key)[0]
+        return algo.policy.act(algo.learned(ts), (), obs, key)[0]
 
     mean = act(ts, obs[0])
     assert mean.shape == (2,)
@@ -129,11 +129,13 @@ def test_two_updates_with_every_option_at_once_are_finite(name):
     ts = begin(name, **every_option(name, ESTIMATORS.get(name, "vtrace")))
     ts, _ = compiled(name).update(ts)
     ts, metrics = compiled(name).update(ts)
-    assert all(jnp.isfinite(x).all() for x in jax.tree.leaves((ts.params, ts.signals, metrics)))
-    assert metrics["train/nonfinite"] == 0 and ts.signals.count == 2 * 8 * 25
+    assert all(
+        jnp.isfinite(x).all() for x in jax.tree.leaves((ts.params, ts.signal_normaliser, metrics))
+    )
+    assert metrics["train/nonfinite"] == 0 and ts.signal_normaliser.count == 2 * 8 * 25
     after, metrics = compiled(name).update(senseless(ts))  # leaves the statistics of rewards alone, too
     assert metrics["train/nonfinite"] > 0
-    same(ts.signals, after.signals)
+    same(ts.signal_normaliser, after.signal_normaliser)
 
 
 def test_without_normalisation_nothing_is_kept():

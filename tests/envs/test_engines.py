@@ -64,7 +64,7 @@ def agreement(name: str, steps: int, tolerance: float) -> float:
         if k == 0 and name.startswith("car"):
             continue  # its wheels start 1e-17 m from the floor: not well-conditioned (docs/fidelity.md)
         pairs = (
-            (twin.physics.physics.qpos, state.physics.physics.qpos),
+            (twin.physics.bodies.qpos, state.physics.bodies.qpos),
             (twin.reward[:, None], state.reward[:, None]),
             (mjx.part(twin, "goal_lidar"), c.part(state, "goal_lidar")),
             (twin.cost[:, None] / tolerance, state.cost[:, None] / tolerance),  # equal
@@ -281,7 +281,7 @@ def test_one_world_or_many_and_batches_of_batches_are_the_same(engine):
     np.testing.assert_allclose(nested.obs.reshape(many.obs.shape), many.obs, atol=1e-5)
     one = jax.jit(t.env.step, compiler_options=FAST)(jax.tree.map(lambda x: x[4], state), action[4])
     np.testing.assert_allclose(one.obs, many.obs[4], atol=1e-5)
-    np.testing.assert_allclose(one.physics.physics.qpos, many.physics.physics.qpos[4], atol=1e-6)
+    np.testing.assert_allclose(one.physics.bodies.qpos, many.physics.bodies.qpos[4], atol=1e-6)
 
 
 def test_reset_and_step_have_the_same_structure():

@@ -124,7 +124,7 @@ def test_goal_buttons_are_drawn_evenly():
 
 
 def test_headings_are_uniform_and_differ_between_objects():
-    vases = begun("point_goal2").physics.qpos[:, task("point_goal2").env.scene.qpos_slice("vases")]
+    vases = begun("point_goal2").bodies.qpos[:, task("point_goal2").env.scene.qpos_slice("vases")]
     quat = np.asarray(vases).reshape(COUNT, -1, 7)[:, :, 3:]
     heading = np.mod(2 * np.arctan2(quat[..., 3], quat[..., 0]), 2 * np.pi) / (2 * np.pi)
     assert min(kstest(column, "uniform").pvalue for column in heading.T) > FALSE_ALARM / 10

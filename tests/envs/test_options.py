@@ -204,7 +204,7 @@ def outcome(env: SafetyGym) -> list[np.ndarray]:
         states.append(step(states[-1], jnp.ones((1, env.action_size))))
     shown = [(s.obs, s.reward, s.cost, s.costs, s.terminated, s.info) for s in states]
     world: Any = states[-1].physics
-    kept = world.physics, world.layout, world.buttons_timer
+    kept = world.bodies, world.layout, world.buttons_timer
     return [np.asarray(x) for x in jax.tree.leaves((shown, kept))]
 
 
@@ -311,25 +311,25 @@ def test_the_reward_of_an_exception_is_an_option(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # MuJoCo writes MUJOCO_LOG.TXT
     t = task("point_goal0", reward_exception=-3.0)
     state = t.begin()
-    after = t.idle(change(state, {"qvel": state.physics.physics.qvel.at[1].set(jnp.inf)}))
+    after = t.idle(change(state, {"qvel": state.physics.bodies.qvel.at[1].set(jnp.inf)}))
     np.testing.assert_array_equal(after.reward == -3, [False, True, False, False])
 
 
 def test_frames_are_skipped_at_random():
     """Substeps ~ Binomial(10, 0.3): mean 3, variance 2.1; and always 10 when p is 1."""
     t = task("point_goal0", frameskip_binom_p=0.3)
-    counts = np.asarray(t.idle(t.begin(512)).physics.physics.substeps)
+    counts = np.asarray(t.idle(t.begin(512)).physics.bodies.substeps)
     assert abs(counts.mean() - 3) < 4 * np.sqrt(2.1 / 512) and abs(counts.var() - 2.1) < 0.6
     t = task("point_goal0")
     state = t.idle(t.idle(t.begin()))
-    np.testing.assert_array_equal(state.physics.physics.substeps, 20)
+    np.testing.assert_array_equal(state.physics.bodies.substeps, 20)
 
 
 def test_a_step_of_no_frames_changes_no_pose():
     t = task("point_goal0", frameskip_binom_p=0.0)
     state = t.begin()
     after = t.step(state, jnp.ones((4, 2)))
-    np.testing.assert_array_equal(after.physics.physics.qpos, state.physics.physics.qpos)
+    np.testing.assert_array_equal(after.physics.bodies.qpos, state.physics.bodies.qpos)
     np.testing.assert_array_equal(after.reward, 0)
 
 

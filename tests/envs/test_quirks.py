@@ -18,7 +18,7 @@ def test_drives_saturate_far_below_the_largest_action(robot, limit, ahead):
     t = task(f"{robot}_goal0")
     state = jax.tree.map(lambda x: jnp.broadcast_to(x[:1], x.shape), t.idle(t.begin()))
     actions = jnp.array([limit, 1.0, 7.0, limit / 2])[:, None] * jnp.array(ahead)
-    velocity = np.asarray(t.step(state, actions).physics.physics.qvel)
+    velocity = np.asarray(t.step(state, actions).physics.bodies.qvel)
     np.testing.assert_allclose(velocity[1:3], velocity[:1].repeat(2, 0), atol=1e-6)
     assert np.abs(velocity[3] - velocity[0]).max() > 1e-3
 
@@ -28,9 +28,9 @@ def test_point_is_slowed_by_its_joints_alone():
     t = task("point_goal0", robot_rot=0.0)
     model = t.env.scene.model
     state = t.begin()
-    state = change(state, {"qvel": state.physics.physics.qvel.at[:, 0].set(0.7)})
+    state = change(state, {"qvel": state.physics.bodies.qvel.at[:, 0].set(0.7)})
     factor = (1 + model.opt.timestep * model.dof_damping[0] / model.body_subtreemass[1]) ** -10
-    speed = t.idle(state).physics.physics.qvel
+    speed = t.idle(state).physics.bodies.qvel
     np.testing.assert_allclose(speed, [[0.7 * factor, 0, 0]] * 4, rtol=1e-5, atol=1e-7)
 
 
@@ -41,7 +41,7 @@ def test_gremlins_hover_and_circle_in_phase():
 
     def gremlins(state) -> np.ndarray:
         centres = state.physics.layout[:, t.env.place.slice("gremlins")]
-        poses = np.asarray(state.physics.physics.qpos)[:, rows].reshape(4, -1, 7)[..., :3]
+        poses = np.asarray(state.physics.bodies.qpos)[:, rows].reshape(4, -1, 7)[..., :3]
         return poses - np.pad(centres, ((0, 0), (0, 0), (0, 1)))
 
     np.testing.assert_allclose(gremlins(state), np.broadcast_to([0, 0, 0.1], (4, 4, 3)), atol=1e-6)
@@ -119,7 +119,7 @@ def pressing(t, state, button):
     """The robot, at rest, against a button."""
     x = jnp.array([0.41, -0.41])[button]  # sphere of 0.1 m against one of 0.1 m at 0.6
     state = with_qpos(state, slice(0, 3), jnp.stack([x, 0 * x, 0 * x], 1))
-    return change(state, {"qvel": jnp.zeros_like(state.physics.physics.qvel)})
+    return change(state, {"qvel": jnp.zeros_like(state.physics.bodies.qvel)})
 
 
 def test_for_ten_steps_after_a_success_buttons_are_not_seen_and_cost_nothing():
@@ -181,7 +181,7 @@ def test_a_vase_costs_while_it_slides_untouched():
     rows = t.env.scene.qvel_slice("vases").start
     vase = t.env.scene.qpos_slice("vases").start
     state = with_qpos(t.begin(), slice(vase, vase + 2), [1.5, 1.5])
-    qvel = state.physics.physics.qvel.at[:, rows].set(jnp.array([0.0, 0.5, 1.0, 2.0]))
+    qvel = state.physics.bodies.qvel.at[:, rows].set(jnp.array([0.0, 0.5, 1.0, 2.0]))
     after = t.idle(change(state, {"qvel": qvel}))
     np.testing.assert_array_equal(after.costs[:, t.env.cost_names.index("vases_contact")], 0)
     np.testing.assert_array_equal(
@@ -195,7 +195,7 @@ def test_the_vase_of_level_one_is_free():
     vase = t.env.scene.qpos_slice("vases").start
     before = with_qpos(t.begin(), slice(vase, vase + 2), [0.19, 0.0])
     after = t.step(before, jnp.ones((4, 2)))
-    assert (np.abs(after.physics.physics.qpos[:, vase] - 0.19) > 1e-3).all()
+    assert (np.abs(after.physics.bodies.qpos[:, vase] - 0.19) > 1e-3).all()
     np.testing.assert_array_equal(after.cost, 0)
 
 
@@ -204,7 +204,7 @@ def test_nothing_keeps_a_robot_inside():
     state = with_qpos(t.begin(), slice(0, 1), [1.0])
     for _ in range(60):
         state = t.step(state, jnp.array([[1.0, 0.0]] * 4))
-    assert (state.physics.physics.qpos[:, 0] > 1.2).all()
+    assert (state.physics.bodies.qpos[:, 0] > 1.2).all()
     assert not state.terminated.any() and not state.info["exception"].any()
 
 
@@ -306,7 +306,7 @@ def test_circle_pays_for_speed_along_the_circle():
     state = change(state, {"qvel": jnp.array([[0.3, 0.4, 0.0]] * 4)})
     after = t.idle(state)
     qpos, qvel = (
-        np.asarray(x)[0].astype(float) for x in (after.physics.physics.qpos, after.physics.physics.qvel)
+        np.asarray(x)[0].astype(float) for x in (after.physics.bodies.qpos, after.physics.bodies.qvel)
     )
     (x, y), (u, v) = qpos[:2], qvel[:2]
     body = model.body("robot")
@@ -332,7 +332,7 @@ def test_a_physics_error_ends_its_own_world_only(field, robot, tmp_path, monkeyp
     t = task(f"{robot}_goal1")
     state, action = t.begin(), jax.random.uniform(jax.random.key(1), (4, t.env.action_size), minval=-1)
     good = t.step(state, action)
-    physics = state.physics.physics
+    physics = state.physics.bodies
     broken = getattr(physics, field).at[2, 1].set(jnp.nan)
     after = t.step(change(state, {field: broken}), action)
     assert (after.reward[2], after.cost[2]) == (-10, 0)

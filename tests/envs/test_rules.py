@@ -28,7 +28,7 @@ def test_the_buttons_of_a_new_episode_are_not_seen_and_cost_nothing_for_ten_step
         t = task("point_button0", **TOUCHED, **rules)
         state = t.begin()
         state = change(state, goal_button=jnp.ones(4, jnp.int32))
-        touching = {k: getattr(state.physics.physics, k) for k in ("qpos", "qvel", "warmstart")}
+        touching = {k: getattr(state.physics.bodies, k) for k in ("qpos", "qvel", "warmstart")}
         seen, costs = [], []
         for _ in range(12):
             seen.append(bool(t.part(state, "buttons_lidar").any()))

@@ -26,7 +26,7 @@ def test_who_is_out_of_reach_may_sleep(name):
         np.testing.assert_allclose(some.obs, everyone.obs, atol=2e-5)
         np.testing.assert_allclose(some.reward, everyone.reward, atol=1e-6)
         np.testing.assert_array_equal(some.costs, everyone.costs)
-        world, whole = some.physics.physics, everyone.physics.physics
+        world, whole = some.physics.bodies, everyone.physics.bodies
         np.testing.assert_allclose(world.qpos, whole.qpos, atol=2e-5)
         np.testing.assert_allclose(world.qvel, whole.qvel, atol=1e-3)
 
@@ -61,11 +61,11 @@ def test_a_moving_vase_stays_awake_and_the_others_rest():
     t = task("point_goal1", awake=2, **(ROBOT_AT_ORIGIN | {"vases_num": 6, "hazards_num": 0}))
     state = beside_the_robot(t, 4)
     first = t.env.scene.qvel_slice("vases").start
-    qvel = state.physics.physics.qvel.at[:, first].set(1.0)  # vase 0, the farthest, slides along x
+    qvel = state.physics.bodies.qvel.at[:, first].set(1.0)  # vase 0, the farthest, slides along x
     qvel = qvel.at[:, first + 12].set(5e-5)  # vase 2 does not count as moving
     state = change(state, {"qvel": qvel})
-    after = t.idle(state).physics.physics
-    shift = (after.qpos - state.physics.physics.qpos)[:, t.env.scene.qpos_slice("vases")]
+    after = t.idle(state).physics.bodies
+    shift = (after.qpos - state.physics.bodies.qpos)[:, t.env.scene.qpos_slice("vases")]
     shift = shift.reshape(4, 6, 7)[:, :, 0]
     assert (shift[:, 0] > 5e-3).all()
     np.testing.assert_array_equal(shift[:, 1:4], 0)
@@ -78,18 +78,18 @@ def test_a_vase_whose_speed_is_charged_stays_awake():
     t = task("point_goal1", awake=2, **options)
     state = beside_the_robot(t, 4)
     at = t.env.scene.qvel_slice("vases").start + 12  # vase 2
-    state = change(state, {"qvel": state.physics.physics.qvel.at[:, at].set(5e-5)})
-    after = t.idle(state).physics.physics
+    state = change(state, {"qvel": state.physics.bodies.qvel.at[:, at].set(5e-5)})
+    after = t.idle(state).physics.bodies
     assert (after.qvel[:, at] != 0).all()  # asleep, it would rest
 
 
 def test_of_too_many_moving_vases_the_nearest_stay_awake():
     t = task("point_goal1", awake=2, **(ROBOT_AT_ORIGIN | {"vases_num": 6, "hazards_num": 0}))
     state = beside_the_robot(t, 4)
-    speeds = state.physics.physics.qvel.at[:, t.env.scene.qvel_slice("vases")].set(0.5)
-    physics = jax.tree.map(lambda x: x[0], change(state, {"qvel": speeds}).physics.physics)
+    speeds = state.physics.bodies.qvel.at[:, t.env.scene.qvel_slice("vases")].set(0.5)
+    physics = jax.tree.map(lambda x: x[0], change(state, {"qvel": speeds}).physics.bodies)
     small = envs.SafetyGym(sleeping.small_config(t.env.config, 2), "c").scene
-    chosen = sleeping.nearest(physics, t.env.scene, small, "vases")
+    chosen = sleeping.awake_objects(physics, t.env.scene, small, "vases")
     np.testing.assert_array_equal(chosen, [4, 5])  # 0.25 m and 1.5 m away
 
 
@@ -100,7 +100,7 @@ def test_a_gremlin_alone_goes_where_mujoco_takes_it():
     for _ in range(70):
         a, b = some.idle(a), everyone.idle(b)
     for field, tolerance in (("qpos", 1e-5), ("qvel", 1e-3)):
-        ours, theirs = (getattr(s.physics.physics, field) for s in (a, b))
+        ours, theirs = (getattr(s.physics.bodies, field) for s in (a, b))
         np.testing.assert_allclose(ours, theirs, atol=tolerance)
 
 

@@ -231,7 +231,7 @@ def test_objects_weigh_and_rub_as_in_the_original():
 def test_an_episode_starts_at_rest_at_nominal_heights(robot):
     t = task(f"{robot}_goal1")
     state = t.begin()
-    physics = state.physics.physics
+    physics = state.physics.bodies
     heights = {"point": 0.1, "car": 0.1, "doggo": 0.22}
     position, _ = jax.vmap(t.env.robot_pose)(state.physics)
     np.testing.assert_allclose(position[:, 2], heights[robot], rtol=1e-6)

@@ -31,8 +31,8 @@ def errors(name: str, steps: int = 4, **options) -> dict[str, float]:
         np.testing.assert_array_equal(ours.info["goal_met"], state.info["goal_met"])
         assert not ours.info["overflow"].any()
         for k, a, b in (
-            ("qpos", ours.physics.physics.qpos, state.physics.physics.qpos),
-            ("qvel", ours.physics.physics.qvel, state.physics.physics.qvel),
+            ("qpos", ours.physics.bodies.qpos, state.physics.bodies.qpos),
+            ("qvel", ours.physics.bodies.qvel, state.physics.bodies.qvel),
             ("obs", ours.obs, state.obs),
             ("reward", ours.reward, state.reward),
         ):
@@ -56,7 +56,7 @@ def test_guides_go_round_and_steps_of_different_length_live_side_by_side():
     worst = errors("point_goal0", **options)
     assert worst["qpos"] < 1e-4 and worst["qvel"] < 1e-2
     t = task("point_goal0", engine="warp", **options)
-    assert len(set(t.idle(t.begin()).physics.physics.substeps.tolist())) > 1
+    assert len(set(t.idle(t.begin()).physics.bodies.substeps.tolist())) > 1
 
 
 def test_poses_that_a_task_asks_for_come_along():

@@ -108,7 +108,7 @@ def test_held_keys_take_over_from_the_policy(session):
         for _ in range(5):
             session.step()
         session.held = set()
-        return float(session.state.physics.physics.qvel[2])
+        return float(session.state.physics.bodies.qvel[2])
 
     assert turning(set()) > 0.1 and turning({"ArrowRight"}) < -0.1
     assert turning({"ArrowRight", "ArrowLeft"}) == turning(set())

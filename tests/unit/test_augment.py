@@ -12,8 +12,7 @@ from toys import START, Lever, Ticker, updated
 from jaxsafe.algos import ALGOS
 from jaxsafe.learn import augment
 from jaxsafe.learn.augment import Budget, control_budget, full_budget, init_schedule
-from jaxsafe.learn.normalise import Normaliser, normalise
-from jaxsafe.learn.on_policy import network_inputs
+from jaxsafe.learn.normalise import Normaliser, network_inputs, normalise
 from jaxsafe.learn.rollout import collect, init_rollout, memoryless
 from jaxsafe.run import checkpoint, compat, evaluate
 from jaxsafe.types import Policy
@@ -250,7 +249,7 @@ def test_evaluation_shows_what_is_left_of_the_scheduled_budget():
     def spend(params, carry, obs, key):  # an action of z: a step costs (1 +- z) / 2
         return obs[..., -1:] * jnp.ones(2), (), {}
 
-    algo = ALGOS["ppo_simmer_pid"].make(Lever())._replace(policy=Policy(lambda params: (), spend))
+    algo = ALGOS["ppo_simmer_pid"].make(Lever())._replace(policy=Policy(lambda learned: (), spend))
     cfg = ALGOS["ppo_simmer_pid"].config(**TINY, cost_limit=1e6, budget_init=0.2)
     ts = jax.tree.map(lambda x: x[None], algo.init(jax.random.key(0), cfg, START))
     cost = evaluate.run_episodes(algo, ts, 50, seed=0).cost  # 10 steps of 0.4 or 0.6

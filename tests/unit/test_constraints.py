@@ -78,7 +78,7 @@ def test_a_metric_of_several_constraints_is_one_each():
 
 
 solve = jax.jit(cpo.multipliers_of_several)
-project = jax.jit(lambda problem: pcpo.projection(problem, pcpo.PCPOConfig()).step)
+project = jax.jit(lambda problem: pcpo.projected_step(problem, pcpo.PCPOConfig()).step)
 
 
 def step_of(g, b, hessian, c, delta):

@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 from toys import context
 
 from jaxsafe.algos.cpo import BOUNDED, FREE, RECOVER, RETURN, CPOConfig, Margin, cpo_step, multipliers
-from jaxsafe.learn.on_policy import Batch
+from jaxsafe.learn.estimates import Batch
 from jaxsafe.learn.steps import Pair, mean_kl
 from jaxsafe.learn.surrogates import plain
 from jaxsafe.nn.gaussian import log_prob, sample

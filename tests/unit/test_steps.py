@@ -10,7 +10,7 @@ from compiling import FAST
 from toys import context
 
 from jaxsafe.algos.ppo import PPOConfig
-from jaxsafe.learn.on_policy import Batch
+from jaxsafe.learn.estimates import Batch
 from jaxsafe.learn.steps import Trainable, adam, adam_epochs, fit_critic, one_pass
 from jaxsafe.learn.surrogates import clipped, plain, with_entropy
 from jaxsafe.nn.gaussian import log_prob, sample

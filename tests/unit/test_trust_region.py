@@ -10,7 +10,7 @@ from toys import context
 
 from jaxsafe.algos.cpo import CPOConfig
 from jaxsafe.algos.trpo import TRPOConfig
-from jaxsafe.learn.on_policy import Batch
+from jaxsafe.learn.estimates import Batch
 from jaxsafe.learn.surrogates import plain
 from jaxsafe.learn.trust_region import (
     conjugate_gradient,
