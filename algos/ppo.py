@@ -64,7 +64,7 @@ class PPOLagConfig(LagrangianConfig, PPOConfig):
     Learning"; the 1 / (1 + lam) scale is from the authors' code.
     Differs from it: in the authors' code only the reward term is clipped, and Adam moves a softplus of
     lam. Here, as in OmniSafe, both terms are clipped, and Adam moves lam. J_c is of this batch
-    (`returns.mean_length`), where OmniSafe has the last 100 episodes.
+    (`returns.expected_length`), where OmniSafe has the last 100 episodes.
     """
 
 

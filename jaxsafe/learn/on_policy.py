@@ -52,7 +52,16 @@ from jaxsafe.learn.constraints import (
 from jaxsafe.learn.conventions import Convention
 from jaxsafe.learn.metrics import episode_metrics, explained_variance, world_metrics
 from jaxsafe.learn.normalise import init_normaliser, merge, network_inputs, normalise
-from jaxsafe.learn.returns import Estimator, Window, advantages, empty_window, mean_length, window_mean
+from jaxsafe.learn.returns import (
+    Estimator,
+    LostTime,
+    Window,
+    advantages,
+    empty_window,
+    expected_length,
+    no_lost_time,
+    window_mean,
+)
 from jaxsafe.learn.rollout import Bad, RolloutState, Trajectory, check_steps, collect, init_rollout
 from jaxsafe.learn.steps import Context, Pair, PolicyStep, Trainable, adam, fit_critic, stops_critics
 from jaxsafe.learn.surrogates import Surrogate, with_entropy
@@ -166,7 +175,7 @@ class TrainState:
     normaliser: Normaliser, or () without `obs_normalize`.
     signals: Normaliser of [reward, costs ...], or () without `reward_normalize` and `cost_normalize`.
     rollout: this device's environments.
-    episode_length: float [], running mean length of an episode, in steps.
+    lost_time: LostTime, from which the mean length of an episode follows.
     past_costs: Window of J_c of the last `cost_window` iterations, [W] or [W, K].
     """
 
@@ -177,7 +186,7 @@ class TrainState:
     normaliser: PyTree
     signals: PyTree
     rollout: RolloutState
-    episode_length: jax.Array
+    lost_time: LostTime
     past_costs: Window
     key: jax.Array
 
@@ -335,7 +344,7 @@ def on_policy_loop(env: Env, method: Method, axis_name: str | None) -> Algorithm
             normaliser=init_normaliser(env.obs_size) if cfg.obs_normalize else (),
             signals=init_signals(cfg, len(names) or 1),
             rollout=dataclasses.replace(rollout, carry=carry),
-            episode_length=jnp.float32(env.episode_length),
+            lost_time=no_lost_time(),
             past_costs=empty_window(cfg.cost_window, jnp.shape(limit(cfg, names))),
             key=key,
         )
@@ -372,7 +381,9 @@ def on_policy_loop(env: Env, method: Method, axis_name: str | None) -> Algorithm
         signals = scaled_signals(ts, augmentation.reward(traj, cfg), charged, axis_name, share)
         augmented = dataclasses.replace(traj, next_obs=augmentation.last_obs(traj, cfg))
         batch, explained = estimate(ts, augmented, signals, names, axis_name)
-        length = mean_length(ts.episode_length, traj.ended, traj.length, axis_name)
+        length, lost_time = expected_length(
+            ts.lost_time, env.episode_length, traj.terminated, traj.length, axis_name
+        )
         cost_rate = batch_mean(traj.cost, axis_name) * share
         episode_cost = batch_mean(charged, axis_name, (0, 1)) * share * length
         recent, past_costs = window_mean(ts.past_costs, episode_cost)
@@ -393,10 +404,10 @@ def on_policy_loop(env: Env, method: Method, axis_name: str | None) -> Algorithm
         finite = (
             psum(~all_finite((batch, normaliser, signals.normaliser, episode_cost)), axis_name) == 0
         )
-        dual, normaliser, signal_stats, length, past_costs = select(
+        dual, normaliser, signal_stats, lost_time, past_costs = select(
             finite,
-            (dual, normaliser, signals.normaliser, length, past_costs),
-            (ts.dual, ts.normaliser, ts.signals, ts.episode_length, ts.past_costs),
+            (dual, normaliser, signals.normaliser, lost_time, past_costs),
+            (ts.dual, ts.normaliser, ts.signals, ts.lost_time, ts.past_costs),
         )
         # of several constraints, J_c of each; that of the total cost is among the next metrics
         metrics |= explained | ({"train/cost_estimate": episode_cost} if names else {})
@@ -417,7 +428,7 @@ def on_policy_loop(env: Env, method: Method, axis_name: str | None) -> Algorithm
             normaliser=normaliser,
             signals=signal_stats,
             rollout=rollout,
-            episode_length=length,
+            lost_time=lost_time,
             past_costs=past_costs,
             key=key,
         )

@@ -234,7 +234,9 @@ def test_in_a_forked_process_there_is_one_line(monkeypatch):
 
 def test_processes_that_are_spawned_step_side_by_side():
     """One worker is enough: it is a new Python, which imports JAX."""
-    several = AsyncVectorEnv([functools.partial(GymEnv, Ticker())], context="spawn", shared_memory=False)
+    several = AsyncVectorEnv(
+        [functools.partial(GymEnv, Ticker())], context="spawn", shared_memory=False
+    )
     try:
         obs, _ = several.reset(seed=0)
         obs, rewards, *_ = several.step(np.zeros((1, 1)))
