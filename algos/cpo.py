@@ -28,38 +28,40 @@ class CPOConfig(LimitsConfig, trpo.TRPOConfig):
 
         maximise_x  g'x   subject to   b'x + c <= 0,   x'Hx / 2 <= delta
 
-    g, b: gradients of E[w A_r] and E[w A_c]; H: the Fisher matrix; c: the violation, see below. With
-    q = g'H^-1 g, r = g'H^-1 b, s = b'H^-1 b the solution is x = (H^-1 g - nu H^-1 b) / lam. Where no x
-    satisfies both constraints, the step only lowers cost: x = -nu H^-1 b.
+    x is the change of the policy's parameters in an iteration. g and b are the gradients of E[w A_r]
+    and E[w A_c], H is the Fisher matrix, and c is the violation of the limit, per step (see below).
+    With q = g'H^-1 g, r = g'H^-1 b and s = b'H^-1 b, the solution is x = (H^-1 g - nu H^-1 b) / lam.
+    lam and nu are the multipliers of the trust region and of the cost. Where no x satisfies both
+    constraints, the step only lowers cost: x = -nu H^-1 b.
 
     Source: Achiam et al. (2017), "Constrained Policy Optimization", arXiv:1705.10528, section 6 and
-    theorem 2 (which minimises: its g is -g here).
-    Differs from it: c is made of v, the violation per step, instead of the discounted J_c. The line
-    search compares the surrogates' values and does not ask for a decreasing expected cost. Both are as
-    in safety-starter-agents. The Fisher product is damped.
+    theorem 2, which minimises, so that its g is our -g.
+    Differs from it: c is made of v, the undiscounted violation per step. The paper's is discounted. The
+    line search accepts a step whose surrogates are good enough and does not ask that the expected cost
+    falls. Both are as in safety-starter-agents. The Fisher matrix is damped.
 
         c = violation_gain v + margin,   v = (J_c - cost_limit) / mean episode length
         margin <- clip(margin + margin_lr v, 0, margin_max sqrt(2 delta s))
 
-    A step lowers the cost by less than b'x promises. There are thousands of parameters, so most of the
-    step fits the noise of its batch: that lowers the surrogate and not the cost. On Goal and Button
-    about 1% of the promised decrease is realised. With c = v the cost therefore stays well above the
-    limit, as in Ray, Achiam and Amodei (2019).
+    Why a gain and a margin: a step lowers the cost by less than b'x promises. There are thousands of
+    parameters, so most of the step fits the noise of its batch. That lowers the surrogate, but not the
+    cost. On Goal and Button about 1% of the promised decrease is realised. With c = v the cost
+    therefore stays well above the limit, as it does in Ray, Achiam and Amodei (2019).
 
-    The margin asks for more until the limit holds. It is from the code of that paper, where it is off
-    and has no bound. With the margin alone the cost swings about the limit: if a share eta of each
-    decrease is realised, cost and margin move like a pendulum. violation_gain damps it; its damping
-    ratio is violation_gain sqrt(eta / margin_lr) / 2. The bound is there because a step can promise at
-    most sqrt(2 delta s). A margin far beyond that does nothing more while the cost is high, and takes
-    long to fall when the cost is low.
+    The margin grows while the limit is broken, and so asks for more and more. It is from the code of
+    that paper, where it is off and has no bound. With the margin alone the cost swings about the limit
+    like a pendulum. violation_gain damps the swing. If a share eta of each promised decrease is
+    realised, the damping ratio is violation_gain sqrt(eta / margin_lr) / 2. The margin has a bound
+    because a step can promise at most sqrt(2 delta s). A margin far beyond that would do nothing more
+    while the cost is high, and would take long to fall when the cost is low.
 
     With several constraints (`cost_limits`) each has a b, a c and a margin. The step satisfies all of
     them. If no step does, it goes towards the nearest x that would.
 
-    OmniSafe's c = v is per episode (`per_step=False`), about a thousand times as large as b'x can be.
-    Then a step maximises reward while the cost is under the limit, and lowers cost while it is over. In
-    between OmniSafe has two mistakes, a sign in the dual and a clamp. They are not reproduced, because
-    they matter in fewer than 1% of iterations.
+    In OmniSafe c = v is per episode (`per_step=False`), about a thousand times as large as b'x can be.
+    So its steps only maximise reward while the cost is under the limit, and only lower cost while it is
+    over. Its code for the cases between has two mistakes, a sign in the dual and a clamp. They matter
+    in fewer than 1% of iterations and are not reproduced.
     """
 
     CONVENTIONS: ClassVar = (

@@ -25,15 +25,24 @@ class CUPConfig(LagrangianConfig, ppo.PPOConfig):
 
         1. theta_1: maximise  E[min(w A_r, clip(w) A_r)]
         2. theta:   minimise  E[lam (1 - gamma gae_lambda) / (1 - gamma) w A_c + KL(pi || pi_1)]
-        minimise_lam  -lam (J_c - cost_limit),  0 <= lam <= lam_max,  by Adam, once before both
+        minimise_lam  -lam (J_c - cost_limit),  0 <= lam <= lam_max,  by Adam
 
-    w = pi(a | s) / pi_old(a | s) with the policy that collected the batch, in both steps; gamma and
-    gae_lambda are `cost_discount` and `cost_gae_lambda`.
+    An iteration first moves the price lam. Then step 1 improves reward and gives the policy pi_1, and
+    step 2 takes back cost without going far from pi_1. w = pi(a | s) / pi_old(a | s) is with the policy
+    that collected the batch in both steps. gamma and gae_lambda are `cost_discount` and
+    `cost_gae_lambda`.
 
     Source: Yang et al. (2022), "Constrained Update Projection Approach to Safe Policy Optimization",
     arXiv:2209.07089, algorithm 1 and equation 22.
     Differs from it, as OmniSafe does: Adam moves lam, A_c is centred, and each step stops at target_kl.
     On a shared trunk both steps train the values, too.
+
+    The cost may end below the limit, with lam = 0, and so may that of every method with a price. This
+    was measured on a task of two observations whose best policy mixes two actions at one of them. The
+    best policy that does not mix costs 0.80 of the limit. CUP ended there with 5 of 8 seeds,
+    PPO-Lagrangian with 6, and both with all 8 at a tenfold `lr`. A price that is too high for a while
+    removes the second action. Then the price falls to 0, but the policy no longer tries that action.
+    CPO ended within 1% of the limit with all 8 seeds.
     """
 
     POLICY_STEPS: ClassVar = 2

@@ -18,14 +18,15 @@ class FOCOPSConfig(LagrangianConfig, pg.PGConfig):
     """FOCOPS: first-order constrained optimisation in policy space.
 
         maximise_theta  E[1{KL <= eta} (w A / temperature - KL)],  A = (A_r - lam A_c) / (1 + lam)
-        minimise_lam    -lam (J_c - cost_limit),  0 <= lam <= lam_max,  by Adam, once before each step
+        minimise_lam    -lam (J_c - cost_limit),  0 <= lam <= lam_max,  by Adam
 
-    KL: KL(new || old) of each state; w = pi(a | s) / pi_old(a | s).
+    An iteration first moves the price lam, and then the policy. KL is KL(new || old) of each state, and
+    eta is `near_kl`. States whose KL is already above eta do not move the policy any further.
 
     Source: Zhang, Vuong and Ross (2020), "First Order Constrained Optimization in Policy Space",
     arXiv:2002.06506, equation 11 and algorithm 1.
     Differs from it: Adam moves lam, and the advantage is scaled by 1 / (1 + lam), as in OmniSafe. The
-    indicator is per state as in the paper. OmniSafe's multiplies the mean of the minibatch
+    indicator 1{} is per state, as in the paper. OmniSafe multiplies the mean of the minibatch by it
     (`per_state=False`).
     """
 

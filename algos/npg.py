@@ -21,7 +21,7 @@ class NPGConfig(NaturalConfig, OnPolicyConfig):
     g: gradient of E[w A]; H: the Fisher matrix.
 
     Source: Kakade (2001), "A Natural Policy Gradient".
-    Differs from it: delta, the KL of the step, sets its length, as in OmniSafe.
+    Differs from it: the step is as long as makes its KL delta, as in OmniSafe.
     """
 
 
@@ -31,12 +31,14 @@ class RCPOConfig(LagrangianConfig, NPGConfig):
 
         theta <- theta + sqrt(2 delta / g'H^-1 g) H^-1 g
         g = gradient of E[w (A_r - lam A_c)] / (1 + lam)
-        minimise_lam    -lam (J_c - cost_limit),  lam >= 0,  by Adam, once before each step
+        minimise_lam    -lam (J_c - cost_limit),  lam >= 0,  by Adam
+
+    An iteration first moves the price lam, and then the policy. delta, g and H are as in NPG.
 
     Source: Tessler, Mankowitz and Mannor (2019), "Reward Constrained Policy Optimization",
     arXiv:1805.11074.
-    Differs from it, as OmniSafe does: advantages are mixed, where the paper takes lam c from the reward
-    and trains one critic for both. Gradients are natural, where the paper has plain ones.
+    Differs from it, as OmniSafe does: the advantages of reward and cost are mixed. The paper subtracts
+    lam c from the reward and trains one critic for both. Gradients are natural, and plain in the paper.
     """
 
 

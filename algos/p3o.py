@@ -27,11 +27,11 @@ class P3OConfig(ppo.PPOConfig):
 
     Source: Zhang et al. (2022), "Penalized Proximal Policy Optimization for Safe Reinforcement
     Learning", arXiv:2205.11814, equation 13.
-    Differs from it: the paper's c is (1 - gamma) times the discounted violation, which is another mean
-    per step. The mean of A_c over a minibatch is subtracted from its surrogate. That mean is noise,
-    which max would rectify, so that costs would end well below the limit. OmniSafe does not subtract it
-    (`centre_cost=False`), takes c per episode (`per_step=False`) and does not clip the cost's surrogate
-    (`clip_cost=False`).
+    Differs from it: the paper's c is the discounted violation, times (1 - gamma). Both are violations
+    per step, but weigh the steps differently. Here each minibatch subtracts its mean of A_c from the
+    cost's surrogate. That mean is noise around 0. The max would keep its positive part, and costs would
+    end well below the limit. OmniSafe does not subtract it (`centre_cost=False`), takes c per episode
+    (`per_step=False`) and does not clip the cost's surrogate (`clip_cost=False`).
     """
 
     CONVENTIONS: ClassVar = (

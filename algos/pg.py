@@ -30,13 +30,15 @@ class PDOConfig(LagrangianConfig, PGConfig):
     """PDO: primal-dual policy gradient, whose advantage pays for cost at an adaptive price.
 
         maximise_theta  E[w A],  A = (A_r - lam A_c) / (1 + lam)
-        minimise_lam    -lam (J_c - cost_limit),  lam >= 0,  by Adam, once before each step
+        minimise_lam    -lam (J_c - cost_limit),  lam >= 0,  by Adam
+
+    An iteration first moves the price lam, and then the policy.
 
     Source: Chow et al. (2018), "Risk-Constrained Reinforcement Learning with Percentile Risk Criteria",
     arXiv:1512.01629.
-    Differs from it, as OmniSafe does: the constraint is on the expected cost, where the paper has one
-    on the CVaR or on a probability. OmniSafe also normalises rewards and costs. Here only the published
-    settings do.
+    Differs from it, as OmniSafe does: the constraint is on the expected cost. The paper's is on the
+    CVaR or on a probability. OmniSafe also normalises rewards and costs. Here `preset=published` does
+    so.
     """
 
 

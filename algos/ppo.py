@@ -44,9 +44,9 @@ class PPOConfig(pg.PGConfig):
         maximise_theta  E[min(w A, clip(w, 1 - eps, 1 + eps) A)],  w = pi(a | s) / pi_old(a | s)
 
     Source: Schulman et al. (2017), "Proximal Policy Optimization Algorithms", arXiv:1707.06347.
-    Differs from it: passes stop once KL(old || new) > target_kl, as in safety-starter-agents and
-    OmniSafe. The value function is a network of its own, unless `trunk` is shared. A cost critic is
-    trained for its metrics alone.
+    Differs from it: the passes over a batch stop once KL(old || new) > target_kl, as in
+    safety-starter-agents and OmniSafe. The value function is a network of its own, unless `trunk` is
+    shared. A cost critic is trained, too, but only its metrics are used.
     """
 
     # eps: ratios count as if they were at most this far from 1, as in the paper.
@@ -58,13 +58,16 @@ class PPOLagConfig(LagrangianConfig, PPOConfig):
     """PPO-Lagrangian: PPO whose advantage pays for cost at an adaptive price.
 
         maximise_theta  E[min(w A, clip(w, 1 - eps, 1 + eps) A)],  A = (A_r - lam A_c) / (1 + lam)
-        minimise_lam    -lam (J_c - cost_limit),  lam >= 0,  by Adam, once before each step
+        minimise_lam    -lam (J_c - cost_limit),  lam >= 0,  by Adam
+
+    An iteration first moves the price lam by one step of Adam, and then the policy. The price rises
+    while an episode costs more than cost_limit, and falls while it costs less.
 
     Source: Ray, Achiam and Amodei (2019), "Benchmarking Safe Exploration in Deep Reinforcement
     Learning"; the 1 / (1 + lam) scale is from the authors' code.
     Differs from it: in the authors' code only the reward term is clipped, and Adam moves a softplus of
-    lam. Here, as in OmniSafe, both terms are clipped, and Adam moves lam. J_c is of this batch
-    (`returns.mean_length`), where OmniSafe has the last 100 episodes.
+    lam. Here, as in OmniSafe, both terms are clipped, and Adam moves lam itself. J_c is estimated from
+    the last batch. OmniSafe takes the mean of the last 100 episodes.
     """
 
 
@@ -86,8 +89,8 @@ class CPPOPIDConfig(PIDConfig, PPOConfig):
         maximise_theta  E[min(w A, clip(w, 1 - eps, 1 + eps) A)],  A = (A_r - lam A_c) / (1 + lam)
         lam <- (K_p P + I + K_d D)+,   I <- (I + K_i (J_c - cost_limit))+
 
-    P is the smoothed J_c - cost_limit. D is what the smoothed J_c rose over `pid_delay` iterations, and
-    0 if it fell.
+    P is the smoothed violation J_c - cost_limit. D is how much the smoothed J_c rose in the last
+    `pid_delay` iterations, or 0 if it fell. K_p, K_i and K_d are `pid_kp`, `pid_ki` and `pid_kd`.
 
     Source: Stooke, Achiam and Abbeel (2020), "Responsive Safety in Reinforcement Learning by PID
     Lagrangian Methods", arXiv:2007.03964, algorithm 2.
@@ -103,8 +106,9 @@ class IPOConfig(BarrierConfig, PPOConfig):
 
     Source: Liu, Ding and Liu (2020), "IPO: Interior-point Policy Optimization under Constraints",
     arXiv:1910.09615.
-    Differs from it, as OmniSafe does: the barrier enters by its gradient at the present policy.
-    OmniSafe also normalises rewards and costs. Here only the published settings do.
+    Differs from it, as OmniSafe does: the paper maximises the barrier itself, here its slope at the
+    present policy is the price p. OmniSafe also normalises rewards and costs. Here
+    `preset=published` does so.
     """
 
 
@@ -115,14 +119,18 @@ class PPOSauteConfig(SauteConfig, PPOConfig):
         z_0 = 1,   z_{t+1} = (z_t - c_t / B) / gamma_n,   B = cost_limit mean_{t<T} gamma_n^t
         maximise_theta  E[min(w A, clip(w, 1 - eps, 1 + eps) A)],  A of r_t if z_{t+1} > 0, else n
 
-    The policy takes z beside the observation. The limit is to hold in every episode, not on average.
+    z is the share of the cost budget B that the episode has left, and part of what the policy observes.
+    While z is positive a step earns its reward. After that it earns n (`unsafe_reward`) instead. So the
+    policy learns to keep every episode within the limit, not only the average one. T is the number of
+    steps of an episode. gamma_n (`saute_discount`) makes costs at the start of an episode count a
+    little more.
 
     Source: Sootla et al. (2022), "Saute RL: Almost Surely Safe Reinforcement Learning Using State
     Augmentation", arXiv:2202.06558; B, which turns a sum into a discounted one, is from the authors'
     code.
-    Differs from it: a step that ends at z = 0 exactly is unsafe, as in the authors' code and in
-    OmniSafe. z is not normalised. The value at a time limit is of the z that the episode ended with;
-    OmniSafe's is of z = 1 (`full_at_end`). A cost critic is trained for its metrics alone.
+    Differs from it: a step that ends at exactly z = 0 earns n, as in the authors' code and in OmniSafe.
+    z is not normalised. At a time limit the critic is asked for the value of the last z. OmniSafe asks
+    for that of z = 1 (`full_at_end`). A cost critic is trained, too, but only its metrics are used.
     """
 
 
@@ -134,15 +142,17 @@ class PPOSimmerPIDConfig(SimmerConfig, PPOConfig):
         B = clip(d + u, 0, cost_limit),   u = clip(K_p e + K_i sum e + K_aw (u' - u'_raw), -U, U)
         e = s e' + (1 - s) (d - J_c),   once an iteration; ' is the iteration before
 
-    d rises on a line to cost_limit: the task starts safer than it has to be, and simmers up. u' is what
-    the clips left of u'_raw, both the clip at U and the clip of B. So the sum does not wind up.
+    d is the scheduled budget. It rises on a line to cost_limit, so training starts safer than it has to
+    be. The controller's u corrects d by what episodes really cost. u is at most U (`budget_reach`). u'
+    is what both clips left of u'_raw. The term with K_aw takes back what they cut off, so that the sum
+    of errors does not grow without bound.
 
     Source: Sootla et al. (2022), "Effects of Safety State Augmentation on Safe Exploration",
     arXiv:2206.02675, PI Simmer; the filter, the sum over the last `simmer_window` errors and both clips
     are from the authors' code.
-    Differs from it: d is a line, where the paper has a staircase. OmniSafe has B' for d, so that u adds
-    up (`simmer_adds`), and calls K_aw the gain of a derivative. There, all episodes of an epoch but the
-    first start at z = 1, the whole share of B (`simmer_full`).
+    Differs from it: d is a line, where the paper has a staircase. OmniSafe adds u to the last budget B'
+    instead of d (`simmer_adds`), and calls K_aw the gain of a derivative. In OmniSafe all episodes of
+    an epoch but the first start at z = 1 (`simmer_full`).
     """
 
 
@@ -153,14 +163,15 @@ class PPOEarlyTerminatedConfig(EarlyConfig, PPOConfig):
         maximise_theta  E[min(w A, clip(w, 1 - eps, 1 + eps) A)]
         terminated_t  where  sum_{s<=t} c_s > cost_limit;  there r_t = r_e, and the value after it is 0
 
-    The policy loses the reward that was to come, so the limit is to hold in every episode. Only
-    training ends episodes: evaluation runs whole ones, whose cost says what the limit was worth.
+    An episode that breaks the limit loses all reward that was to come. So the policy learns to keep
+    every episode within the limit. Only training ends episodes early. Evaluation runs whole episodes
+    and so shows what they would cost. r_e is `termination_reward`.
 
     Source: Sun et al. (2021), "Safe Exploration by Solving Early Terminated MDP", arXiv:2107.04200.
     Differs from it: PPO sees the observation alone, as in OmniSafe. The paper's policies are off-policy
-    ones that remember the episode. Each environment counts the cost of its own episode; OmniSafe's
-    count goes on after an episode that time ends (`keep_cost`). A cost critic is trained for its
-    metrics alone.
+    ones that remember the episode. Each episode counts its own cost. OmniSafe's count goes on into
+    the next episode after a time limit (`keep_cost`). A cost critic is trained, too, but only its
+    metrics are used.
     """
 
 

@@ -50,7 +50,9 @@ class TRPOLagConfig(LagrangianConfig, TRPOConfig):
     """TRPO-Lagrangian: TRPO whose advantage pays for cost at an adaptive price.
 
         maximise_theta  E[w A]   subject to   KL(old || new) <= delta,   A = (A_r - lam A_c) / (1 + lam)
-        minimise_lam    -lam (J_c - cost_limit),  lam >= 0,  by Adam, once before each step
+        minimise_lam    -lam (J_c - cost_limit),  lam >= 0,  by Adam
+
+    An iteration first moves the price lam, and then the policy.
 
     Source: Ray, Achiam and Amodei (2019), "Benchmarking Safe Exploration in Deep Reinforcement
     Learning".
@@ -79,7 +81,7 @@ class CRPOConfig(SwitchConfig, TRPOConfig):
 
     Source: Xu, Liang and Lan (2021), "CRPO: A New Approach for Safe Reinforcement Learning with
     Convergence Guarantee", arXiv:2011.05869, algorithm 1.
-    Differs from it: its steps are natural gradients, these are TRPO's, as in OmniSafe's OnCRPO.
+    Differs from it: the steps are TRPO's, as in OmniSafe's OnCRPO. The paper's are natural gradients.
     """
 
 

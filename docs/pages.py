@@ -52,7 +52,7 @@ ALGORITHMS = """# Algorithms
 Each page has the equations, the sources, every setting with its origin, the departures from the paper,
 and what it made in our runs. Which one to take: [choosing](../choosing.md#an-algorithm).
 
-How families work, with the code's letters: [prices](../theory/prices.md),
+How families work, step by step: [prices](../theory/prices.md),
 [trust regions](../theory/trust_region.md), [penalties](../theory/penalties.md),
 [budgets in the state](../theory/budgets.md).
 
@@ -69,6 +69,30 @@ The on-policy algorithms share these options:
 
 With `shared` and `gru` policy and critics have one loss. Both are for the algorithms whose steps are
 Adam's, such as `ppo_lag` and `focops`. They go best with `reward_normalize` and `cost_normalize`.
+
+## Letters
+
+All pages use the same letters, and the code has the same names. An iteration collects a batch with the
+policy pi_old and then improves it.
+
+| letter | what it is | setting or metric |
+|---|---|---|
+| s, a, r, c | observation, action, reward and cost of a step | |
+| pi, theta | the policy, and its parameters | |
+| w | pi(a \\| s) / pi_old(a \\| s), the ratio of the probabilities of an action | |
+| A_r | advantage of reward, scaled to a standard deviation of 1 in a batch | `algo.gae_lambda` |
+| A_c | advantage of cost, in units of cost, with a mean of 0 in a batch | `algo.cost_gae_lambda` |
+| A | the advantage that the policy's step maximises | |
+| E | mean over the batch | |
+| J_c | undiscounted cost of an episode, as this batch estimates it | `train/cost_estimate` |
+| lam | price on cost: how many standard deviations of A_r one unit of A_c is worth | `train/lam` |
+| KL(old \\|\\| new) | divergence of the new policy from pi_old, in nats | `train/kl` |
+| delta | the largest KL of a step | `algo.target_kl` |
+| eps | how far w may move from 1 before it is clipped | `algo.clip` |
+| gamma | discounts of reward and of cost | `algo.discount`, `algo.cost_discount` |
+| (x)+ | max(0, x) | |
+
+## All algorithms
 
 | | |
 |---|---|
@@ -231,7 +255,8 @@ def page(name: str) -> str:
 
 {text}
 
-The code: [algos/{module}.py](../../algos/{module}.py).{derivation(name)}
+The letters: [what they mean on all pages](README.md#letters). The code:
+[algos/{module}.py](../../algos/{module}.py).{derivation(name)}
 
 ## Settings
 

@@ -53,7 +53,15 @@ from jaxsafe.learn.estimates import (
 )
 from jaxsafe.learn.metrics import episode_metrics, world_metrics
 from jaxsafe.learn.normalise import init_normaliser, merge, network_inputs
-from jaxsafe.learn.returns import Estimator, Window, empty_window, mean_length, window_mean
+from jaxsafe.learn.returns import (
+    Estimator,
+    LostTime,
+    Window,
+    empty_window,
+    expected_length,
+    no_lost_time,
+    window_mean,
+)
 from jaxsafe.learn.rollout import RolloutState, Trajectory, check_steps, collect, init_rollout
 from jaxsafe.learn.steps import Context, Pair, PolicyStep, Trainable, adam, fit_critic, stops_critics
 from jaxsafe.learn.surrogates import Surrogate, with_entropy
@@ -167,7 +175,7 @@ class TrainState:
     signal_normaliser: Normaliser of [reward, costs ...], or () without `reward_normalize` and
         `cost_normalize`.
     rollout: this device's environments.
-    episode_length: float [], running mean length of an episode, in steps.
+    lost_time: LostTime, from which the mean length of an episode follows.
     past_costs: Window of J_c of the last `cost_window` iterations, [W] or [W, K].
     """
 
@@ -178,7 +186,7 @@ class TrainState:
     normaliser: PyTree
     signal_normaliser: PyTree
     rollout: RolloutState
-    episode_length: jax.Array
+    lost_time: LostTime
     past_costs: Window
     key: jax.Array
 
@@ -315,7 +323,7 @@ def on_policy_loop(env: Env, method: Method, axis_name: str | None) -> Algorithm
             normaliser=init_normaliser(env.obs_size) if cfg.obs_normalize else (),
             signal_normaliser=init_signal_normaliser(cfg, len(names) or 1),
             rollout=dataclasses.replace(rollout, carry=carry),
-            episode_length=jnp.float32(env.episode_length),
+            lost_time=no_lost_time(),
             past_costs=empty_window(cfg.cost_window, jnp.shape(limit(cfg, names))),
             key=key,
         )
@@ -356,12 +364,13 @@ def on_policy_loop(env: Env, method: Method, axis_name: str | None) -> Algorithm
         augmented = dataclasses.replace(traj, next_obs=augmentation.last_obs(traj, cfg))
         seen = Experience(augmented, signals, ts.rollout.carry)
         batch, explained = estimate_batch(learned_of(ts), seen, names, axis_name)
-        cost = episode_cost(ts, traj, charged, weight, axis_name)
+        length, lost_time = expected_length(
+            ts.lost_time, env.episode_length, traj.terminated, traj.length, axis_name
+        )
+        cost = episode_cost(ts.past_costs, charged, weight, length, axis_name)
 
         violation = cost.recent - limit(cfg, names)
-        context = Context(
-            shared.iteration, cfg, step_key, axis_name, cost.recent, violation, cost.length
-        )
+        context = Context(shared.iteration, cfg, step_key, axis_name, cost.recent, violation, length)
         improved = method.improve(ts, batch, context)
         fitted = FittedCritics({}, (), 0, {})
         if cfg.trunk == "separate":
@@ -377,7 +386,7 @@ def on_policy_loop(env: Env, method: Method, axis_name: str | None) -> Algorithm
             normaliser=normaliser,
             signal_normaliser=signals.normaliser,
             rollout=rollout,
-            episode_length=cost.length,
+            lost_time=lost_time,
             past_costs=cost.past,
             key=key,
         )
@@ -387,7 +396,7 @@ def on_policy_loop(env: Env, method: Method, axis_name: str | None) -> Algorithm
         metrics = metrics_by_constraint(improved.metrics | fitted.metrics | explained, names)
         metrics["train/nonfinite"] += fitted.skipped + ~finite
         metrics |= {f"train/cost_estimate_{name}": cost.of_iteration[k] for k, name in enumerate(names)}
-        metrics |= rollout_metrics(env, traj, weight, after.episode_length, axis_name)
+        metrics |= rollout_metrics(env, traj, weight, length, axis_name)
         dist = policy(improved.actor, batch.obs, cfg)
         metrics["train/entropy"] = batch_mean(entropy(dist), axis_name)
         return after, jax.tree.map(jnp.float32, metrics)
@@ -441,36 +450,30 @@ def initial_carry(learned: Learned) -> PyTree:
 class EpisodeCost(NamedTuple):
     """J_c, the undiscounted cost of an episode: [] or, of several constraints, [K].
 
-    of_iteration: this iteration's estimate, the mean cost of a step times `length`.
+    of_iteration: this iteration's estimate, the mean cost of a step times the mean length.
     recent: the mean of the estimates in `past`, which is what the method gets.
     past: Window of the last `cost_window` estimates, this one included.
-    length: float [], running mean length of an episode, in steps.
     """
 
     of_iteration: jax.Array
     recent: jax.Array
     past: Window
-    length: jax.Array
 
 
 def episode_cost(
-    ts: TrainState,
-    traj: Trajectory,
-    charged: jax.Array,
-    weight: jax.Array,
-    axis_name: str | None,
+    past: Window, charged: jax.Array, weight: jax.Array, length: jax.Array, axis_name: str | None
 ) -> EpisodeCost:
     """J_c after a rollout.
 
     Args:
-        ts: the train state before it.
+        past: of the iterations before it.
         charged: float [T, N] or [T, N, K], what is held under the limit, 0 in bad steps.
         weight: float [], of a good step.
+        length: float [], mean length of an episode, in steps.
     """
-    length = mean_length(ts.episode_length, traj.ended, traj.length, axis_name)
     of_iteration = batch_mean(charged, axis_name, (0, 1)) * weight * length
-    recent, past = window_mean(ts.past_costs, of_iteration)
-    return EpisodeCost(of_iteration, recent, past, length)
+    recent, past = window_mean(past, of_iteration)
+    return EpisodeCost(of_iteration, recent, past)
 
 
 def guarded(
@@ -479,7 +482,7 @@ def guarded(
     """`after`, with the statistics and the dual of `before` unless all of `computed` is finite on every
     device; and whether it is, bool []. Parameters are guarded step by step, where they are moved."""
     finite = psum(~all_finite(computed), axis_name) == 0
-    names = ("dual", "normaliser", "signal_normaliser", "episode_length", "past_costs")
+    names = ("dual", "normaliser", "signal_normaliser", "lost_time", "past_costs")
     kept = {name: select(finite, getattr(after, name), getattr(before, name)) for name in names}
     return dataclasses.replace(after, **kept), finite
 

@@ -183,3 +183,53 @@ def mean_length(
         (jnp.where(ended, lengths - length, 0.0).sum(), ended.sum(), ended.shape[1]), axis_name
     )
     return length + excess / (count + memory)
+
+
+class LostTime(NamedTuple):
+    """Sums over the recent past, float [] each: steps that failures took from their episodes, which
+    would have lasted to the time limit, and steps taken."""
+
+    lost: jax.Array
+    taken: jax.Array
+
+
+def no_lost_time() -> LostTime:
+    return LostTime(jnp.zeros(()), jnp.zeros(()))
+
+
+def expected_length(
+    past: LostTime,
+    limit: int,
+    terminated: jax.Array,
+    lengths: jax.Array,
+    axis_name: str | None = None,
+) -> tuple[jax.Array, LostTime]:
+    """The mean length L of an episode in steps, float [], by which a cost per step is multiplied.
+
+    By the renewal-reward theorem the mean cost of an episode is the mean cost per step times L. The
+    batch gives the first factor without lag, whether or not an episode ended in it. The same theorem
+    gives L: an episode that fails at step n loses T - n of the time limit T, so the time lost per step
+    is x = (T - L) / L, and
+
+        L = T / (1 + x),   x = lost / taken, over about the last N complete episodes.
+
+    - L is exactly T while nothing fails. Over synchronous whole episodes J_c is then their plain mean
+      cost, Safety Gym's; over parts of staggered episodes it is unbiased.
+    - The first batch counts in full. If failures are equally likely at every step, the first L is
+      within a quarter of the true one, or up to half above it where `stagger` pretends to ages. A mean
+      over the episodes that have ended would start with short ones alone.
+    - Until the first episodes are T steps old, L is too low where only young episodes fail, and too
+      high where only old ones do.
+
+    Args:
+        past: what the last call returned, at first `no_lost_time()`.
+        limit: T, `env.episode_length`.
+        terminated: bool [T, N], where episodes failed.
+        lengths: int [T, N], the steps of the episodes so far.
+    """
+    lost = jnp.where(terminated, limit - lengths, 0).sum(dtype=jnp.float32)
+    lost, taken, num_envs = psum((lost, jnp.float32(terminated.size), terminated.shape[1]), axis_name)
+    lost, taken = past.lost + lost, past.taken + taken
+    length = limit / (1 + lost / taken)
+    keep = jnp.minimum(1.0, num_envs * length / taken)
+    return length, LostTime(keep * lost, keep * taken)

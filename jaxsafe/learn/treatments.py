@@ -102,7 +102,9 @@ class PIDConfig(LimitsConfig):
 class PID(NamedTuple):
     """What the controller remembers: lam and integral are prices, the others costs per episode.
 
-    Of several constraints all have a last axis K.
+    Of several constraints all have a last axis K. `error`, `cost` and `past` start at 0, as in the code
+    of Stooke et al. and in OmniSafe: the first `pid_delay` iterations see the whole smoothed cost as a
+    rise.
     """
 
     lam: jax.Array  # float [], standard deviations of A_r per unit of cost, >= 0

@@ -92,3 +92,11 @@ class Watch:
     def over(self) -> bool:
         """Whether no member is left."""
         return len(self.lost) == len(self.members)
+
+    @property
+    def verdict(self) -> str:
+        """Why the run is over, in one line; '' while it is not."""
+        if not self.over:
+            return ""
+        first, *others = self.lost.values()
+        return f"{first}{f'; so did {len(others)} more' if others else ''}"

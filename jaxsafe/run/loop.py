@@ -128,9 +128,8 @@ def train(
                 if stopping:
                     break
         report.stop()
-        if watch.over:
-            first, *others = watch.lost.values()
-            raise Diverged(f"{first}{f'; so did {len(others)} more' if others else ''}")
+        if lost := distributed.text_from_process_0(watch.verdict):  # which alone watches
+            raise Diverged(lost)
         interrupted = iteration < iterations
         if interrupted:
             done = f"{unit.at(iteration):,} {unit.name}"

@@ -533,7 +533,8 @@ def unusual_in_words(settings: Settings, most: int = 4) -> str:
     def oddness(name: str) -> float:
         """How many times a number is larger or smaller than usual, as a logarithm."""
         here, there = other[name]
-        if not all(isinstance(x, int | float) and x for x in other[name]):
+        numbers = all(isinstance(x, int | float) and x for x in other[name])
+        if not numbers or math.isinf(there):  # a finite number is not odd where inf is the default
             return 0.0
         return abs(math.log(abs(here / there))) if math.isfinite(here) else math.inf
 

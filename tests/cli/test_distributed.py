@@ -127,6 +127,14 @@ def test_what_one_cannot_do_ends_both_with_one_line(tmp_path):
     assert lines == {"error: devices=3: expected 2, which the 2 processes have together (cpu)"}
 
 
+def test_a_run_that_diverges_ends_both_with_one_line(tmp_path):
+    pair = start_pair(tmp_path, "env=toys:Lost", "total_steps=1e9", "run_dir=run")
+    found = ends(*pair)
+    assert [status for status, _, _ in found] == [3, 3]
+    (line,) = {line for _, _, err in found for line in err.splitlines()}
+    assert "diverged at" in line and "the reward of worlds is not finite" in line
+
+
 @pytest.mark.parametrize(
     ("options", "problem"),
     [

@@ -63,7 +63,7 @@ for name in sys.argv[2:]:
     update = split(updated(algo))
     for _ in range(2):
         ts, metrics = update(ts)
-        statistics = (ts.normaliser, ts.signal_normaliser, ts.episode_length)
+        statistics = (ts.normaliser, ts.signal_normaliser, ts.lost_time)
         shared = (ts.params, ts.opt_state, ts.dual, statistics, metrics)
         for x in jax.tree.leaves(shared):
             np.testing.assert_array_equal(x[0], x[1])  # the devices agree

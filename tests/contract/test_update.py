@@ -71,7 +71,7 @@ def test_a_batch_that_is_not_finite_changes_nothing_that_is_learned_and_is_count
     whole, _ = compiled(name).together(ts)
     after, metrics = compiled(name).together(senseless(ts, 1))
     assert metrics["train/nonfinite"][1] > 0
-    for field in ("params", "dual", "normaliser", "episode_length"):
+    for field in ("params", "dual", "normaliser", "lost_time"):
         same(member(getattr(ts, field), 1), member(getattr(after, field), 1))
     for other in (0, 2):  # the members beside it learn on
         assert metrics["train/nonfinite"][other] == 0
@@ -85,7 +85,7 @@ def test_a_world_that_is_not_finite_is_reset_and_counted_and_the_others_are_lear
     after, metrics = compiled(name).together(broken(ts, 1))
     assert metrics["train/nonfinite"].tolist() == [0, 0, 0]
     assert metrics["train/bad_worlds"].tolist() == metrics["train/bad_obs"].tolist() == [0, 1, 0]
-    learned = [member(getattr(after, k), 1) for k in ("params", "dual", "normaliser", "episode_length")]
+    learned = [member(getattr(after, k), 1) for k in ("params", "dual", "normaliser", "lost_time")]
     assert all(np.isfinite(x).all() for x in numbers(learned))
     assert all(np.isfinite(x).all() for x in numbers(after.rollout.state))
     old, new = (jax.tree.leaves(member(x.params, 1)) for x in (ts, after))

@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 from jaxsafe.learn.batch import batch_mean
-from jaxsafe.learn.returns import Estimator, advantages, gae, mean_length, vtrace
+from jaxsafe.learn.returns import (
+    Estimator,
+    advantages,
+    expected_length,
+    gae,
+    mean_length,
+    no_lost_time,
+    vtrace,
+)
 
 NO, YES = jnp.zeros((1, 1), bool), jnp.ones((1, 1), bool)
 ONE = jnp.ones((1, 1))
@@ -84,6 +92,43 @@ def test_the_mean_length_finds_that_of_early_terminations():
             clock[done] = 0
         length = step(length, jnp.array(ended), jnp.array(lengths))
     np.testing.assert_allclose(length, 10 * (1 - 0.9**50), rtol=0.15)
+
+
+def test_the_length_by_lost_time_by_hand():
+    # of 8 steps one fails at step 2 of 10 and loses 8: x = 1, and 10 / (1 + 1) = 5
+    failed, lengths = jnp.zeros((4, 2), bool).at[1, 0].set(True), jnp.full((4, 2), 2)
+    length, past = expected_length(no_lost_time(), 10, failed, lengths)
+    assert length == 5 and past == (8, 8)  # 2 episodes of 5 steps are remembered: all of it
+    # 8 more steps without a failure: x = 8 / 16, of which 2 episodes of 6 2/3 steps stay
+    length, past = expected_length(past, 10, ~failed & False, lengths)
+    np.testing.assert_allclose((length, *past), (20 / 3, 20 / 3, 40 / 3), rtol=1e-6)
+
+
+def test_the_length_by_lost_time_stays_exactly_at_the_time_limit():
+    past = no_lost_time()
+    for _ in range(3):
+        length, past = expected_length(past, 1000, jnp.zeros((7, 13), bool), jnp.full((7, 13), 3))
+        assert length == 1000
+
+
+@pytest.mark.parametrize("stagger", [False, True])
+@pytest.mark.parametrize("limit, hazard", [(50, 0.1), (1000, 0.001)])
+def test_the_length_by_lost_time_is_right_from_the_first_batch(limit, hazard, stagger):
+    """Each step fails with the same probability h, so the mean length is (1 - (1 - h)^T) / h."""
+    rng, envs, horizon = np.random.default_rng(0), 4096, 40
+    clock = np.arange(envs) * limit // envs * stagger
+    exact = (1 - (1 - hazard) ** limit) / hazard
+    past, found, step = no_lost_time(), [], jax.jit(expected_length)
+    for _ in range(60):
+        failed, lengths = [], []
+        for _ in range(horizon):
+            clock += 1
+            failed, lengths = [*failed, rng.random(envs) < hazard], [*lengths, clock.copy()]
+            clock[failed[-1] | (clock == limit)] = 0
+        length, past = step(past, limit, jnp.array(failed), jnp.array(lengths))
+        found.append(length / exact)
+    np.testing.assert_allclose(found[0], 1, atol=0.3)
+    np.testing.assert_allclose(found[-1], 1, atol=0.1)
 
 
 # Three steps of one environment: the first ends by its time limit, the second by a failure, the third
