@@ -59,6 +59,8 @@ def test_every_environment_of_the_suite_has_an_id():
     assert {"jaxsafe/point_goal1", "jaxsafe/PointGoal1-v0"} <= ids
     kwargs = [gymnasium.spec(f"jaxsafe/{name}").kwargs for name in ("point_goal1", "PointGoal1-v0")]
     assert kwargs == [{"env": "point_goal1"}] * 2
+    older = gymnasium.spec("jaxsafe/SafetyAntVelocity-v0").kwargs
+    assert older == {"env": "ant_velocity", "thresholds": "v0"}
 
 
 @pytest.mark.filterwarnings("error")
@@ -234,7 +236,9 @@ def test_in_a_forked_process_there_is_one_line(monkeypatch):
 
 def test_processes_that_are_spawned_step_side_by_side():
     """One worker is enough: it is a new Python, which imports JAX."""
-    several = AsyncVectorEnv([functools.partial(GymEnv, Ticker())], context="spawn", shared_memory=False)
+    several = AsyncVectorEnv(
+        [functools.partial(GymEnv, Ticker())], context="spawn", shared_memory=False
+    )
     try:
         obs, _ = several.reset(seed=0)
         obs, rewards, *_ = several.step(np.zeros((1, 1)))
@@ -250,7 +254,9 @@ def test_bad_input_is_one_line():
         GymEnv(Ticker(), lives=(1, 1))
     with pytest.raises(ConfigError, match="expected 'rgb_array'"):
         GymVectorEnv(Ticker(), render_mode="human")
-    with pytest.raises(ConfigError, match="only Safety Gym's environments can be drawn"):
+    with pytest.raises(
+        ConfigError, match="only Safety Gym's environments and velocity tasks can be drawn"
+    ):
         GymEnv(Ticker(), render_mode="rgb_array")
 
 
