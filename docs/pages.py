@@ -22,7 +22,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from jaxsafe.algos import ALGOS, Row
-from jaxsafe.envs import ENVS
+from jaxsafe.envs import make
+from jaxsafe.envs.safety_gym import suite
+from jaxsafe.envs.velocity import config as velocity_config
+from jaxsafe.envs.velocity import suite as velocities
 from jaxsafe.learn.offline import OfflineConfig
 from jaxsafe.report import stats, studies
 from jaxsafe.report import tables as report
@@ -101,7 +104,8 @@ ENVIRONMENTS = """# Environments
 
 A name is a robot and a task: `point_goal1`, `car_push2`, `doggo_button1`. Safety Gym's ids, as in
 `Safexp-PointGoal1-v0`, work too. Goal, Button and Push are the suite's 27 tasks. Run, Circle and the
-grids are the original's tests. Vision is not there yet.
+grids are the original's tests. Vision is not there yet. The six [velocity tasks](velocity.md) are
+Safety-Gymnasium's: `ant_velocity` is `SafetyAntVelocity-v1`.
 
 Every other option of Safety Gym's Engine is `env.OPTION`.
 [`env.rules`](../howto/safety_gymnasium.md) takes Safety-Gymnasium's rules where they differ. How close
@@ -124,6 +128,61 @@ print(state.obs.shape, state.reward, state.cost, dict(zip(env.cost_names, state.
 The table has the size of each robot's observation. The vase of `goal1` and the pillar of `push1` are
 observed and cost nothing, as in the original.
 
+"""
+VELOCITY = """# velocity
+
+Run along x as fast as the threshold allows. A robot is paid for its speed and for staying healthy, and
+pays for control. A step costs 1 if the robot is faster than the threshold. The tasks are
+Safety-Gymnasium's `Safe Velocity`, on Gymnasium's environments of version 4.
+
+    python scripts/train.py env=hopper_velocity algo=ppo_lag
+
+{pictures}
+
+## Sizes
+
+{table}
+
+- The speed of a robot in a plane is that in x, with its sign. So running backwards costs nothing. The
+  speed of Ant and Humanoid is the length of the velocity in x and y.
+- The ceiling is the return of 1,000 steps at the threshold without control. An agent that never costs
+  cannot earn more; with 25 steps of cost it can earn a little more. A return far above it is a bug.
+- `SafetyAntVelocity-v0` and its like have older thresholds: `env.thresholds=v0`. There Swimmer's speed
+  in y counts, too.
+- Actions are in [-1, 1]. Humanoid's controls are 0.4 times them. An action beyond that does no more,
+  but is paid for, as in the original.
+- The healthy reward is paid on the step that ends an episode, too, as in version 4.
+
+## Options
+
+{options}
+
+Where a robot has another default, it is in the table of sizes. `env.engine` and `env.wrap` are
+[those of every task](README.md).
+
+## Fidelity
+
+The models are our own. A test compares their compiled numbers with those of Gymnasium's files, to
+1e-12.
+Single steps from the same state agree with Gymnasium's on engine `c` to the rounding of float32. On
+`jax` and `warp`, float32 inside, qpos agrees to 1e-5 in 99% of steps, and to 1e-6 in half of them.
+
+What differs:
+
+| | here | Safety-Gymnasium |
+|---|---|---|
+| the velocity of Ant and Humanoid | of the state after the step | of the integrator's last stage |
+| Humanoid's inertias, velocities and forces | likewise | likewise |
+| Humanoid's solver | Newton's | PGS with 50 iterations |
+| Humanoid's actions | [-1, 1] | [-0.4, 0.4] |
+| a physics error | ends the episode | goes on with NaN |
+
+With random actions Ant's velocity is 0.001 m/s away from that of the last stage in the median, and 0.1
+m/s at most. There is no option for the last stage.
+
+Five tasks take Runge and Kutta's fourth order, HalfCheetah Euler's integrator. Engine `warp` runs the
+five on MuJoCo Warp's kernels with our solver, and one line says so. Engine `jax` takes longest to
+compile for Humanoid, of which 128 pairs of geoms can meet.
 """
 COSTS = {
     "hazards": "inside a hazard (blue disc)",
@@ -175,7 +234,7 @@ def values(kind: Any) -> str:
     return next(filter(None, map(values, typing.get_args(kind))), "")
 
 
-def settings(config: type) -> str:
+def settings(config: type, head: str = "algo") -> str:
     """A row a field: its default, the values it takes, and the comment in the class that defines it."""
     comments: dict[str, str] = {}
     for cls in reversed(config.__mro__[:-1]):
@@ -184,9 +243,8 @@ def settings(config: type) -> str:
     hints = typing.get_type_hints(config, include_extras=True)
     for field in dataclasses.fields(config):
         note = comments[field.name].replace("|", "\\|")
-        rows.append(
-            f"| `algo.{field.name}` | `{field.default}` | {values(hints[field.name])} | {note} |"
-        )
+        default = "" if field.default is dataclasses.MISSING else f"`{field.default}`"
+        rows.append(f"| `{head}.{field.name}` | {default} | {values(hints[field.name])} | {note} |")
     return "\n".join(rows)
 
 
@@ -367,6 +425,54 @@ of boxes, vases and gremlins; those of Point's task. An episode has {env.episode
 """.replace("\n\n\n", "\n\n")
 
 
+def velocity_page() -> str:
+    made = {name: make(name, engine="c") for name in velocities.suite()}
+    names = [f"`{name}`" for name in made]
+
+    def row(head: str, cells: list[Any]) -> str:
+        return f"| {head} | " + " | ".join(map(str, cells)) + " |"
+
+    def of(attribute: str) -> list[Any]:
+        return [getattr(env, attribute) for env in made.values()]
+
+    def option(field: str) -> list[Any]:
+        found = [getattr(env.config, field) for env in made.values()]
+        return [
+            f"{x[0]:g} to {x[1]:g}" if isinstance(x, tuple) else "" if x is None else x for x in found
+        ]
+
+    rows = [row("", names), "|---|" + "---:|" * len(made)]
+    rows += [row("action", of("action_size")), row("observation", of("obs_size"))]
+    parts = dict.fromkeys(part for spec in of("observation_spec") for part in spec)
+    for part in parts:
+        rows.append(row(part, [spec.get(part, ("",))[0] for spec in of("observation_spec")]))
+    rows.append(row("seconds of a step", [f"{x:g}" for x in of("step_seconds")]))
+    rows.append(row("threshold, m/s", of("threshold")))
+    rows.append(row("threshold of v0", [env.robot.thresholds["v0"] for env in made.values()]))
+    rows.append(row("ceiling", [f"{x:,.0f}" for x in of("ceiling")]))
+    for field in (
+        "frame_skip",
+        "forward_reward_weight",
+        "ctrl_cost_weight",
+        "healthy_reward",
+        "healthy_z_range",
+        "healthy_angle_range",
+        "healthy_state_range",
+        "reset_noise_scale",
+    ):
+        rows.append(row(f"`{field}`", option(field)))
+    images = [f"![{name}](../images/environments/{name}.jpg)" for name in made]
+    pictures: list[str] = []
+    for k in (0, 3):
+        pictures += [f"| {' | '.join(names[k : k + 3])} |", "|---|---|---|"]
+        pictures += [f"| {' | '.join(images[k : k + 3])} |", ""]
+    return VELOCITY.format(
+        pictures="\n".join(pictures).strip(),
+        table="\n".join(rows),
+        options=settings(velocity_config.VelocityConfig, "env"),
+    )
+
+
 def algorithms() -> str:
     """The index of the algorithms' pages."""
     lines = [f"| [`{name}`]({name}.md) | {row.summary} |" for name, row in ALGOS.items()]
@@ -377,7 +483,7 @@ def pages() -> dict[Path, str]:
     """Every page that is made, by its path."""
     found = {HERE / "algorithms" / f"{name}.md": page(name) for name in ALGOS}
     found[HERE / "algorithms" / "README.md"] = algorithms()
-    tasks = list(dict.fromkeys(name.split("_")[1] for name in ENVS))
+    tasks = list(dict.fromkeys(name.split("_")[1] for name in suite.suite()))
     found |= {HERE / "environments" / f"{task}.md": task_page(task) for task in tasks}
     lines = ["| task | | point | car | doggo | costs |", "|---|---|---:|---:|---:|---|"]
     for task in tasks:
@@ -386,6 +492,7 @@ def pages() -> dict[Path, str]:
         cells = [f"[`{task}`]({task}.md)", about, *(str(env.obs_size) for env in made)]
         lines.append(f"| {' | '.join(cells)} | {', '.join(made[0].cost_names) or 'none'} |")
     text = ENVIRONMENTS + "\n".join(lines) + "\n"
+    found[HERE / "environments" / "velocity.md"] = velocity_page()
     return found | {HERE / "environments" / "README.md": text}
 
 

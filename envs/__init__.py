@@ -1,4 +1,4 @@
-"""Environments: Safety Gym's by name, those that a user registers, and wrappers around any of them."""
+"""Environments: Safety Gym's, velocity tasks, those that a user registers, and wrappers around any."""
 
 from jaxsafe.envs.registry import (
     ALIASES,
@@ -13,6 +13,8 @@ from jaxsafe.envs.registry import (
 from jaxsafe.envs.safety_gym import suite
 from jaxsafe.envs.safety_gym.config import SafetyGymConfig, config_from_plain, defaults
 from jaxsafe.envs.safety_gym.task import SafetyGym
+from jaxsafe.envs.velocity.config import VelocityConfig
+from jaxsafe.envs.velocity.task import Velocity
 from jaxsafe.envs.wrap import raw_steps
 
 __all__ = [
@@ -20,6 +22,8 @@ __all__ = [
     "ENVS",
     "SafetyGym",
     "SafetyGymConfig",
+    "Velocity",
+    "VelocityConfig",
     "canonical",
     "check_options",
     "config_from_plain",

@@ -1,4 +1,4 @@
-"""Environments by name: Safety Gym's, and those that `register` adds.
+"""Environments by name: Safety Gym's, the velocity tasks, and those that `register` adds.
 
 `make("car_push1")` and `make("Safexp-CarPush1-v0")` are the same environment.
 """
@@ -14,16 +14,25 @@ from jaxsafe.envs.engines.choose import ENGINES
 from jaxsafe.envs.safety_gym import layout, suite
 from jaxsafe.envs.safety_gym.config import SafetyGymConfig, config_from_plain, defaults
 from jaxsafe.envs.safety_gym.task import SafetyGym
+from jaxsafe.envs.velocity import config as velocity
+from jaxsafe.envs.velocity import suite as velocities
+from jaxsafe.envs.velocity.config import VelocityConfig
+from jaxsafe.envs.velocity.task import Velocity
 from jaxsafe.envs.wrap import WrapConfig, wrapped
 from jaxsafe.types import Env
 
-# name -> options that differ from Safety Gym's defaults, or a function that makes another environment
+# name -> options that differ from Safety Gym's defaults, the config of a velocity task, or a function
+# that makes another environment
 SUITE = suite.suite()
-ENVS: dict[str, Any] = {**SUITE}
+ENVS: dict[str, Any] = {**SUITE, **velocities.suite()}
+Config = SafetyGymConfig | VelocityConfig
 PLAIN = (type(None), bool, int, float, str, list, tuple, dict)
 ANY_ENV = "wrap"  # the option that every environment has
-OF_MAKE = ("engine", ANY_ENV)  # options of a Safety Gym environment that are no `SafetyGymConfig`'s
-ALIASES: dict[str, str] = {suite.alias(name): name for name in ENVS}
+OF_MAKE = ("engine", ANY_ENV)  # options of our environments that are no field of their config
+ALIASES: dict[str, str] = {suite.alias(name): name for name in SUITE}
+ALIASES |= {alias: name for alias, (name, _) in velocities.aliases().items()}
+# options that an alias stands for, beside a name
+IMPLIED: dict[str, dict[str, Any]] = {a: options for a, (_, options) in velocities.aliases().items()}
 
 
 def register(name: str, env: Any) -> None:
@@ -33,13 +42,13 @@ def register(name: str, env: Any) -> None:
         name: what to call it. A name that is there already is replaced.
         env: one of
             a dict of Safety Gym's options, such as `TASKS["goal1"] | ROBOTS["car"]` of suite.py;
-            a `SafetyGymConfig`, or an environment that `make` made of one;
+            a `SafetyGymConfig` or a `VelocityConfig`, or an environment that `make` made of one;
             any other `Env`;
             a function or a class that makes one. Its arguments with defaults become options.
     Raises:
         ConfigError: an unknown option, or something that is none of these.
     """
-    if isinstance(env, SafetyGym):
+    if isinstance(env, SafetyGym | Velocity):
         env = env.config
     if isinstance(env, SafetyGymConfig):
         env = dataclasses.asdict(env)
@@ -47,7 +56,7 @@ def register(name: str, env: Any) -> None:
         config_from_plain({k: v for k, v in defaults(**env).items() if k not in OF_MAKE})
         wrap_config(env.get(ANY_ENV, {}))
         ENVS[name] = dict(env)
-    elif callable(env):
+    elif isinstance(env, VelocityConfig) or callable(env):
         ENVS[name] = env
     else:
         checked = check_env(env, name)
@@ -91,6 +100,9 @@ def env_defaults(name: str) -> dict[str, Any]:
     wrap = dataclasses.asdict(WrapConfig())
     if isinstance(entry, dict):
         return {"engine": "auto"} | defaults(**entry) | {ANY_ENV: wrap | entry.get(ANY_ENV, {})}
+    if isinstance(entry, VelocityConfig):
+        implied = IMPLIED.get(name, {})
+        return {"engine": "auto"} | dataclasses.asdict(entry) | implied | {ANY_ENV: wrap}
     return {p.name: p.default for p in arguments(entry, name)} | {ANY_ENV: wrap}
 
 
@@ -116,16 +128,17 @@ def arguments(factory: Callable[..., Env], name: str) -> list[inspect.Parameter]
     return [p for p in named if isinstance(p.default, PLAIN)]
 
 
-def make(env: str | SafetyGymConfig, **overrides: Any) -> Any:
+def make(env: str | Config, **overrides: Any) -> Any:
     """Build an environment.
 
     Args:
         env: a name ('car_push1', 'Safexp-CarPush1-v0', what `register` was given) or a config.
-        overrides: options by name. Safety Gym's are those of `SafetyGymConfig`, and `engine`: 'auto',
-            'c', 'warp' or 'jax'. Every environment has `wrap`, a dict of `WrapConfig`'s fields.
+        overrides: options by name. Safety Gym's are those of `SafetyGymConfig`, those of velocity tasks
+            are in `VelocityConfig`. Both have `engine`: 'auto', 'c', 'warp' or 'jax'. Every environment
+            has `wrap`, a dict of `WrapConfig`'s fields.
     Returns:
-        A `SafetyGym`, or the `Env` that was registered; in its wrappers, if `wrap` asks for any. Only
-        the name decides which, so that type checkers see `Any`.
+        A `SafetyGym`, a `Velocity`, or the `Env` that was registered; in its wrappers, if `wrap` asks
+        for any. Only the name decides which, so that type checkers see `Any`.
     Raises:
         ConfigError: an unknown name or option (with the nearest valid one), a value of the wrong
             type, or a task that cannot be built or has no valid layout.
@@ -138,17 +151,20 @@ def check_options(env: str, **overrides: Any) -> None:
     planned(env, overrides)
 
 
-def planned(env: str | SafetyGymConfig, overrides: dict[str, Any]) -> Callable[[], Env]:
+def planned(env: str | Config, overrides: dict[str, Any]) -> Callable[[], Env]:
     """What builds the environment. Names, types and bounds are checked by now."""
-    if not isinstance(env, str | SafetyGymConfig):
-        raise ConfigError(f"env={shown(env)}: expected a name or a SafetyGymConfig")
-    name = "custom" if isinstance(env, SafetyGymConfig) else canonical(env)
-    options = dataclasses.asdict(env) if isinstance(env, SafetyGymConfig) else ENVS[name]
+    if not isinstance(env, str | Config):
+        raise ConfigError(f"env={shown(env)}: expected a name, a SafetyGymConfig or a VelocityConfig")
+    name, entry = ("custom", env) if isinstance(env, Config) else (canonical(env), ENVS[canonical(env)])
+    options = dataclasses.asdict(entry) if isinstance(entry, SafetyGymConfig) else entry
     given = {k: v for k, v in overrides.items() if k != ANY_ENV}
     wrap = overrides.get(ANY_ENV, {})
     if isinstance(options, dict):
         wrap = {**options.get(ANY_ENV, {}), **wrap} if isinstance(wrap, dict) else wrap
         plan = safety_gym(name, {k: v for k, v in options.items() if k != ANY_ENV}, given)
+    elif isinstance(options, VelocityConfig):
+        implied = IMPLIED.get(env, {}) if isinstance(env, str) else {}
+        plan = velocity_task(name, options, implied | given)
     else:
         plan = registered(name, options, given)
     wrappers = wrap_config(wrap)
@@ -156,8 +172,8 @@ def planned(env: str | SafetyGymConfig, overrides: dict[str, Any]) -> Callable[[
 
 
 def safety_gym(name: str, options: dict[str, Any], overrides: dict[str, Any]) -> Callable[[], Env]:
-    options = {"engine": "auto"} | defaults(**options) | overrides
-    engine = convert(options.pop("engine"), Literal["auto", *ENGINES], "env.engine")  # type: ignore
+    options = defaults(**options) | overrides
+    engine = engine_of(options)
     cfg = config_from_plain(options)
 
     def build() -> Env:
@@ -178,6 +194,18 @@ def safety_gym(name: str, options: dict[str, Any], overrides: dict[str, Any]) ->
             "placements_extents"
         )
     return build
+
+
+def velocity_task(name: str, base: VelocityConfig, overrides: dict[str, Any]) -> Callable[[], Env]:
+    options = dataclasses.asdict(base) | overrides
+    engine = engine_of(options)
+    cfg = velocity.config_from_plain(options)
+    return lambda: Velocity(cfg, engine, name)
+
+
+def engine_of(options: dict[str, Any]) -> str:
+    """The option `engine`, which is taken out of `options`."""
+    return convert(options.pop("engine", "auto"), Literal["auto", *ENGINES], "env.engine")  # type: ignore
 
 
 def registered(name: str, factory: Callable[..., Env], overrides: dict[str, Any]) -> Callable[[], Env]:

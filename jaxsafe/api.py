@@ -19,7 +19,7 @@ import numpy as np
 from jaxsafe import algos, envs
 from jaxsafe.algos import Row
 from jaxsafe.config import ConfigError, EpisodeCount, Index, Seed, convert, flat, nearest
-from jaxsafe.envs import SafetyGym, SafetyGymConfig
+from jaxsafe.envs import SafetyGym, SafetyGymConfig, Velocity, VelocityConfig
 from jaxsafe.envs.check import check_env
 from jaxsafe.envs.engines import default_engine
 from jaxsafe.envs.wrap import Wrapper, innermost, wrap_config_of
@@ -54,9 +54,10 @@ __all__ = ["ConfigError", "Run", "SweepResult", "evaluate", "make", "render", "s
 
 RUN_OPTIONS = [f.name for f in dataclasses.fields(TrainConfig)]
 PLAIN = (bool, int, float, str, list, tuple, dict, type(None))
+BY_OPTIONS = (dict, VelocityConfig)  # entries whose name and options say it all
 
 
-def make(env: str | SafetyGymConfig, **options: Any) -> Any:
+def make(env: str | SafetyGymConfig | VelocityConfig, **options: Any) -> Any:
     """Build an environment: `reset(key)` and `step(state, action)`, pure and without a batch axis.
 
         env = jaxsafe.make("point_goal1", hazards_num=12)
@@ -68,8 +69,8 @@ def make(env: str | SafetyGymConfig, **options: Any) -> Any:
     Args:
         env: a name ('car_push1'), Safety Gym's id ('Safexp-CarPush1-v0'), 'module:name' for code of
             yours, which is imported, or a config.
-        options: Safety Gym's (`hazards_num`, ...; lengths in m, angles in rad) and `engine`: 'auto',
-            'c', 'warp' or 'jax'.
+        options: Safety Gym's (`hazards_num`, ...; lengths in m, angles in rad) or a velocity task's
+            (`velocity_threshold`, ...), and `engine`: 'auto', 'c', 'warp' or 'jax'.
 
     Returns:
         The environment; of 'module:name' what stands there, if it is an `Env` (jaxsafe.types).
@@ -433,10 +434,9 @@ def choose_env(env: Any) -> tuple[dict[str, Any], dict[str, EnvEntry]]:
             load("env", name)
         return {"env": list(env)}, {}
     inner = innermost(env)
-    gym = isinstance(inner, SafetyGym)
+    gym = isinstance(inner, SafetyGym | Velocity)
     fields = to_plain(plain_fields(env))
-    if gym and isinstance(envs.ENVS.get(inner.name), dict) and (wrap := wrap_config_of(env)):
-        # a name and options say it all
+    if gym and isinstance(envs.ENVS.get(inner.name), BY_OPTIONS) and (wrap := wrap_config_of(env)):
         defaults = flat(find_env(inner.name)[1].defaults)
         fields = to_plain(plain_fields(inner)) | {"wrap": to_plain(dataclasses.asdict(wrap))}
         fields["engine"] = "auto" if inner.engine == default_engine() else inner.engine
@@ -453,13 +453,13 @@ def choose_env(env: Any) -> tuple[dict[str, Any], dict[str, EnvEntry]]:
             )
         return env
 
-    drawn = {} if gym else {"video": False}  # there is a picture of Safety Gym's alone
+    drawn = {} if gym else {"video": False}  # there is a picture of our own alone
     return {"env": name, **drawn}, {name: EnvEntry(fields, made, made)}
 
 
 def plain_fields(env: Any) -> dict[str, Any]:
     """What config.yaml keeps of an environment: the plain fields of a dataclass."""
-    fields = env.config if isinstance(env, SafetyGym) else env
+    fields = env.config if isinstance(env, SafetyGym | Velocity) else env
     if not dataclasses.is_dataclass(fields):
         return {}
     values = {f.name: getattr(fields, f.name) for f in dataclasses.fields(fields)}

@@ -15,6 +15,7 @@ from PIL import Image
 
 from jaxsafe import envs
 from jaxsafe.envs.safety_gym.suite import ROBOTS, TASKS
+from jaxsafe.envs.velocity import suite as velocities
 from jaxsafe.envs.view import render
 from jaxsafe.run.policies import open_run
 
@@ -66,6 +67,16 @@ def draw_small(name: str) -> None:
     imageio.imwrite(path, smooth.round().astype(np.uint8), quality=88)
 
 
+def draw_velocity(name: str) -> None:
+    """The first frame of an episode, at 240 x 160."""
+    env = envs.make(name, engine="c")
+    state = jax.device_get(jax.jit(env.reset)(jax.random.key(0)))
+    frame = render.Renderer(env, 480, 320, "track").frame(state).astype(np.float32)
+    smooth = frame.reshape(160, 2, 240, 2, 3).mean((1, 3))
+    path = HERE / "environments" / f"{name}.jpg"
+    imageio.imwrite(path, smooth.round().astype(np.uint8), quality=88)
+
+
 def draw_policy(run: Path, seed: int, begin: int) -> None:
     """A part of an episode of the policy in `run`, from step `begin` on, as a small GIF."""
     actor = open_run(run).actor(0)
@@ -95,3 +106,5 @@ if __name__ == "__main__":
             draw(name)
         for name in SMALL:
             draw_small(name)
+        for name in velocities.suite():
+            draw_velocity(name)

@@ -26,7 +26,7 @@ def widths(model: mujoco.MjModel, simulation: Simulation) -> tuple[dict[str, int
 
 
 def count_of(model: mujoco.MjModel, count: str) -> int:
-    return {"nbody": model.nbody, "ngeom": model.ngeom, "nsite": model.nsite}[count]
+    return {"nbody": model.nbody, "ngeom": model.ngeom, "nsite": model.nsite, "nv": model.nv}[count]
 
 
 def columns(sizes: dict[str, int]) -> Columns:
@@ -54,7 +54,7 @@ def unpack(
         substeps=physics.substeps + substeps,
     )
     return physics, Readings(
-        sensors=sensors[:split],
+        sensors=sensors[: split - simulation.unread],
         contacts=sensors[split:],
         fields={name: parts[name].reshape(-1, *FIELDS[name][1]) for name in simulation.fields},
         overflow=parts["overflow"][0] if "overflow" in parts else jnp.zeros(()),

@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxsafe.config import ConfigError, nearest
 
-FIELDS = {  # poses that an engine can report: what there are as many of, and the shape of each
+FIELDS = {  # what an engine can report: what there are as many of, and the shape of each
     "xpos": ("nbody", (3,)),
     "xquat": ("nbody", (4,)),
     "xmat": ("nbody", (3, 3)),
@@ -20,6 +20,11 @@ FIELDS = {  # poses that an engine can report: what there are as many of, and th
     "geom_xmat": ("ngeom", (3, 3)),
     "site_xpos": ("nsite", (3,)),
     "site_xmat": ("nsite", (3, 3)),
+    "subtree_com": ("nbody", (3,)),
+    "cinert": ("nbody", (10,)),
+    "cvel": ("nbody", (6,)),
+    "cfrc_ext": ("nbody", (6,)),
+    "qfrc_actuator": ("nv", ()),
 }
 
 
@@ -37,7 +42,7 @@ class Simulation:
     spec: the model, as `mujoco.MjSpec.from_string` or `from_file` reads it. Engines copy it.
     substeps: physics steps in a call of `Engine.run`, or the most of them if `varied`.
     varied: whether calls differ in how many physics steps they take.
-    fields: poses to report, of `FIELDS`.
+    fields: what to report, of `FIELDS`: poses, inertias, velocities, forces, as MuJoCo has them.
     contacts: pairs of bodies' names. An engine reports how many contact points the first body, or a
         body that it carries, has with the second. The floor belongs to the body 'world'.
     orbits: float [nmocap], in m, or None. After t seconds mocap body i is at its place plus
@@ -57,7 +62,8 @@ class Simulation:
     room: Room | None = None
 
     def compile(self, count: bool) -> mujoco.MjModel:
-        """The model; if `count`, with a sensor for each pair of `contacts`, after all others.
+        """The model; if `count`, with sensors after its own: one that forces among `fields` need, then
+        one for each pair of `contacts`.
 
         Raises:
             ConfigError: MuJoCo cannot compile it, a body or field has an unknown name, or an actuator
@@ -71,6 +77,13 @@ class Simulation:
             if name not in FIELDS:
                 raise ConfigError(f"fields: {name!r} cannot be reported{nearest(name, FIELDS)}")
         spec = self.spec.copy()
+        if count and self.unread:  # MuJoCo computes forces on bodies for such a sensor alone
+            spec.add_sensor(
+                name="for cfrc_ext",
+                type=mujoco.mjtSensor.mjSENS_FRAMELINACC,
+                objtype=mujoco.mjtObj.mjOBJ_XBODY,
+                objname="world",
+            )
         for one, other in self.contacts if count else ():
             spec.add_sensor(
                 name=f"contacts of {one} and {other}",
@@ -89,6 +102,11 @@ class Simulation:
         if model.na:
             raise ConfigError("expected actuators without a state (no muscles, no filters)")
         return model
+
+    @property
+    def unread(self) -> int:
+        """Floats of sensors that stand before those of contacts and are not the model's own."""
+        return 3 if "cfrc_ext" in self.fields else 0
 
     def orbits_of(self, model: mujoco.MjModel) -> np.ndarray:
         """`orbits`, float [nmocap]; zeros where none are given."""

@@ -154,7 +154,8 @@ def build(cfg: SafetyGymConfig, mjx: bool = False, drawn: bool = False) -> Scene
         name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(half, half, 0.1), **fixed
     )
     if drawn:
-        decorate(spec, floor)
+        light(spec, floor)
+        add_cameras(spec)
     add_free_objects(spec, cfg)
     for i in range(cfg.gremlins_num):
         add_gremlin_guide(spec, i, cfg.gremlins_size, drawn)
@@ -337,8 +338,9 @@ def with_soft_gremlins(scene: Scene) -> Scene:
     return dataclasses.replace(scene, spec=spec, model=spec.compile())
 
 
-def decorate(spec: mujoco.MjSpec, floor: mujoco.MjsGeom) -> None:
-    """A checkered floor and the cameras of the original; softer light, and a robot that stands out."""
+def light(spec: mujoco.MjSpec, floor: mujoco.MjsGeom, squares: int = 10) -> None:
+    """A checkered floor with so many squares along a side, a sky, soft light, and a robot that stands
+    out."""
     spec.add_texture(
         name="checker",
         type=mujoco.mjtTexture.mjTEXTURE_2D,
@@ -348,7 +350,7 @@ def decorate(spec: mujoco.MjSpec, floor: mujoco.MjsGeom) -> None:
         width=300,
         height=300,
     )
-    spec.add_material(name="checker", texrepeat=(10, 10), texuniform=False).textures[
+    spec.add_material(name="checker", texrepeat=(squares, squares), texuniform=False).textures[
         mujoco.mjtTextureRole.mjTEXROLE_RGB
     ] = "checker"
     floor.material = "checker"
@@ -367,8 +369,7 @@ def decorate(spec: mujoco.MjSpec, floor: mujoco.MjsGeom) -> None:
     spec.visual.headlight.ambient[:] = 0.35
     spec.visual.headlight.diffuse[:] = 0.35
     spec.visual.headlight.specular[:] = 0
-    world = spec.worldbody
-    world.add_light(
+    spec.worldbody.add_light(
         type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
         pos=(0, 0, 4),
         dir=(0.3, 0.4, -1),
@@ -376,8 +377,12 @@ def decorate(spec: mujoco.MjSpec, floor: mujoco.MjsGeom) -> None:
         specular=(0.1, 0.1, 0.1),
         castshadow=False,
     )
+
+
+def add_cameras(spec: mujoco.MjSpec) -> None:
+    """Those of the original."""
     down = (np.cos(np.pi / 8), np.sin(np.pi / 8), 0, 0)  # half of up's right angle to the horizon
     for name, pos in (("fixednear", (0, -2, 2)), ("fixedfar", (0, -5, 5))):
-        world.add_camera(name=name, pos=pos, quat=down)
+        spec.worldbody.add_camera(name=name, pos=pos, quat=down)
     track = mujoco.mjtCamLight.mjCAMLIGHT_TRACK
     spec.body("robot").add_camera(name="track", pos=(0, -2, 2), quat=down, mode=track)

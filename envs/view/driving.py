@@ -5,6 +5,7 @@ import numpy as np
 from jaxsafe.config import ConfigError
 from jaxsafe.envs.safety_gym import scene
 from jaxsafe.envs.safety_gym.task import SafetyGym
+from jaxsafe.envs.velocity.task import Velocity
 
 FRONT = {"point": 0.0, "car": -np.pi / 2, "doggo": 0.0}  # where a robot's front is in its frame, rad
 # Doggo's gaits, found by random search: torque o + a sin(2 pi (f t + p)), diagonal legs in antiphase.
@@ -31,6 +32,20 @@ TURN = {
     "o": [[-0.29, 0.10, -0.20], [-0.16, 0.20, 0.23]],
     "s": [[0.79, 0.51, -0.44], [2.87, 0.04, 2.26]],
 }
+
+
+def drivable(env: SafetyGym | Velocity) -> SafetyGym:
+    """`env` itself.
+
+    Raises:
+        ConfigError: a robot that no keys are known for.
+    """
+    if isinstance(env, Velocity):
+        raise ConfigError(
+            f"env.robot={env.config.robot!r}: keys drive {', '.join(FRONT)} alone; a film shows it"
+        )
+    robot_of(env)
+    return env
 
 
 def robot_of(env: SafetyGym) -> str:

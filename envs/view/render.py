@@ -1,8 +1,8 @@
 """Frames and films of an episode, drawn by MuJoCo off screen.
 
-Bodies come from the model; goals, hazards, circles and lidars are arrays in the physics, so they are
-drawn as loose geoms over each frame, with the shapes and colours of the original: its Engine's
-`render`, `render_lidar`, `render_compass`, `render_area` and `render_sphere`.
+Bodies come from the model. In Safety Gym's tasks goals, hazards, circles and lidars are arrays in the
+physics, so they are drawn as loose geoms over each frame, with the shapes and colours of the original:
+its Engine's `render`, `render_lidar`, `render_compass`, `render_area` and `render_sphere`.
 """
 
 import atexit
@@ -29,6 +29,8 @@ from jaxsafe.envs.safety_gym import scene as scenes
 from jaxsafe.envs.safety_gym.arena import World
 from jaxsafe.envs.safety_gym.config import SafetyGymConfig
 from jaxsafe.envs.safety_gym.task import SafetyGym
+from jaxsafe.envs.velocity.task import Velocity
+from jaxsafe.envs.velocity.task import World as VelocityWorld
 from jaxsafe.envs.wrap import innermost, raw_steps
 from jaxsafe.learn.acting import Player
 from jaxsafe.types import PyTree, State
@@ -38,6 +40,7 @@ BACKENDS = {"Linux": ("egl", "osmesa", "glfw"), "Darwin": ("cgl", "glfw")}
 # Rows of the halo, from the lowest up.
 SEEN = ("box", "goal", "buttons", "circle", "walls", "hazards", "pillars", "gremlins", "vases")
 RED = (1, 0, 0, 1)
+BESIDE = (np.cos(np.deg2rad(32)), np.sin(np.deg2rad(32)), 0, 0)  # along y, 26 degrees downwards
 CAPTION, GAP = 24, 4  # height of the line over a labelled frame, width between two panels, pixels
 SPHERE, CYLINDER = mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CYLINDER
 PROBE = """
@@ -54,14 +57,13 @@ class NoDisplay(RuntimeError):
 
 
 class Stage:
-    """The bodies of a task in MuJoCo's own model, and what is drawn over them. Needs no display.
+    """The bodies of one of Safety Gym's tasks in MuJoCo's own model, and what is drawn over them.
 
-    Raises:
-        ConfigError: no environment of Safety Gym.
+    It needs no display.
     """
 
     def __init__(self, env: SafetyGym):
-        self.env = env = drawable(env)
+        self.env = env
         self.scene = scenes.build(env.config, drawn=True)
         self.model = self.scene.model
         self.data = mujoco.MjData(self.model)
@@ -125,12 +127,44 @@ class Stage:
     def _add(
         self, geoms: mujoco.MjvScene, name: str, shape: mujoco.mjtGeom, size: Any, place: Any, rgba: Any
     ) -> None:
-        """Add one upright geom."""
+        """Add one upright geom with its label."""
         geom = geoms.geoms[geoms.ngeom]
-        size, place, rgba = np.array(size, float), np.array(place, float), np.array(rgba, np.float32)
-        mujoco.mjv_initGeom(geom, shape.value, size, place, np.eye(3).reshape(9), rgba)
+        add_geom(geoms, shape, size, place, rgba)
         geom.label = name if self.env.config.render_labels else ""
-        geoms.ngeom += 1
+
+
+class Runway:
+    """A velocity task's robot on a checkered floor, as `Stage` has Safety Gym's. Cameras run along."""
+
+    def __init__(self, env: Velocity):
+        spec = env.spec()
+        scenes.light(spec, spec.geom("floor"), squares=40)
+        along = mujoco.mjtCamLight.mjCAMLIGHT_TRACK
+        for name, far in (("fixednear", 2), ("fixedfar", 4), ("track", 3)):
+            spec.body("torso").add_camera(name=name, pos=(0, -far, far / 2), quat=BESIDE, mode=along)
+        self.model = spec.compile()
+        self.data = mujoco.MjData(self.model)
+
+    def move(self, world: VelocityWorld) -> None:
+        self.data.qpos[:] = world.physics.qpos
+        mujoco.mj_forward(self.model, self.data)
+
+    def mark(self, geoms: mujoco.MjvScene, state: State) -> None:
+        """The light of a cost."""
+        if state.cost > 0:
+            add_geom(geoms, SPHERE, (0.35, 0, 0), self.data.body("torso").xpos, faded(RED, 0.5))
+
+
+def stage_of(env: SafetyGym | Velocity) -> Stage | Runway:
+    env = drawable(env)
+    return Runway(env) if isinstance(env, Velocity) else Stage(env)
+
+
+def add_geom(geoms: mujoco.MjvScene, shape: mujoco.mjtGeom, size: Any, place: Any, rgba: Any) -> None:
+    """Add one upright geom to a scene."""
+    size, place, rgba = np.array(size, float), np.array(place, float), np.array(rgba, np.float32)
+    mujoco.mjv_initGeom(geoms.geoms[geoms.ngeom], shape.value, size, place, np.eye(3).reshape(9), rgba)
+    geoms.ngeom += 1
 
 
 class Renderer:
@@ -138,20 +172,21 @@ class Renderer:
 
     Args:
         width, height: of a frame, pixels.
-        camera: 'fixedfar', 'fixednear', 'track' (beside the robot), 'vision' (on it), or an MjvCamera.
+        camera: 'fixedfar', 'fixednear', 'track' (beside the robot), of Safety Gym's robots 'vision' (on
+            it), or an MjvCamera.
     Raises:
         NoDisplay: this machine has neither EGL nor OSMesa nor a display.
-        ConfigError: an unknown camera, or no environment of Safety Gym.
+        ConfigError: an unknown camera, or an environment that cannot be drawn.
     """
 
     def __init__(
         self,
-        env: SafetyGym,
+        env: SafetyGym | Velocity,
         width: int = 640,
         height: int = 480,
         camera: str | mujoco.MjvCamera = "fixedfar",
     ):
-        self.stage = Stage(env)
+        self.stage = stage_of(env)
         model = self.stage.model
         self.camera = named_camera(model, camera) if isinstance(camera, str) else camera
         self._option = mujoco.MjvOption()
@@ -179,7 +214,7 @@ class Renderer:
 
 
 def render_episode(
-    env: SafetyGym,
+    env: SafetyGym | Velocity,
     player: Player,
     key: jax.Array,
     length: int | None = None,
@@ -314,15 +349,18 @@ def works(backend: str) -> bool:
 # Small parts -----------------------------------------------------------------------------------------
 
 
-def drawable(env: Any) -> SafetyGym:
-    """The environment of Safety Gym that `env` is, without its wrappers.
+def drawable(env: Any) -> SafetyGym | Velocity:
+    """`env` without its wrappers.
 
     Raises:
-        ConfigError: it is none.
+        ConfigError: it is neither Safety Gym's nor a velocity task.
     """
     inside = innermost(env)
-    if not isinstance(inside, SafetyGym):
-        raise ConfigError(f"only Safety Gym's environments can be drawn, not a {type(inside).__name__}")
+    if not isinstance(inside, SafetyGym | Velocity):
+        raise ConfigError(
+            "only Safety Gym's environments and velocity tasks can be drawn, not a "
+            f"{type(inside).__name__}"
+        )
     return inside
 
 

@@ -21,7 +21,7 @@ from PIL import Image
 from jaxsafe.config import ConfigError
 from jaxsafe.envs.safety_gym.task import SafetyGym
 from jaxsafe.envs.view import render
-from jaxsafe.envs.view.driving import FRONT, drive, robot_of
+from jaxsafe.envs.view.driving import FRONT, drivable, drive, robot_of
 from jaxsafe.envs.wrap import raw_steps
 from jaxsafe.learn.acting import Player
 from jaxsafe.types import PyTree, State
@@ -60,7 +60,7 @@ class Playback:
             leaves the robot to the keys. Held keys take over from a policy.
         seed: of the first episode.
     Raises:
-        ConfigError: no environment of Safety Gym, or a robot that no keys are known for.
+        ConfigError: an environment that cannot be drawn, or a robot that no keys are known for.
     """
 
     def __init__(
@@ -69,8 +69,7 @@ class Playback:
         player: Player | None = None,
         seed: int = 0,
     ):
-        self.env, self.playing, self.held = render.drawable(env), True, set[str]()
-        robot_of(self.env)  # raises where no keys could drive
+        self.env, self.playing, self.held = drivable(render.drawable(env)), True, set[str]()
         self.limit, self.seconds = env.episode_length, self.env.step_seconds * raw_steps(env)
         self.ended: list[Ended] = []  # the last `LAST`, newest first
         self._lock = threading.Lock()

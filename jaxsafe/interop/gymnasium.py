@@ -19,6 +19,7 @@ import numpy as np
 
 from jaxsafe import envs
 from jaxsafe.config import ConfigError
+from jaxsafe.envs.registry import IMPLIED
 from jaxsafe.envs.view.render import FPS, Renderer
 from jaxsafe.learn.rollout import RolloutState, init_rollout, restart
 from jaxsafe.types import Env, State
@@ -239,11 +240,10 @@ def advance(
     return restart(env, rollout, state.terminated | truncated, key), state, state.terminated, truncated
 
 
-for _alias, _name in envs.ALIASES.items():
-    for _id in (_name, _alias.removeprefix("Safexp-")):
-        gymnasium.register(
-            f"jaxsafe/{_id}",
-            entry_point="jaxsafe.interop.gymnasium:GymEnv",
-            vector_entry_point="jaxsafe.interop.gymnasium:GymVectorEnv",
-            kwargs={"env": _name},
-        )
+for _id, _name in {**{name: name for name in envs.ALIASES.values()}, **envs.ALIASES}.items():
+    gymnasium.register(
+        f"jaxsafe/{_id.removeprefix('Safexp-')}",
+        entry_point="jaxsafe.interop.gymnasium:GymEnv",
+        vector_entry_point="jaxsafe.interop.gymnasium:GymVectorEnv",
+        kwargs={"env": _name, **IMPLIED.get(_id, {})},
+    )

@@ -22,6 +22,7 @@ import yaml
 
 from jaxsafe import algos, envs
 from jaxsafe.config import Amount, ConfigError, convert, from_dict, nearest, one_line
+from jaxsafe.envs.registry import IMPLIED
 from jaxsafe.envs.safety_gym import suite
 from jaxsafe.envs.safety_gym.config import config_from_plain as read_config
 from jaxsafe.envs.safety_gym.config import defaults
@@ -351,10 +352,14 @@ def find_environment(theirs: Any) -> list[str]:
         raise ConfigError("no env_id in the file: add --env, as in --env SafetyPointGoal1-v0")
     if ours := suite.safety_gymnasium(theirs):
         return [f"env={ours}", "env.rules=safety_gymnasium"]
+    if (alias := theirs.replace("Gymnasium-", "-")) in envs.ALIASES:
+        implied = (as_option(f"env.{k}", v) for k, v in IMPLIED.get(alias, {}).items())
+        return [f"env={envs.canonical(alias)}", *implied]
     if theirs.startswith("Safety"):
         raise ConfigError(
             f"{theirs} has no counterpart: of Safety-Gymnasium's tasks we have Point's and Car's Goal, "
-            "Button and Push; --env chooses another, by Safety-Gymnasium's name or ours"
+            "Button and Push, and the velocity tasks; --env chooses another, by Safety-Gymnasium's "
+            "name or ours"
         )
     return [f"env={envs.canonical(theirs)}"]
 

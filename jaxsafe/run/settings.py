@@ -310,9 +310,8 @@ def find_env(name: str, extras: Extras = NO_EXTRAS) -> tuple[str, EnvEntry]:
     """The name under which an environment is registered, and its entry."""
     if convert(name, str, "env") in extras.envs:
         return name, extras.envs[name]
-    name = envs.canonical(name)
     make, check = functools.partial(envs.make, name), functools.partial(envs.check_options, name)
-    return name, EnvEntry(to_plain(envs.env_defaults(name)), make, check)
+    return envs.canonical(name), EnvEntry(to_plain(envs.env_defaults(name)), make, check)
 
 
 def find_algo(name: str, extras: Extras = NO_EXTRAS) -> Row:

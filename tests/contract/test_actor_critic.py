@@ -40,7 +40,7 @@ class ByHand:
     method: str
     params: dict[str, Any]
     batch: Transitions
-    noise: list[np.ndarray]
+    noise: list[Any]
     alpha: float
     lam: float | None
     reduce: str
@@ -114,7 +114,9 @@ def numerical(loss, params, eps=1e-6):
 
 class Adam:
     def __init__(self, lr):
-        self.lr, self.count, self.mu, self.nu = lr, 0, 0.0, 0.0
+        self.lr, self.count = lr, 0
+        self.mu: dict[str, Any] = {}
+        self.nu: dict[str, Any] = {}
 
     def step(self, params, grads):
         self.count += 1

@@ -306,7 +306,7 @@ def test_without_a_constraint_all_the_reward_is_taken_and_the_cost_paid(name):
 
 def trained(name: str, updates: int, **settings: Any) -> dict[str, jax.Array]:
     """The metrics of two seeds on Lever."""
-    algo, cfg = ALGOS[name].make(Lever()), ALGOS[name].config(**ALGOS[name].lever | settings)
+    algo, cfg = ALGOS[name].make(Lever()), ALGOS[name].config(**{**ALGOS[name].lever, **settings})
 
     def train(key):
         ts = algo.init(key, cfg, START)
@@ -353,7 +353,7 @@ def split(fn, devices=2):
 def training(name, axis_name, num_envs, updates):
     algo = ALGOS[name].make(Lever(), axis_name)
     sizes = dict(num_envs=num_envs, learn_every=4, cost_limit=1e3)  # the price stays near 0
-    cfg = ALGOS[name].config(**ALGOS[name].lever | sizes)
+    cfg = ALGOS[name].config(**{**ALGOS[name].lever, **sizes})
     def train(key):
         ts = algo.init(key, cfg, START)
         return jax.lax.scan(lambda ts, i: algo.update(ts, Shared(i)), ts, jnp.arange(updates))

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from jaxsafe.envs.velocity import suite as velocities
 from jaxsafe.report.tables import between_marks
 
 ROOT = Path(__file__).parent.parent.parent
@@ -112,5 +113,6 @@ def test_docstrings_show_fields_and_sections():
 def test_every_task_of_the_suite_has_a_small_picture():
     found = {path.stem: path.stat().st_size for path in (DOCS / "images/environments").glob("*.jpg")}
     tasks = [f"{task}{level}" for task in ("goal", "button", "push") for level in "012"]
-    assert set(found) == {f"{robot}_{task}" for robot in ("point", "car", "doggo") for task in tasks}
+    drawn = {f"{robot}_{task}" for robot in ("point", "car", "doggo") for task in tasks}
+    assert set(found) == drawn | set(velocities.suite())
     assert max(found.values()) <= 25_000

@@ -117,6 +117,40 @@ def test_contacts_count_for_what_a_body_carries_and_poses_come_along():
         assert readings.fields["xmat"].shape == (3, 3, 3) and readings.sensors.shape == (0,)
 
 
+def test_inertias_velocities_and_forces_are_mujocos(page):
+    """A wheel is driven over the floor. No sensor of the model asks for the forces."""
+    xml = """
+    <mujoco>
+      <worldbody>
+        <geom type="plane" size="1 1 1"/>
+        <body name="frame" pos="0 0 0.199">
+          <joint type="slide" axis="0 0 1"/><joint type="slide" axis="1 0 0" damping="0.1"/>
+          <geom size="0.1" contype="0"/>
+          <body name="wheel" pos="0 0 0"><joint name="axle" axis="0 1 0"/><geom size="0.2"/></body>
+        </body>
+      </worldbody>
+      <actuator><motor joint="axle" gear="3"/></actuator>
+    </mujoco>"""
+    fields = ("subtree_com", "cinert", "cvel", "cfrc_ext", "qfrc_actuator")
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)
+    data.ctrl[:] = 0.5
+    mujoco.mj_step(model, data, 10)
+    mujoco.mj_forward(model, data)
+    mujoco.mj_rnePostConstraint(model, data)
+    assert abs(data.cfrc_ext).max() > 100 and abs(data.cvel).max() > 0.01
+    simulation = Simulation(mujoco.MjSpec.from_string(xml), substeps=10, fields=fields)
+    for name in ENGINES:
+        engine = make_engine(name, simulation)
+        run = jax.jit(engine.run, compiler_options=FAST)
+        _, readings = run(engine.start(), jnp.array([0.5]))
+        assert readings.sensors.shape == (0,)
+        for field in fields:
+            their = getattr(data, field)
+            error = np.abs(readings.fields[field] - their).max()
+            assert error < 1e-3 * max(1.0, np.abs(their).max()), (name, field)
+
+
 def test_a_model_that_our_kernels_are_not_for_runs_on_mujoco_warps_and_one_line_says_so(page, capfd):
     xml = page.XML.replace("<option ", '<option integrator="implicitfast" ')
     engine = make_engine("warp", Simulation(mujoco.MjSpec.from_string(xml), substeps=2))

@@ -71,7 +71,10 @@ def test_no_keys_drive_a_robot_of_ones_own(tmp_path):
     env = envs.make("point_goal0", engine="c", robot_base=str(own))
     with pytest.raises(ConfigError, match=r"rover\.xml'?: keys drive point, car, doggo alone"):
         watch.Playback(env)
-    with pytest.raises(ConfigError, match="only Safety Gym's environments can be drawn, not a Simple"):
+    with pytest.raises(
+        ConfigError,
+        match="only Safety Gym's environments and velocity tasks can be drawn, not a Simple",
+    ):
         watch.Playback(SimpleNamespace())  # type: ignore[arg-type]
     assert robot_of(envs.make("car_goal0", engine="c", robot_base="xmls/car.xml")) == "car"
 

@@ -59,6 +59,8 @@ def test_every_environment_of_the_suite_has_an_id():
     assert {"jaxsafe/point_goal1", "jaxsafe/PointGoal1-v0"} <= ids
     kwargs = [gymnasium.spec(f"jaxsafe/{name}").kwargs for name in ("point_goal1", "PointGoal1-v0")]
     assert kwargs == [{"env": "point_goal1"}] * 2
+    older = gymnasium.spec("jaxsafe/SafetyAntVelocity-v0").kwargs
+    assert older == {"env": "ant_velocity", "thresholds": "v0"}
 
 
 @pytest.mark.filterwarnings("error")
@@ -252,7 +254,9 @@ def test_bad_input_is_one_line():
         GymEnv(Ticker(), lives=(1, 1))
     with pytest.raises(ConfigError, match="expected 'rgb_array'"):
         GymVectorEnv(Ticker(), render_mode="human")
-    with pytest.raises(ConfigError, match="only Safety Gym's environments can be drawn"):
+    with pytest.raises(
+        ConfigError, match="only Safety Gym's environments and velocity tasks can be drawn"
+    ):
         GymEnv(Ticker(), render_mode="rgb_array")
 
 

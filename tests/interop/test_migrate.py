@@ -9,6 +9,7 @@ from shell import typed
 
 from jaxsafe import algos, envs
 from jaxsafe.config import ConfigError
+from jaxsafe.envs.safety_gym import suite
 from jaxsafe.interop import migrate
 from jaxsafe.run import arguments
 
@@ -196,7 +197,7 @@ def test_every_option_that_a_key_becomes_exists():
         ({}, "SACLag", "point_goal1", "off-policy"),
         ({}, "", "point_goal1", "add --algo"),
         ({}, "CPO", "", "add --env"),
-        ({}, "CPO", "SafetyHalfCheetahVelocity-v1", "no counterpart"),
+        ({}, "CPO", "SafetyRacecarGoal1-v0", "no counterpart"),
         ({}, "CPO", "point_gaol1", "did you mean 'point_goal1'"),
     ],
 )
@@ -206,8 +207,24 @@ def test_bad_input_is_one_line(config, algo, env, message):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize(
+    "theirs, ours",
+    {
+        "SafetyHalfCheetahVelocity-v1": ["env=halfcheetah_velocity"],
+        "SafetyAntVelocityGymnasium-v1": ["env=ant_velocity"],
+        "SafetySwimmerVelocity-v0": ["env=swimmer_velocity", "env.thresholds=v0"],
+    }.items(),
+)
+def test_a_velocity_task_is_migrated_with_its_thresholds(theirs, ours):
+    assert migrate.find_environment(theirs) == ours
+    for options in (ours, [f"env={theirs.replace('Gymnasium-', '-')}"]):
+        settings = arguments.compose(options)
+        assert settings.plain()["env"]["thresholds"] == theirs[-2:]
+        assert f"env={settings.env_name}" == ours[0]
+
+
 def test_the_options_of_every_registered_environment_are_its_name():
-    for name, options in envs.ENVS.items():
+    for name, options in suite.suite().items():
         assert migrate.safety_gym(options).argv == [f"env={name}"]
 
 

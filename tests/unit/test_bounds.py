@@ -30,9 +30,12 @@ from jaxsafe.run.settings import (
 )
 
 CONFIGS = {name: row.config for name, row in algos.ALGOS.items()}
-CONFIGS |= {cls.__name__: cls for cls in (TrainConfig, envs.SafetyGymConfig, WrapConfig)}
+CONFIGS |= {
+    cls.__name__: cls for cls in (TrainConfig, envs.SafetyGymConfig, envs.VelocityConfig, WrapConfig)
+}
 INFINITE = {  # fields whose comment or bounds say what infinity means
-    "total_iterations", "lam_max", "max_grad_norm", "target_kl",
+    "total_iterations", "lam_max", "max_grad_norm", "target_kl", "healthy_z_range",
+    "healthy_angle_range", "healthy_state_range",
 }  # fmt: skip
 
 

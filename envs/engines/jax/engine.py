@@ -1,11 +1,13 @@
 """Engine `jax`: a physics step of MJX, with contacts and a solver of our own."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 from mujoco import mjx
-from mujoco.mjx._src import forward, sensor
+from mujoco.mjx._src import forward, scan, sensor, smooth
 
 from jaxsafe.config import ConfigError
 from jaxsafe.envs.engines.jax import contacts  # noqa: F401  (registers our collisions with MJX)
@@ -14,10 +16,7 @@ from jaxsafe.envs.engines.rows import STATE
 from jaxsafe.envs.engines.simulation import Engine, Physics, PhysicsCall, Readings, Simulation, mocap_at
 
 State = dict[str, jax.Array]  # of a world between two substeps
-INTEGRATORS = {
-    mujoco.mjtIntegrator.mjINT_EULER: forward.euler,
-    mujoco.mjtIntegrator.mjINT_IMPLICITFAST: forward.implicit,
-}
+IN_IMPL = ("cinert", "cfrc_ext")  # fields of an engine's own part of MJX's data
 
 
 def forward_pass(model: mjx.Model, data: mjx.Data) -> mjx.Data:
@@ -25,6 +24,52 @@ def forward_pass(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     data = forward.fwd_velocity(model, forward.fwd_position(model, data))
     data = forward.fwd_acceleration(model, forward.fwd_actuation(model, data))
     return solve(model, data)
+
+
+def euler(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    return forward.euler(model, forward_pass(model, data))
+
+
+def implicitfast(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    return forward.implicit(model, forward_pass(model, data))
+
+
+def runge_kutta(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """A step of the fourth order, from slopes k at four stages.
+
+        k_i = f(x + a_i h k_{i-1}),   x(t + h) = x + h sum_i b_i k_i
+
+    x: positions and velocities, f: velocities and accelerations. Positions move on their manifold.
+    Source: Kutta (1901), as MuJoCo has it.
+    """
+    h, qpos, qvel = model.opt.timestep, data.qpos, data.qvel
+    zero = jnp.zeros_like(qvel)
+
+    def moved(velocity: jax.Array, seconds: jax.Array) -> jax.Array:
+        def integrate(*args: Any) -> jax.Array:
+            return forward._integrate_pos(*args, dt=seconds)
+
+        return scan.flat(model, integrate, "jqv", "q", model.jnt_type, qpos, velocity)
+
+    def stage(carry: Any, weights: tuple[jax.Array, jax.Array]) -> tuple[Any, None]:
+        (velocity, acceleration), (sum_v, sum_a), _ = carry
+        a, b = weights
+        at = data.replace(qpos=moved(velocity, a * h), qvel=qvel + a * h * acceleration)
+        at = forward_pass(model, at)
+        slope = at.qvel, at.qacc
+        return (slope, (sum_v + b * at.qvel, sum_a + b * at.qacc), at.qacc), None
+
+    weights = jnp.array([0, 1 / 2, 1 / 2, 1]), jnp.array([1 / 6, 1 / 3, 1 / 3, 1 / 6])
+    start = (qvel, zero), (zero, zero), zero
+    (_, (velocity, acceleration), last), _ = jax.lax.scan(stage, start, weights)
+    return data.replace(qpos=moved(velocity, h), qvel=qvel + h * acceleration, qacc_warmstart=last)
+
+
+INTEGRATORS = {  # a step, its forward passes included
+    mujoco.mjtIntegrator.mjINT_EULER: euler,
+    mujoco.mjtIntegrator.mjINT_IMPLICITFAST: implicitfast,
+    mujoco.mjtIntegrator.mjINT_RK4: runge_kutta,
+}
 
 
 def make(simulation: Simulation) -> Engine:
@@ -36,8 +81,8 @@ def make(simulation: Simulation) -> Engine:
     option = compiled.opt
     if option.integrator not in INTEGRATORS or option.cone != mujoco.mjtCone.mjCONE_PYRAMIDAL:
         raise ConfigError(
-            "env.engine='jax': expected a model with integrator Euler or implicitfast and pyramidal "
-            "friction cones; c and warp take other integrators and cones"
+            "env.engine='jax': expected a model with integrator Euler, implicitfast or RK4 and "
+            "pyramidal friction cones; c and warp take other integrators and cones"
         )
     try:
         with jax.ensure_compile_time_eval():
@@ -62,6 +107,8 @@ def runner(
     timestep = compiled.opt.timestep
 
     def readings(data: mjx.Data) -> Readings:
+        if "cfrc_ext" in simulation.fields:
+            data = smooth.rne_postconstraint(model, data)
         for sense in (sensor.sensor_pos, sensor.sensor_vel, sensor.sensor_acc):
             data = sense(model, data)
         contact = data._impl.contact  # type: ignore[union-attr]
@@ -70,7 +117,10 @@ def runner(
         return Readings(
             sensors=data.sensordata,
             contacts=(met & (contact.dist <= 0)[:, None]).sum(0).astype(jnp.float32),
-            fields={name: getattr(data, name) for name in simulation.fields},
+            fields={
+                name: getattr(data._impl if name in IN_IMPL else data, name)
+                for name in simulation.fields
+            },
             overflow=jnp.zeros(()),
         )
 
@@ -90,7 +140,7 @@ def runner(
             return data.replace(mocap_pos=jnp.where(substeps > 0, moved, base))
 
         def substep(state: State, k: jax.Array) -> tuple[State, None]:
-            moved = integrate(model, forward_pass(model, after(state, k)))
+            moved = integrate(model, after(state, k))
             return {f: jnp.where(k < substeps, getattr(moved, f), state[f]) for f in STATE}, None
 
         state: State = dict(zip(STATE, (physics.qpos, physics.qvel, physics.warmstart), strict=True))

@@ -54,6 +54,7 @@ READABLE = [  # sensors that need nothing which is not written
         "JOINTLIMITVEL", "JOINTLIMITFRC", "GEOMDIST", "GEOMNORMAL", "GEOMFROMTO", "CONTACT", "CLOCK",
     )
 ]  # fmt: skip
+UNWRITTEN = {"qfrc_actuator", "cfrc_ext"}  # fields that are not written
 
 
 @wp.struct
@@ -192,7 +193,7 @@ class Plan:
     system: Any
     sizes: tuple[int, int, int, int]  # bodies, joints, degrees of freedom, actuators
     damped: bool
-    readable: bool  # whether its sensors need nothing else
+    readable: bool  # whether its sensors, and the fields asked for, need nothing else
     pillars: pillars.Pillars | None
 
 
@@ -265,7 +266,9 @@ def uncovered(model: mujoco.MjModel, m: Any, d: Any) -> list[str]:
     return [*solver.uncovered(m, d), *(name for name, is_so in found.items() if is_so)]
 
 
-def adopt(model: mujoco.MjModel, m: Any, d: Any, upright: Sequence[str] = ()) -> bool:
+def adopt(
+    model: mujoco.MjModel, m: Any, d: Any, upright: Sequence[str] = (), fields: Sequence[str] = ()
+) -> bool:
     """Have `step` and `forward` run `d` here, unless something is `uncovered`.
 
     The solver may adopt `d` even so. The arrays of `m` and `d` are bound now, and options looked at:
@@ -274,6 +277,7 @@ def adopt(model: mujoco.MjModel, m: Any, d: Any, upright: Sequence[str] = ()) ->
     Args:
         model: what `m` and `d` were made of.
         upright: the model's pillars, see `Simulation.pillars`.
+        fields: what the last pass is to leave in `d`, see `Simulation.fields`.
     """
     solver.adopt(model, m, d)
     if uncovered(model, m, d):
@@ -292,7 +296,7 @@ def adopt(model: mujoco.MjModel, m: Any, d: Any, upright: Sequence[str] = ()) ->
         system=p,
         sizes=sizes_of(model),
         damped=bool(m.dof_damping.numpy().any()),
-        readable=bool(np.isin(model.sensor_type, READABLE).all()),
+        readable=bool(np.isin(model.sensor_type, READABLE).all()) and UNWRITTEN.isdisjoint(fields),
         pillars=pillars.adopt(model, m, d, upright),
     )
     return True

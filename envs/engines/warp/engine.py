@@ -195,7 +195,7 @@ class Kernels:
             contacts, room["njmax"] = self.simulation.room
             room["naconmax"] = contacts * worlds + FEW_WORLDS
         data = mujoco_warp.make_data(self.model, nworld=worlds, **room)
-        adopted = adopt(self.model, m, data, self.simulation.pillars)
+        adopted = adopt(self.model, m, data, self.simulation.pillars, self.simulation.fields)
         if not adopted and not self.said:
             self.said = True
             reasons = ", ".join(uncovered(self.model, m, data))

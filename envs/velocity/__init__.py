@@ -1,0 +1,1 @@
+"""Velocity tasks of Safety-Gymnasium: run, but not faster than a threshold."""
