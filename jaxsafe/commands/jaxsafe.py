@@ -2,6 +2,7 @@
 
 import importlib
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 COMMANDS = {
@@ -22,6 +23,9 @@ def main() -> int:
     name, *rest = sys.argv[1:] or ["--help"]
     if name in ("-h", "--help"):
         print(overview())
+        return 0
+    if name == "--version":
+        print(f"jaxsafe {version('jaxsafe')}")
         return 0
     if name not in COMMANDS:
         from jaxsafe.config import nearest  # late: it imports JAX, which takes a second

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from shell import SCRIPTS
 
+from jaxsafe import __version__
 from jaxsafe.commands import jaxsafe
 from jaxsafe.commands.train import resume_command
 from jaxsafe.run.settings import settings_from_options
@@ -27,6 +28,11 @@ def test_alone_it_lists_every_command_on_one_screen(args, monkeypatch, capsys):
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) <= 24 and all(len(line) <= 80 for line in lines)
     assert [line.split()[0] for line in lines if line.startswith("  ")] == [*jaxsafe.COMMANDS]
+
+
+def test_it_says_its_version(monkeypatch, capsys):
+    assert run(monkeypatch, "--version") == 0
+    assert capsys.readouterr().out == f"jaxsafe {__version__}\n"
 
 
 def test_every_command_has_a_module_and_a_thin_script():

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import chex
 import jax
 import jax.numpy as jnp
 import pytest
@@ -28,7 +29,7 @@ def kinds(tree):
 @pytest.mark.parametrize("name", NAMES)
 def test_an_update_keeps_the_structure(name):
     before, after, metrics = shapes(name)
-    assert jax.tree.structure(before) == jax.tree.structure(after)
+    chex.assert_trees_all_equal_structs(before, after)
     assert kinds(before) == kinds(after)
     assert all(x.dtype == jnp.float32 and x.shape == () for x in metrics.values())
     assert {"train/return", "train/cost", "train/cost_estimate", "train/nonfinite"} <= metrics.keys()
@@ -37,7 +38,7 @@ def test_an_update_keeps_the_structure(name):
 @pytest.mark.parametrize("name", NAMES)
 def test_an_update_with_every_option_at_once_keeps_the_structure(name):
     before, after, _ = shapes(name, **every_option(name))
-    assert jax.tree.structure(before) == jax.tree.structure(after)
+    chex.assert_trees_all_equal_structs(before, after)
     assert kinds(before) == kinds(after)
 
 
@@ -51,7 +52,7 @@ def test_the_algorithms_by_adam_share_a_trunk_and_the_others_say_that_they_do_no
         return
     assert algo.clocks(cfg).updates == cfg.POLICY_STEPS * cfg.epochs * cfg.minibatches
     before, after, metrics = shapes(name, Ticker(), trunk="shared")
-    assert jax.tree.structure(before) == jax.tree.structure(after)
+    chex.assert_trees_all_equal_structs(before, after)
     assert [*before.params] == ["actor"] and before.opt_state["critics"] == ()
     assert before.params["actor"]["mean"]["params"]["Dense_1"]["bias"].shape == (1 + 2,)
     assert {"train/value_loss_r", "train/value_loss_c", "train/nonfinite"} <= metrics.keys()

@@ -4,6 +4,7 @@ import dataclasses
 from functools import cache
 from typing import Any, NamedTuple
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -52,9 +53,9 @@ def senseless(ts: PyTree, *where: int) -> PyTree:
 @pytest.mark.parametrize("name", COMPILED)
 def test_an_update_moves_every_parameter_and_stays_finite(name):
     before, after, metrics = first_update(name)
-    assert jax.tree.structure(before) == jax.tree.structure(after)
+    chex.assert_trees_all_equal_structs(before, after)
     assert [x.aval for x in jax.tree.leaves(before)] == [x.aval for x in jax.tree.leaves(after)]
-    assert all(jnp.isfinite(x).all() for x in jax.tree.leaves((after.params, metrics)))
+    chex.assert_tree_all_finite((after.params, metrics))
     assert (metrics["train/nonfinite"] == 0).all()
     for a, b in zip(*map(jax.tree.leaves, (before.params, after.params)), strict=True):
         assert (a != b).reshape(3, -1).any(1).all()
@@ -129,9 +130,7 @@ def test_two_updates_with_every_option_at_once_are_finite(name):
     ts = begin(name, **every_option(name, ESTIMATORS.get(name, "vtrace")))
     ts, _ = compiled(name).update(ts)
     ts, metrics = compiled(name).update(ts)
-    assert all(
-        jnp.isfinite(x).all() for x in jax.tree.leaves((ts.params, ts.signal_normaliser, metrics))
-    )
+    chex.assert_tree_all_finite((ts.params, ts.signal_normaliser, metrics))
     assert metrics["train/nonfinite"] == 0 and ts.signal_normaliser.count == 2 * 8 * 25
     after, metrics = compiled(name).update(senseless(ts))  # leaves the statistics of rewards alone, too
     assert metrics["train/nonfinite"] > 0
