@@ -18,7 +18,7 @@ from jaxsafe.learn.row import Row
 from jaxsafe.learn.steps import Context, Pair, PolicyStep, require_separate_trunk
 from jaxsafe.learn.surrogates import plain
 from jaxsafe.learn.trust_region import conjugate_gradient, distance, fisher_product, line_search
-from jaxsafe.nn.networks import policy
+from jaxsafe.nn.networks import action_dist
 from jaxsafe.types import Algorithm, Env, Metrics, PyTree
 
 
@@ -213,7 +213,7 @@ def gradients(actor: PyTree, objectives: Pair, batch: Any, context: Context) -> 
     gradient = jax.jacrev if jnp.ndim(context.violation) else jax.grad  # [K, P], or [P]
     b = pmean(gradient(lambda params: objectives.cost(unravel(params), batch)[0])(start), axis_name)
     product = fisher_product(
-        lambda params: policy(unravel(params), batch.obs, cfg), start, batch.old, cfg, axis_name
+        lambda params: action_dist(unravel(params), batch.obs, cfg), start, batch.old, cfg, axis_name
     )
     solve = jax.vmap(lambda v: conjugate_gradient(product, v, cfg.cg_iterations))
     h, residual = solve(jnp.concatenate([g[None], b.reshape(-1, g.size)]))
@@ -251,7 +251,7 @@ def step_by(rule: Rule) -> PolicyStep:
             actor = unravel(params)
             both = objectives.reward(actor, batch)[0], objectives.cost(actor, batch)[0]
             reward, cost = pmean(both, axis_name)
-            return reward, cost, distance(batch.old, policy(actor, batch.obs, cfg), cfg, axis_name)
+            return reward, cost, distance(batch.old, action_dist(actor, batch.obs, cfg), cfg, axis_name)
 
         found = gradients(actor, objectives, batch, context)
         g, b, h_g, h_b = found.g, found.b, found.h_g, found.h_b

@@ -15,7 +15,7 @@ from jaxsafe.learn.steps import Context, adam_epochs
 from jaxsafe.learn.surrogates import clipped, plain, with_entropy
 from jaxsafe.learn.treatments import LagrangianConfig, lagrangian
 from jaxsafe.nn.gaussian import kl
-from jaxsafe.nn.networks import policy
+from jaxsafe.nn.networks import action_dist
 from jaxsafe.types import Algorithm, Env, Metrics, PyTree
 
 
@@ -58,7 +58,7 @@ def projection(
     actor: PyTree, batch: Batch, lam: jax.Array | float, cfg: Any
 ) -> tuple[jax.Array, Metrics]:
     """What the second step maximises, with `batch.old` the policy of the first."""
-    dist = policy(actor, batch.obs, cfg)
+    dist = action_dist(actor, batch.obs, cfg)
     scale = (1 - cfg.cost_discount * cfg.cost_gae_lambda) / (1 - cfg.cost_discount)
     cost, _ = each(lambda adv_c: plain(dist, batch, adv_c, cfg), constrained_costs(cfg))(batch.adv_c)
     return -(jnp.sum(lam * scale * cost) + jnp.mean(kl(dist, batch.old))), {}
@@ -72,12 +72,12 @@ def make(env: Env, axis_name: str | None = None) -> Algorithm:
 
         def earn(actor: PyTree, batch: Batch) -> tuple[jax.Array, Metrics]:
             earned = with_entropy(clipped, context.iteration)
-            return earned(policy(actor, batch.obs, cfg), batch, batch.adv_r, cfg)
+            return earned(action_dist(actor, batch.obs, cfg), batch, batch.adv_r, cfg)
 
         actor, opt_state, metrics = adam_epochs.update(
             ts.params["actor"], ts.opt_state["actor"], earn, batch, contexts[0]
         )
-        better = dataclasses.replace(batch, old=policy(actor, batch.obs, cfg))
+        better = dataclasses.replace(batch, old=action_dist(actor, batch.obs, cfg))
 
         def project(actor: PyTree, batch: Batch) -> tuple[jax.Array, Metrics]:
             return projection(actor, batch, dual.lam, cfg)

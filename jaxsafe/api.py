@@ -166,7 +166,7 @@ class Run:
         Raises:
             ConfigError: no such policy, or no checkpoint yet.
         """
-        self._opened.actor(index)
+        self._opened.one(index)
         return self._act(self._opened.learned, index, obs, key)
 
     def player(self, index: int = 0) -> Player:
@@ -182,7 +182,7 @@ class Run:
         Raises:
             ConfigError: no such policy, or no checkpoint yet.
         """
-        return self._opened.actor(index).player
+        return self._opened.one(index).player
 
     def env(self, index: int = 0) -> Env:
         """The environment as a policy meets it: with what an algorithm adds to the observation, as
@@ -390,7 +390,7 @@ def render(
     out = Path(path or run.folder / "video.mp4").expanduser()
     film.check_video(out)
     index, seed = convert(index, Index, "index"), convert(seed, Seed, "seed")
-    film.film([run._opened.actor(index)], out, seed)
+    film.film([run._opened.one(index)], out, seed)
     return out
 
 

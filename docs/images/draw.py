@@ -79,9 +79,9 @@ def draw_velocity(name: str) -> None:
 
 def draw_policy(run: Path, seed: int, begin: int) -> None:
     """A part of an episode of the policy in `run`, from step `begin` on, as a small GIF."""
-    actor = open_run(run).actor(0)
-    states = render.run_episode(actor.player, jax.random.key(seed), begin + STEPS)
-    drawing = render.Renderer(actor.env, 560, 400, camera((0.0, 0.0, 0.0), 4.5, elevation=-55))
+    policy = open_run(run).one(0)
+    states = render.run_episode(policy.player, jax.random.key(seed), begin + STEPS)
+    drawing = render.Renderer(policy.env, 560, 400, camera((0.0, 0.0, 0.0), 4.5, elevation=-55))
     frames = [
         Image.fromarray(drawing.frame(jax.tree.map(lambda x, t=t: x[t], states)))
         for t in range(begin, begin + STEPS, EVERY)

@@ -31,10 +31,11 @@ def command() -> int:
     several = len(folders) > 1
     out = args.out or (Path("compared.mp4") if several else folders[0] / "video.mp4")
     check_video(out)
-    actors = what.actors(args.index)
-    check_one_task(folders, actors)
-    names = labels(folders, [actor.settings.algo_name for actor in actors]) if several else None
-    print(f"filming {len(actors)} x 1 episode of {actors[0].settings.env_name} ...", file=sys.stderr)
-    film(actors, out, args.seed, names)
+    policies = what.policies(args.index)
+    check_one_task(folders, policies)
+    names = labels(folders, [policy.settings.algo_name for policy in policies]) if several else None
+    task = policies[0].settings.env_name
+    print(f"filming {len(policies)} x 1 episode of {task} ...", file=sys.stderr)
+    film(policies, out, args.seed, names)
     print(out)
     return 0

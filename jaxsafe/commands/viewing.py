@@ -7,7 +7,7 @@ from typing import NamedTuple
 from jaxsafe.config import ConfigError, Index, Seed
 from jaxsafe.run.arguments import fail, number
 from jaxsafe.run.devices import use_compilation_cache
-from jaxsafe.run.policies import CODE, ROBOT, Actor, open_run
+from jaxsafe.run.policies import CODE, ROBOT, RunPolicy, open_run
 
 
 class Targets(NamedTuple):
@@ -16,9 +16,9 @@ class Targets(NamedTuple):
     folders: list[Path]  # of runs
     options: list[str]  # env=..., env.OPTION=..., algo=MODULE:NAME
 
-    def actors(self, index: int) -> list[Actor]:
+    def policies(self, index: int) -> list[RunPolicy]:
         """Policy number `index` of each run."""
-        return [open_run(folder, self.options).actor(index) for folder in self.folders]
+        return [open_run(folder, self.options).one(index) for folder in self.folders]
 
 
 def parser_of(description: str, what: str, more: str) -> argparse.ArgumentParser:

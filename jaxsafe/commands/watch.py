@@ -35,9 +35,9 @@ def command() -> int:
     if page:
         watch.check_page(args.port, args.open)
     if what.folders:
-        (actor,) = what.actors(args.index)
-        title = f"{actor.settings.env_name}, {actor.settings.algo_name}"
-        env, player = actor.env, actor.player
+        (policy,) = what.policies(args.index)
+        title = f"{policy.settings.env_name}, {policy.settings.algo_name}"
+        env, player = policy.env, policy.player
     else:
         settings = compose(what.options)
         if settings.env_options.get("engine") == "auto":  # one environment gains from no other

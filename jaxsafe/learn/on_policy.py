@@ -68,9 +68,9 @@ from jaxsafe.learn.surrogates import Surrogate, with_entropy
 from jaxsafe.learn.treatments import Treatment
 from jaxsafe.nn.gaussian import Gaussian, entropy, log_prob, sample
 from jaxsafe.nn.networks import (
+    action_dist,
     init_params,
     init_recurrent,
-    policy,
     recurrent_step,
     share_trunk,
     stack,
@@ -236,7 +236,7 @@ def on_policy(
         def objective(actor: PyTree, batch: Batch) -> tuple[jax.Array, Metrics]:
             advantage = treatment.advantage(dual, batch.adv_r, batch.adv_c)
             earned = with_entropy(surrogate, context.iteration)
-            return earned(policy(actor, batch.obs, cfg), batch, advantage, cfg)
+            return earned(action_dist(actor, batch.obs, cfg), batch, advantage, cfg)
 
         actor, opt_state, metrics = step.update(
             ts.params["actor"], ts.opt_state["actor"], objective, batch, context
@@ -267,10 +267,10 @@ def on_policy_pair(
 
         def objective_r(actor: PyTree, batch: Batch) -> tuple[jax.Array, Metrics]:
             earned = with_entropy(surrogate, context.iteration)
-            return earned(policy(actor, batch.obs, cfg), batch, batch.adv_r, cfg)
+            return earned(action_dist(actor, batch.obs, cfg), batch, batch.adv_r, cfg)
 
         def objective_c(actor: PyTree, batch: Batch) -> tuple[jax.Array, Metrics]:
-            dist = policy(actor, batch.obs, cfg)
+            dist = action_dist(actor, batch.obs, cfg)
 
             def of_one(adv_c: jax.Array) -> tuple[jax.Array, Metrics]:
                 return (surrogate_c or surrogate)(dist, batch, adv_c, cfg)
@@ -397,7 +397,7 @@ def on_policy_loop(env: Env, method: Method, axis_name: str | None) -> Algorithm
         metrics["train/nonfinite"] += fitted.skipped + ~finite
         metrics |= {f"train/cost_estimate_{name}": cost.of_iteration[k] for k, name in enumerate(names)}
         metrics |= rollout_metrics(env, traj, weight, length, axis_name)
-        dist = policy(improved.actor, batch.obs, cfg)
+        dist = action_dist(improved.actor, batch.obs, cfg)
         metrics["train/entropy"] = batch_mean(entropy(dist), axis_name)
         return after, jax.tree.map(jnp.float32, metrics)
 
@@ -439,7 +439,7 @@ def decide(learned: Learned, carry: PyTree, obs: jax.Array) -> tuple[Gaussian, P
     if cfg.trunk == "gru":
         carry, dist, _ = recurrent_step(actor, carry, inputs, cfg)
         return dist, carry
-    return policy(actor, inputs, cfg), carry
+    return action_dist(actor, inputs, cfg), carry
 
 
 def initial_carry(learned: Learned) -> PyTree:

@@ -16,7 +16,7 @@ from jaxsafe.config import ConfigError, Iterations, KLStop, Rate, config
 from jaxsafe.learn.batch import batch_mean, pmean, select
 from jaxsafe.learn.conventions import Convention
 from jaxsafe.nn.gaussian import Gaussian, kl
-from jaxsafe.nn.networks import outputs, policy, value
+from jaxsafe.nn.networks import action_dist, outputs, value
 from jaxsafe.types import Count, Metrics, PyTree
 
 # (actor, batch) -> (this device's mean of what to maximise, metrics)
@@ -175,7 +175,7 @@ def update_adam(
     def next_pass(now: Passes) -> Passes:
         key, shuffle_key = jax.random.split(now.key)
         trained, skips = one_pass(minibatch_step, now.trained, batch, shuffle_key, cfg.minibatches)
-        divergence = mean_kl(batch.old, policy(trained.params, batch.obs, cfg), axis_name)
+        divergence = mean_kl(batch.old, action_dist(trained.params, batch.obs, cfg), axis_name)
         return Passes(trained, key, now.count + 1, divergence, now.skipped + skips.sum())
 
     start = Passes(Trainable(actor, opt_state), context.key, jnp.int32(0), jnp.zeros(()), jnp.int32(0))

@@ -16,7 +16,7 @@ from jaxsafe.learn.batch import all_finite, pmean
 from jaxsafe.learn.conventions import Convention
 from jaxsafe.learn.steps import Context, Objective, PolicyStep, mean_kl, require_separate_trunk
 from jaxsafe.nn.gaussian import Gaussian, kl
-from jaxsafe.nn.networks import policy
+from jaxsafe.nn.networks import action_dist
 from jaxsafe.types import Metrics, PyTree
 
 Matvec = Callable[[jax.Array], jax.Array]
@@ -183,11 +183,11 @@ def update_natural(
     def evaluate(params: jax.Array) -> tuple[jax.Array, jax.Array]:
         actor = unravel(params)
         gain = pmean(objective(actor, batch)[0], axis_name)
-        return gain, distance(batch.old, policy(actor, batch.obs, cfg), cfg, axis_name)
+        return gain, distance(batch.old, action_dist(actor, batch.obs, cfg), cfg, axis_name)
 
     g = pmean(jax.grad(lambda params: objective(unravel(params), batch)[0])(start), axis_name)
     product = fisher_product(
-        lambda params: policy(unravel(params), batch.obs, cfg), start, batch.old, cfg, axis_name
+        lambda params: action_dist(unravel(params), batch.obs, cfg), start, batch.old, cfg, axis_name
     )
     h_g, residual = conjugate_gradient(product, g, cfg.cg_iterations)
     step = jnp.sqrt(2 * cfg.target_kl / jnp.maximum(g @ h_g, 1e-20)) * h_g

@@ -163,7 +163,7 @@ def outputs(actor: PyTree, inputs: Any, cfg: Any) -> tuple[jax.Array, jax.Array]
     return out[..., :size], out[..., size:]
 
 
-def policy(actor: PyTree, inputs: Any, cfg: Any) -> Gaussian:
+def action_dist(actor: PyTree, inputs: Any, cfg: Any) -> Gaussian:
     """The policy's action distribution; its mean and log std are [..., A].
 
     Args:
@@ -235,7 +235,7 @@ def apply_to_rollout(
     actor = params["actor"]
     if cfg.trunk != "gru":
         v, next_v = values(params, obs, cfg), values(params, next_obs, cfg)
-        return RolloutOutputs(obs, policy(actor, obs, cfg), v, next_v)
+        return RolloutOutputs(obs, action_dist(actor, obs, cfg), v, next_v)
     inputs = Sequences(jnp.swapaxes(obs, 0, 1), jnp.swapaxes(first, 0, 1), carry)
     h, out = unroll(net_of(actor, cfg), actor["mean"], inputs)
     h, out = jnp.swapaxes(h, 0, 1), jnp.swapaxes(out, 0, 1)

@@ -8,7 +8,7 @@ import jax
 from jaxsafe.config import ConfigError, one_line
 from jaxsafe.envs.view import render
 from jaxsafe.run import files
-from jaxsafe.run.policies import Actor
+from jaxsafe.run.policies import RunPolicy
 
 OF_PHYSICS = ("engine", "awake")  # options that leave a task what it is
 
@@ -29,7 +29,7 @@ def check_video(path: Path) -> None:
         raise ConfigError(f"{path} cannot be written")
 
 
-def film(actors: list[Actor], path: Path, seed: int, labels: list[str] | None = None) -> None:
+def film(policies: list[RunPolicy], path: Path, seed: int, labels: list[str] | None = None) -> None:
     """Write one episode of each deterministic policy as a video, side by side in labelled panels.
 
     Raises:
@@ -39,7 +39,7 @@ def film(actors: list[Actor], path: Path, seed: int, labels: list[str] | None = 
     try:
         films = [
             render.render_episode(a.env, a.player, key, label=label)  # type: ignore[arg-type]
-            for a, label in zip(actors, labels or [None] * len(actors), strict=True)
+            for a, label in zip(policies, labels or [None] * len(policies), strict=True)
         ]
     except render.NoDisplay as error:
         raise NoVideo(one_line(error)) from error
@@ -48,12 +48,12 @@ def film(actors: list[Actor], path: Path, seed: int, labels: list[str] | None = 
         render.write_video(render.side_by_side(films), part, fps=30)
 
 
-def check_one_task(folders: list[Path], actors: list[Actor]) -> None:
+def check_one_task(folders: list[Path], policies: list[RunPolicy]) -> None:
     """Raise ConfigError where layouts would differ."""
     tasks = [
         {"env": a.settings.env_name}
         | {f"env.{k}": v for k, v in a.settings.env_options.items() if k not in OF_PHYSICS}
-        for a in actors
+        for a in policies
     ]
     for folder, task in zip(folders, tasks, strict=True):
         for name, value in tasks[0].items():

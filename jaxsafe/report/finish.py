@@ -9,7 +9,7 @@ from jaxsafe.report import evaluation, plots
 from jaxsafe.report.film import film
 from jaxsafe.run import files, run_folder
 from jaxsafe.run.interrupts import Interrupts
-from jaxsafe.run.policies import RunPolicies, policy_of
+from jaxsafe.run.policies import RunPolicies, member_policies
 from jaxsafe.run.progress import Reporter
 from jaxsafe.run.session import Session
 
@@ -23,7 +23,9 @@ def finish(session: Session, report: Reporter, stop: Interrupts) -> None:
     settings, folder, env = session.settings, session.folder, session.env
     train = settings.train
     title = f"{settings.env_name}, {settings.algo_name}"
-    run = functools.cache(lambda: RunPolicies(folder, settings, env, *policy_of(settings, env, folder)))
+    run = functools.cache(
+        lambda: RunPolicies(folder, settings, env, *member_policies(settings, env, folder))
+    )
 
     def curves() -> None:
         limit = float(settings.algo.cost_limit)
@@ -45,7 +47,7 @@ def finish(session: Session, report: Reporter, stop: Interrupts) -> None:
             )
 
     def video() -> None:
-        film([run().actor(0)], folder / "video.mp4", train.seed)
+        film([run().one(0)], folder / "video.mp4", train.seed)
 
     members = len(settings.configs) * train.num_seeds
     wanted = {

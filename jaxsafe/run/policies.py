@@ -47,7 +47,7 @@ class RunPolicies(NamedTuple):
     algo: Algorithm
     learned: PyTree
 
-    def actor(self, index: int) -> "Actor":
+    def one(self, index: int) -> "RunPolicy":
         """One of the policies.
 
         Raises:
@@ -57,7 +57,7 @@ class RunPolicies(NamedTuple):
         if not 0 <= index < count:
             raise ConfigError(f"index {index}: the run has {count} policies, from 0, in {self.folder}")
         learned = jax.tree.map(lambda x: x[index], self.learned)
-        return Actor(self.settings, self.env, self.algo, learned)
+        return RunPolicy(self.settings, self.env, self.algo, learned)
 
 
 def open_run(folder: Path, code: Sequence[str] = (), extras: Extras = NO_EXTRAS) -> RunPolicies:
@@ -86,10 +86,10 @@ def open_run(folder: Path, code: Sequence[str] = (), extras: Extras = NO_EXTRAS)
     if not checkpoint.checkpoints(policy_folder(folder)):
         raise ConfigError(f"{folder} holds no checkpoint")
     env = make_env(settings)
-    return RunPolicies(folder, settings, env, *policy_of(settings, env, folder))
+    return RunPolicies(folder, settings, env, *member_policies(settings, env, folder))
 
 
-class Actor(NamedTuple):
+class RunPolicy(NamedTuple):
     """One policy of a run, ready to act."""
 
     settings: Settings
@@ -102,7 +102,7 @@ class Actor(NamedTuple):
         return Player(self.algo.policy, self.learned, self.algo.task(self.learned))
 
 
-def policy_of(settings: Settings, env: Env, folder: Path) -> tuple[Algorithm, PyTree]:
+def member_policies(settings: Settings, env: Env, folder: Path) -> tuple[Algorithm, PyTree]:
     """The algorithm, and what each member's policy has learned by the newest checkpoint, [S, ...]."""
     algo = settings.row.make(env, None)
     offline = not algo.clocks(settings.algo).steps  # shapes alone count, so that no data set is read

@@ -294,7 +294,7 @@ def test_the_policy_of_a_run_is_read_whatever_its_minibatches_divide(tmp_path, n
     )
     run_folder.write_config(tmp_path, run.plain())
     checkpoint.save(tmp_path / "policy", ones, checkpoint.Progress(1, 40, 4))
-    algo, learned = policies.policy_of(run, env, tmp_path)
+    algo, learned = policies.member_policies(run, env, tmp_path)
     learned = jax.tree.map(lambda x: x[0], learned)
     action, _, _ = algo.policy.act(learned, (), jnp.zeros(algo.task(learned).obs_size), None)
     assert action.shape == (env.action_size,)

@@ -37,7 +37,7 @@ def test_stopped_and_resumed_it_ends_bit_for_bit_as_if_uninterrupted(trained, tm
 def test_evaluated_and_filmed_it_remembers(trained):
     run = open_run(trained, ("env=toys:Corridor",))
     whole = run_episodes(run.algo, run.learned, 2, 0)
-    player = run.actor(0).player
+    player = run.one(0).player
     states = render.run_episode(player, jax.random.key(0), run.env.episode_length)
     assert np.isfinite(whole.ret).all() and np.isfinite(states.obs).all()
     state, forgetful, mindful = player.task.reset(jax.random.key(0)), player.begin(), player.begin()
@@ -53,7 +53,7 @@ def test_another_run_starts_from_it(trained, tmp_path, capsys):
     assert typed("train", *GRU, *rest, f"init_from={trained}") == 0
     before, after = (checkpoint.load(x / "policy")[0] for x in (trained, run))
     networks = [name for name in before if name.startswith("params.")]
-    assert networks and "params.actor.mean.params.GRU_0.gates.kernel" in networks
+    assert networks and "params.policy.mean.params.GRU_0.gates.kernel" in networks
     for name in networks:
         np.testing.assert_array_equal(before[name], after[name])
     other = tmp_path / "other"

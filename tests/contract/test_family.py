@@ -16,7 +16,7 @@ from jaxsafe.learn.estimates import Batch
 from jaxsafe.learn.steps import Pair, adam_epochs
 from jaxsafe.learn.surrogates import clipped, near_old, pessimistic, plain
 from jaxsafe.nn.gaussian import Gaussian, kl, log_prob, sample
-from jaxsafe.nn.networks import init_params, policy
+from jaxsafe.nn.networks import action_dist, init_params
 
 
 def batch_of(old, action, adv):
@@ -114,7 +114,7 @@ def problem(cfg):
     keys = jax.random.split(jax.random.key(0), 3)
     actor = init_params(keys[0], 3, 2, cfg)["actor"]
     obs = jax.random.normal(keys[1], (64, 3))
-    old = policy(actor, obs, cfg)
+    old = action_dist(actor, obs, cfg)
     action = sample(old, keys[2])
     adv_r, adv_c = action[:, 0], action[:, 0] + action[:, 1]
     adv_r, adv_c = adv_r - adv_r.mean(), adv_c - adv_c.mean()
@@ -132,19 +132,19 @@ def test_the_penalty_is_felt_beyond_the_limit_alone(excess, price, omnisafe):
 
     def objective(surrogate, field):
         def value(actor, batch):
-            return surrogate(policy(actor, batch.obs, cfg), batch, getattr(batch, field), cfg)
+            return surrogate(action_dist(actor, batch.obs, cfg), batch, getattr(batch, field), cfg)
 
         return value
 
     def mixed(actor, batch):
-        dist = policy(actor, batch.obs, cfg)
+        dist = action_dist(actor, batch.obs, cfg)
         reward, _ = clipped(dist, batch, batch.adv_r, cfg)
         return reward - price * of_cost(dist, batch, batch.adv_c, cfg)[0], {}
 
     pair = Pair(objective(clipped, "adv_r"), objective(p3o.surrogate_c, "adv_c"))
     state, told = adam_epochs.init(actor, cfg), context(cfg, violation=excess, episode_length=10.0)
     after, _, metrics = p3o.update(actor, state, pair, batch, told)
-    cost = p3o.surrogate_c(policy(after, batch.obs, cfg), batch, batch.adv_c, cfg)[0]
+    cost = p3o.surrogate_c(action_dist(after, batch.obs, cfg), batch, batch.adv_c, cfg)[0]
     violation = 1.0 if omnisafe else 1.0 / 10  # per episode, or per step of an episode of 10
     paid = price * (cost + violation)
     np.testing.assert_allclose(metrics["train/penalty"], paid, rtol=1e-5)
@@ -165,7 +165,7 @@ def test_the_mean_of_a_minibatchs_cost_advantages_is_not_a_violation(violation, 
         return jnp.zeros(()), {}
 
     def of_cost(actor, batch):
-        return p3o.surrogate_c(policy(actor, batch.obs, cfg), batch, batch.adv_c, cfg)
+        return p3o.surrogate_c(action_dist(actor, batch.obs, cfg), batch, batch.adv_c, cfg)
 
     told = context(cfg, violation=violation)
     _, metrics = p3o.penalised(Pair(of_reward, of_cost), told)(actor, batch)
@@ -179,7 +179,7 @@ def test_cups_projection_is_a_step_down_the_papers_loss():
     start, unravel = ravel_pytree(actor)
 
     def paper(x):
-        dist = policy(unravel(x), batch.obs, cfg)
+        dist = action_dist(unravel(x), batch.obs, cfg)
         w = jnp.exp(log_prob(dist, batch.action) - batch.log_prob)
         return jnp.mean(lam * scale * w * batch.adv_c + kl(dist, batch.old))
 

@@ -16,7 +16,7 @@ from jaxsafe.learn.normalise import normalise
 from jaxsafe.learn.steps import with_values
 from jaxsafe.learn.surrogates import clipped
 from jaxsafe.nn.gaussian import log_prob, sample
-from jaxsafe.nn.networks import init_params, policy, share_trunk, value, values
+from jaxsafe.nn.networks import action_dist, init_params, share_trunk, value, values
 
 CFG = ALGOS["ppo_lag"].config(hidden=(4,), trunk="shared", value_coef=0.3)
 
@@ -43,21 +43,23 @@ def networks() -> Any:
 
 def batch_of(actor, costs=2, size=6):
     obs = jax.random.normal(jax.random.key(3), (size, 3))
-    old = policy(actor, obs, CFG)
+    old = action_dist(actor, obs, CFG)
     action = sample(old, jax.random.key(4))
     adv, ret_c = action.sum(-1), jnp.arange(size * costs, dtype=jnp.float32).reshape(size, costs)
     return Batch(obs, action, log_prob(old, action), old, adv, ret_c, 3 * adv, ret_c)
 
 
 def earn(actor, batch):
-    return clipped(policy(actor, batch.obs, CFG), batch, batch.adv_r, CFG)
+    return clipped(action_dist(actor, batch.obs, CFG), batch, batch.adv_r, CFG)
 
 
 def test_one_trunk_gives_what_networks_with_the_same_hidden_layers_give():
     apart, shared = networks()
     obs = jax.random.normal(jax.random.key(5), (7, 5, 3))
     np.testing.assert_allclose(
-        policy(shared["actor"], obs, CFG).mean, policy(apart["actor"], obs, CFG).mean, atol=1e-6
+        action_dist(shared["actor"], obs, CFG).mean,
+        action_dist(apart["actor"], obs, CFG).mean,
+        atol=1e-6,
     )
     together = values(shared, obs, CFG)
     assert together.shape == (7, 5, 3)

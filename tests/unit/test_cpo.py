@@ -14,7 +14,7 @@ from jaxsafe.learn.estimates import Batch
 from jaxsafe.learn.steps import Pair, mean_kl
 from jaxsafe.learn.surrogates import plain
 from jaxsafe.nn.gaussian import log_prob, sample
-from jaxsafe.nn.networks import init_params, policy
+from jaxsafe.nn.networks import action_dist, init_params
 
 solve = jax.jit(multipliers)
 
@@ -181,7 +181,7 @@ def problem():
     cfg = CPOConfig(hidden=(8,))
     actor = init_params(KEYS[0], 3, 2, cfg)["actor"]
     obs = jax.random.normal(KEYS[1], (256, 3))
-    old = policy(actor, obs, cfg)
+    old = action_dist(actor, obs, cfg)
     action = sample(old, KEYS[2])
     adv_r, adv_c = action.sum(-1), 0.5 * action[:, 0]
     adv_r, adv_c = (x - x.mean() for x in (adv_r, adv_c))
@@ -192,7 +192,7 @@ def moved(cfg, actor, violation, margin, batch, axis_name=None):
     """(actor, margin, metrics) after a step; floats of the config are arguments of one program."""
 
     def objective(adv):
-        return lambda actor, batch: plain(policy(actor, batch.obs, cfg), batch, adv(batch), cfg)
+        return lambda actor, batch: plain(action_dist(actor, batch.obs, cfg), batch, adv(batch), cfg)
 
     pair = Pair(objective(lambda batch: batch.adv_r), objective(lambda batch: batch.adv_c))
     told = context(cfg, axis_name=axis_name, violation=LENGTH * violation, episode_length=LENGTH)
@@ -230,10 +230,10 @@ def test_the_margin_is_bounded_by_what_a_step_can_promise():
     actor, unravel = ravel_pytree(actor)
 
     def divergence(params):
-        return mean_kl(batch.old, policy(unravel(params), batch.obs, cfg), None)
+        return mean_kl(batch.old, action_dist(unravel(params), batch.obs, cfg), None)
 
     def cost(params):
-        return plain(policy(unravel(params), batch.obs, cfg), batch, batch.adv_c, cfg)[0]
+        return plain(action_dist(unravel(params), batch.obs, cfg), batch, batch.adv_c, cfg)[0]
 
     hessian = np.float64(jax.hessian(divergence)(actor)) + cfg.damping * np.eye(actor.size)
     b = np.float64(jax.grad(cost)(actor))

@@ -5,7 +5,7 @@ import pytest
 
 from jaxsafe.algos.ppo import PPOConfig
 from jaxsafe.nn.gaussian import log_prob
-from jaxsafe.nn.networks import LOG_STD, init_params, policy, value
+from jaxsafe.nn.networks import LOG_STD, action_dist, init_params, value
 
 
 def params(**settings):
@@ -25,7 +25,7 @@ def test_orthogonal_layers_keep_angles_and_the_policy_starts_near_zero():
     tree = params(hidden=(64, 64))
     kernel = tree["actor"]["mean"]["params"]["Dense_1"]["kernel"]
     np.testing.assert_allclose(kernel.T @ kernel, 2 * np.eye(64), atol=1e-5)
-    dist = policy(tree["actor"], jax.random.normal(jax.random.key(1), (9, 5)), PPOConfig())
+    dist = action_dist(tree["actor"], jax.random.normal(jax.random.key(1), (9, 5)), PPOConfig())
     assert jnp.abs(dist.mean).max() < 0.1
     np.testing.assert_array_equal(dist.log_std, jnp.full((9, 3), -0.5))
 
@@ -45,20 +45,20 @@ def test_relu_networks_are_piecewise_linear_and_tanh_networks_are_bounded():
     assert jnp.abs(once).max() > 100
     bound = sum(jnp.abs(x).sum() for x in tree["critic_r"]["params"]["Dense_1"].values())
     assert (jnp.abs(value(tree["critic_r"], far, tanh)) <= bound).all()
-    means = [policy(tree["actor"], far, cfg).mean for cfg in (relu, tanh)]
+    means = [action_dist(tree["actor"], far, cfg).mean for cfg in (relu, tanh)]
     assert jnp.abs(means[0]).max() > 100 and jnp.abs(means[1]).max() < 10
 
 
 def test_a_std_of_the_state_starts_near_the_free_one_differs_by_state_and_is_clipped():
     cfg = PPOConfig(std="state")
     tree, obs = params(std="state"), jax.random.normal(jax.random.key(1), (4, 9, 5))
-    dist = policy(tree["actor"], obs, cfg)
+    dist = action_dist(tree["actor"], obs, cfg)
     assert dist.mean.shape == dist.log_std.shape == (4, 9, 3)
     np.testing.assert_allclose(dist.log_std, -0.5, atol=0.1)
     assert (dist.log_std[0, 0] != dist.log_std[0, 1]).all()
     for offset, bound in zip((-99.0, 99.0), LOG_STD, strict=True):
         moved = tree["actor"] | {"log_std": tree["actor"]["log_std"] + offset}
-        np.testing.assert_array_equal(policy(moved, obs, cfg).log_std, jnp.full((4, 9, 3), bound))
+        np.testing.assert_array_equal(action_dist(moved, obs, cfg).log_std, jnp.full((4, 9, 3), bound))
 
 
 @pytest.mark.parametrize("settings", [{"activation": "relu"}, {"std": "state"}, {"init": "torch"}])
@@ -67,7 +67,7 @@ def test_gradients_reach_every_parameter_and_are_finite(settings):
     tree, obs = params(**settings), jax.random.normal(jax.random.key(1), (64, 5))
 
     def total(tree):
-        dist = policy(tree["actor"], obs, cfg)
+        dist = action_dist(tree["actor"], obs, cfg)
         likelihood = log_prob(dist, jnp.ones((64, 3))).sum()
         return likelihood + sum(value(tree[k], obs, cfg).sum() for k in ("critic_r", "critic_c"))
 

@@ -14,7 +14,7 @@ from jaxsafe.learn.estimates import Batch
 from jaxsafe.learn.steps import Trainable, adam, adam_epochs, fit_critic, one_pass
 from jaxsafe.learn.surrogates import clipped, plain, with_entropy
 from jaxsafe.nn.gaussian import log_prob, sample
-from jaxsafe.nn.networks import init_params, policy, value
+from jaxsafe.nn.networks import action_dist, init_params, value
 
 SMALL: dict[str, Any] = {"hidden": (8,), "num_envs": 8, "horizon": 8, "minibatches": 4}
 
@@ -26,7 +26,7 @@ def problem(size=64):
     keys = jax.random.split(jax.random.key(0), 3)
     params = init_params(keys[0], 3, 2, cfg)
     obs = jax.random.normal(keys[1], (size, 3))
-    old = policy(params["actor"], obs, cfg)
+    old = action_dist(params["actor"], obs, cfg)
     action = sample(old, keys[2])
     adv = action.sum(-1)
     return params, Batch(obs, action, log_prob(old, action), old, adv, -adv, adv, obs[:, 0])
@@ -34,7 +34,7 @@ def problem(size=64):
 
 def earn(actor, batch, cfg):
     """The objective of earning more for large actions."""
-    return clipped(policy(actor, batch.obs, cfg), batch, batch.adv_r, cfg)
+    return clipped(action_dist(actor, batch.obs, cfg), batch, batch.adv_r, cfg)
 
 
 def moved(actor, state, batch, cfg, objective=earn, iteration=0, axis_name=None):
@@ -157,7 +157,7 @@ def test_the_clipped_surrogate_by_hand(w, advantage, expected):
     params, batch = problem(size=1)
     batch = dataclasses.replace(batch, log_prob=batch.log_prob - jnp.log(w))
     adv = jnp.array([advantage], jnp.float32)
-    objective, metrics = clipped(policy(params["actor"], batch.obs, cfg), batch, adv, cfg)
+    objective, metrics = clipped(action_dist(params["actor"], batch.obs, cfg), batch, adv, cfg)
     np.testing.assert_allclose(objective, expected, rtol=1e-4)
     assert metrics["train/clip_fraction"] == 1
     np.testing.assert_allclose(plain(batch.old, batch, adv, cfg)[0], w * advantage, rtol=1e-4)
@@ -171,7 +171,7 @@ def test_the_entropy_bonus_by_hand(iteration, decay, share):
     params, batch = problem()
 
     def bonus(log_std):
-        dist = policy(params["actor"] | {"log_std": log_std}, batch.obs, cfg)
+        dist = action_dist(params["actor"] | {"log_std": log_std}, batch.obs, cfg)
         surrogate = with_entropy(plain, jnp.int32(iteration))
         return surrogate(dist, batch, batch.adv_r, cfg)[0] - plain(dist, batch, batch.adv_r, cfg)[0]
 

@@ -20,7 +20,7 @@ from jaxsafe.learn.trust_region import (
     trust_region,
 )
 from jaxsafe.nn.gaussian import kl, log_prob, sample
-from jaxsafe.nn.networks import init_params, policy
+from jaxsafe.nn.networks import action_dist, init_params
 
 
 def spd(rng, n):
@@ -64,7 +64,7 @@ def test_the_fisher_product_is_that_of_the_kls_hessian():
     params, unravel = ravel_pytree(actor)
 
     def dist(params):
-        return policy(unravel(params), obs, cfg)
+        return action_dist(unravel(params), obs, cfg)
 
     old = dist(params)
     hessian = jax.hessian(lambda p: jnp.mean(kl(old, dist(p))))(params)
@@ -82,13 +82,13 @@ def test_a_kl_per_action_is_half_the_kl_of_two_actions():
         keys = jax.random.split(jax.random.key(0), 3)
         actor = init_params(keys[0], 3, 2, cfg)["actor"]
         obs = jax.random.normal(keys[1], (64, 3))
-        old = policy(actor, obs, cfg)
+        old = action_dist(actor, obs, cfg)
         action = sample(old, keys[2])
         adv = action[:, 0] - action[:, 0].mean()
         batch = Batch(obs, action, log_prob(old, action), old, adv, adv, adv, adv)
 
         def objective(actor, batch):
-            return plain(policy(actor, batch.obs, cfg), batch, batch.adv_r, cfg)
+            return plain(action_dist(actor, batch.obs, cfg), batch, batch.adv_r, cfg)
 
         update = jax.jit(trust_region.update, static_argnums=2, compiler_options=FAST)
         return update(actor, (), objective, batch, context(cfg))
@@ -130,18 +130,18 @@ def taken(step, cfg):
     keys = jax.random.split(jax.random.key(0), 3)
     actor = init_params(keys[0], 3, 2, cfg)["actor"]
     obs = jax.random.normal(keys[1], (256, 3))
-    old = policy(actor, obs, cfg)
+    old = action_dist(actor, obs, cfg)
     action = sample(old, keys[2])
     adv = action.sum(-1) - action.sum(-1).mean()
     batch = Batch(obs, action, log_prob(old, action), old, adv, adv, adv, adv)
 
     def objective(actor, batch):
-        return plain(policy(actor, batch.obs, cfg), batch, batch.adv_r, cfg)
+        return plain(action_dist(actor, batch.obs, cfg), batch, batch.adv_r, cfg)
 
     after, _, metrics = step.update(actor, (), objective, batch, context(cfg))
     start, unravel = ravel_pytree(actor)
     g = jax.grad(lambda x: objective(unravel(x), batch)[0])(start)
-    hessian = jax.hessian(lambda x: kl(old, policy(unravel(x), obs, cfg)).mean())(start)
+    hessian = jax.hessian(lambda x: kl(old, action_dist(unravel(x), obs, cfg)).mean())(start)
     return ravel_pytree(after)[0] - start, g, hessian + cfg.damping * jnp.eye(len(g)), metrics
 
 
