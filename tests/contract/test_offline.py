@@ -12,7 +12,14 @@ from toys import Corridor
 from jaxsafe.algos import ALGOS, bc
 from jaxsafe.config import ConfigError
 from jaxsafe.learn.learner import GradientStep
-from jaxsafe.learn.offline import DataSet, OfflineConfig, batch_at, data_of, data_set_like
+from jaxsafe.learn.offline import (
+    DataSet,
+    OfflineConfig,
+    batch_at,
+    data_of,
+    data_set,
+    data_set_like,
+)
 from jaxsafe.learn.steps import Trainable
 from jaxsafe.types import Shared
 
@@ -27,7 +34,9 @@ def linear_data(n: int = 400) -> DataSet:
     obs = rng.normal(0.3, [0.5, 1.0, 2.0, 1.0], (n, 4)).astype(np.float32)
     action = np.clip(obs @ GAIN.T, -0.9, 0.9)
     number = np.zeros(n, np.float32)
-    return DataSet(obs, action, number, number, obs, np.zeros(n, bool))
+    never = np.zeros(n, bool)
+    late = np.arange(n) % 20 == 19
+    return data_set(obs, action, number, number, obs, never, late, {"wall": number})
 
 
 def shared(iteration: int = 0) -> Shared:
