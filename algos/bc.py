@@ -48,7 +48,7 @@ class BCConfig(OfflineConfig):
 class BCSafeConfig(BCConfig):
     """BC-Safe: behaviour cloning of the safe episodes of a data set.
 
-        minimise_theta  E_{(s, a) in safe episodes}[ |mu_theta(s) - a|^2 ],   mu_theta(s) = tanh(f_theta(s))
+        minimise_theta  E_{(s, a) in safe episodes}[ |mu_theta(s) - a|^2 ],    mu_theta as in BC
 
     An episode is safe if it is whole and its undiscounted cost is at most `cost_limit`. Transitions are
     drawn uniformly from all safe episodes. Without a safe episode the run stops at once.
@@ -82,7 +82,7 @@ class VAEConfig:
 
 @config
 class VAEBCConfig(VAEConfig, OfflineConfig):
-    """VAE-BC: behaviour cloning with a variational autoencoder, so that actions may be of several kinds.
+    """VAE-BC: behaviour cloning with a variational autoencoder, which keeps several kinds of actions.
 
         minimise  E[ mean_i (decode(s, z)_i - a_i)^2 + kl_weight mean_j KL(q(z_j | s, a) || N(0, 1)) ],
         z ~ q(z | s, a);   acts with decode(s, z),   z ~ clip(N(0, 1), +-latent_clip)

@@ -37,13 +37,14 @@ class BCQConfig(bc.VAEConfig, OfflineTargetConfig):
     """BCQ: batch-constrained Q-learning, which only considers actions like those of the data.
 
         a_i = clip(decode(s, z_i) + perturbation tanh(xi(s, decode(s, z_i))), +-1),   z_i drawn
-        y = r + discount (1 - terminated) max_i S'(s', a'_i),   S = caution min_j Q_j + (1 - caution) max_j Q_j
+        S = caution min_j Q_j + (1 - caution) max_j Q_j
+        y = r + discount (1 - terminated) max_i S'(s', a'_i)
         minimise_Q   E[sum_j (Q_j(s, a) - y)^2]
         maximise_xi  E[Q_1(s, a_1)]
         Q' <- Q' + tau (Q - Q'),   xi' <- xi' + tau (xi - xi')
 
-    j = 1, 2; a'_i are made with xi'. `decode` belongs to a variational autoencoder of the data's actions,
-    which learns as in VAE-BC at the same steps. Acts with the a_i of the largest Q_1, out of
+    j = 1, 2; a'_i are made with xi'. `decode` belongs to a variational autoencoder of the data's
+    actions, which learns as in VAE-BC at the same steps. Acts with the a_i of the largest Q_1, out of
     `act_candidates`; for the mean action the z_i are the same at every step.
 
     Source: Fujimoto, Meger and Precup (2019), "Off-Policy Deep Reinforcement Learning without
@@ -155,7 +156,8 @@ def learner(env: Env, treatment: Treatment = no_treatment) -> Learner:
         goes_on = (~batch.terminated).astype(jnp.float32)
         s = soft(q_values(targets["critic_r"], many, action, cfg), cfg)  # [B, candidates]
         if not priced:
-            return batch.reward + cfg.discount * goes_on * s.max(-1), None, None
+            y_r = batch.reward + cfg.discount * goes_on * s.max(-1)
+            return y_r, jnp.zeros(()), jnp.zeros(())
         best = jnp.argmax(worth(targets, s, many, action, dual, cfg), -1)[:, None]
         q_c = reduced_costs(targets["critic_c"], many, action, names(cfg), cfg)
         several = each(lambda x: goes_on * x, names(cfg))

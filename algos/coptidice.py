@@ -4,7 +4,6 @@ from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
-import optax
 
 from jaxsafe.algos import bc
 from jaxsafe.config import Bounds, Rate, Real, Weight, config

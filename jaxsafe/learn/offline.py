@@ -10,7 +10,7 @@ episode in the learner's own estimate, which the learner reports as `train/cost_
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import flax.struct
@@ -80,7 +80,7 @@ class DataSet(NamedTuple):
     next_obs: Array
     terminated: Array
     truncated: Array
-    costs: dict[str, Array]
+    costs: Mapping[str, Array]
     episodes: PyTree
 
 
@@ -122,8 +122,8 @@ def episodes_of(
     first = np.concatenate([[True], last[:-1]])
     number = np.cumsum(first, dtype=np.int32) - 1
     count = int(number[-1]) + 1
-    sums = (np.bincount(number, x, count).astype(np.float32) for x in (reward, cost))
-    return Episodes(number, obs[first], *sums, np.bincount(number, ends, count) > 0)
+    ret, paid = (np.bincount(number, x, count).astype(np.float32) for x in (reward, cost))
+    return Episodes(number, obs[first], ret, paid, np.bincount(number, ends, count) > 0)
 
 
 def data_set_like(env: Env) -> DataSet:
@@ -377,7 +377,7 @@ def descended(
     lr: jax.Array | float,
     cfg: Any,
 ) -> tuple[dict[str, PyTree], dict[str, PyTree], Metrics]:
-    """One step of Adam down `loss`, of each network of `params` alone: (params, their states, metrics)."""
+    """One step of Adam down `loss`, of each network alone: (params, states of their Adams, metrics)."""
     grads, metrics = jax.grad(loss, has_aux=True)(params)
     new, states = {}, {}
     for name, gradient in grads.items():

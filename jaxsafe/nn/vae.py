@@ -54,8 +54,8 @@ def draw_latent(key: jax.Array, shape: tuple[int, ...], cfg: Any) -> jax.Array:
 def vae_losses(
     vae: PyTree, obs: jax.Array, action: jax.Array, key: jax.Array, cfg: Any
 ) -> tuple[jax.Array, jax.Array]:
-    """Squared error of the reconstruction, mean over action numbers, and KL(q(z | s, a) || N(0, 1)), mean
-    over latent numbers: float [B] each."""
+    """The squared error of the reconstruction, a mean over action numbers, and KL(q(z | s, a) ||
+    N(0, 1)), a mean over latent numbers: float [B] each."""
     q = encode(vae, obs, action, cfg)
     z = q.mean + jnp.exp(q.log_std) * jax.random.normal(key, q.mean.shape)
     error = ((decode(vae, obs, z, cfg) - action) ** 2).mean(-1)

@@ -102,13 +102,13 @@ def from_flat(path: str, source: Source) -> DataSet:
             raw[name], axes[name] = source.read(name), 1
     raw = {name: checked(path, name, x, axes[name], raw["rewards"]) for name, x in raw.items()}
     costs = {name.removeprefix(NAMED): x for name, x in raw.items() if name.startswith(NAMED)}
-    fields = {field: raw[name] for name, (field, _) in ARRAYS.items()}
+    fields: Any = {field: raw[name] for name, (field, _) in ARRAYS.items()}
     return data_set(**fields, truncated=raw.get("timeouts"), costs=costs)
 
 
 def from_omnisafe(path: str, source: Source, episode_length: int | None) -> DataSet:
-    """Numbers of a step are [n, 1] there. Where one policy's share stops, an episode stops without a mark:
-    its last next_obs is not the obs that follows."""
+    """Numbers of a step are [n, 1] there. Where one policy's share stops, an episode stops without a
+    mark: its last next_obs is not the obs that follows."""
     raw = {}
     for theirs, ours in OMNISAFE.items():
         x = source.read(theirs)
