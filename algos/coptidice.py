@@ -190,9 +190,10 @@ def make(env: Env, axis_name: str | None = None) -> Algorithm:
 
 
 # OmniSafe @15603dd, configs/offline/COptiDICE.yaml: its limit of 0.06 is on the cost of a step
+# of Circle's 500
 OMNISAFE: dict[str, Any] = bc.OMNISAFE | {
     "alpha": 8e-4, "cost_divergence": 0.05, "tau_lr": 3e-3, "lr": 3e-3, "critic_lr": 3e-3,
-    "dual_lr": 0.035,
+    "dual_lr": 0.035, "lam_init": 0.0, "cost_limit": 30.0,
 }  # fmt: skip
 
 ROWS = {

@@ -70,7 +70,8 @@ def settings(given: dict[str, Any]) -> tuple[int, Path, bool, int]:
     numbers = {}
     for name, kind in (("size", Size), ("seed", Seed)):
         try:
-            numbers[name] = convert(float(given[name]), kind, name)
+            text = str(given[name])
+            numbers[name] = convert(int(text) if text.isdecimal() else float(text), kind, name)
         except ValueError as error:
             if isinstance(error, ConfigError):
                 raise

@@ -1,5 +1,6 @@
 """Runs that learn from a data set: trained, evaluated, stopped, resumed, compared, refused."""
 
+import json
 import shutil
 from typing import Any
 
@@ -59,7 +60,13 @@ def test_a_run_counts_gradient_steps_and_needs_no_data_to_be_evaluated(whole, da
     config = run_folder.read_config(whole)
     assert (config["dataset"], config["total_updates"]) == (str(data), 400)
     assert run_folder.dataset_of(whole) == dataset.sha256(str(data))
-    assert (whole / "curves.png").exists() and (whole / "evaluation.json").exists()
+    assert (whole / "curves.png").exists()
+    scores = json.loads((whole / "evaluation.json").read_text())
+    episodes = make_data().episodes
+    assert scores["data return"]["mean"] == pytest.approx(episodes.ret.mean(), rel=1e-5)
+    safe = episodes.ret[episodes.cost <= 25]
+    assert scores["data best safe return"]["mean"] == pytest.approx(safe.max(), rel=1e-5)
+    assert scores["DSRL cost"]["mean"] == pytest.approx(scores["cost"]["mean"] / 25)
     config["dataset"] = "/nowhere.npz"
     copy = whole.parent / "copy"
     shutil.copytree(whole, copy)
