@@ -203,7 +203,7 @@ ROWS = {
         "finds the visits of the best safe policy within a data set",
         {"omnisafe": OMNISAFE},
         omnisafe="COptiDICE",
-        lever={"hidden": (64,), "discount": 0.9, "dual_lr": 3e-3},
+        lever={"hidden": (64,), "discount": 0.9, "alpha": 0.03, "lr": 1e-3, "batch_size": 1024},
         check=check,
     )
 }

@@ -122,7 +122,7 @@ def from_omnisafe(path: str, source: Source, episode_length: int | None) -> Data
     number = np.cumsum(np.append(0, last[:-1]))
     steps = np.arange(len(done)) - begin[number] + 1
     limit = episode_length or steps.max()
-    fields = {field: sized[name] for name, (field, _) in ARRAYS.items() if name != "terminals"}
+    fields: Any = {field: sized[name] for name, (field, _) in ARRAYS.items() if name != "terminals"}
     late = steps >= limit
     return data_set(**fields, terminated=done & ~late, truncated=done & late, cut=cut)
 

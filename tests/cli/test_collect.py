@@ -101,7 +101,8 @@ def test_a_run_that_terminates_gives_shorter_episodes():
     terminated = np.array([False, True, True])
     x = np.arange(3, dtype=np.float32)
     obs = np.arange(4, dtype=np.float32)[:, None]
-    steps: Any = collect.Steps(obs, x[:, None], x, x, x[:, None], terminated, alive)
+    recorded: Any = (obs, x[:, None], x, x, x[:, None], terminated, alive)
+    steps = collect.Steps(*recorded)
     made = collect.arrays(steps)
     assert made["terminated"].tolist() == [False, True] and not made["truncated"].any()
     assert made["next_obs"][:, 0].tolist() == [1, 2]

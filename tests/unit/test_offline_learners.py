@@ -190,8 +190,8 @@ def test_without_a_price_bcq_takes_the_best_of_the_candidates():
         a = np.clip(likely + 0.05 * np.tanh(out), -1, 1)
         best = a[q(params["critic_r"], obs, a)[0].argmax()]
         np.testing.assert_allclose(taken[i], best, atol=1e-5)
-    mean = [learner.act(nets.params, batch.obs, None, cfg) for _ in range(2)]
-    np.testing.assert_array_equal(*mean)
+    first, again = (learner.act(nets.params, batch.obs, None, cfg) for _ in range(2))
+    np.testing.assert_array_equal(first, again)
 
 
 def density(actor, obs, action):
@@ -288,13 +288,14 @@ def test_a_loss_of_coptidice_over_a_batch_is_the_mean_over_its_transitions():
     learner = coptidice.learner(Corridor())
     nets, batch, at, _ = prepared(learner, cfg, n=7)
 
+    step = jax.jit(lambda *args: learner.step(*args, None), compiler_options=FAST)
+
     def losses(rows):
         own = jax.tree.map(lambda x: x[rows], batch)
         moment = at._replace(first_obs=at.first_obs[rows])
         metrics = step(nets, own, moment, cfg)[1]
         return np.array([metrics["train/nu_loss"], metrics["train/actor_loss"]])
 
-    step = jax.jit(lambda *args: learner.step(*args, None), compiler_options=FAST)
     alone = np.mean([losses(np.array([i])) for i in range(7)], 0)
     np.testing.assert_allclose(losses(np.arange(7)), alone, rtol=1e-5)
 
