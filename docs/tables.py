@@ -48,7 +48,8 @@ def omnisafe_conventions() -> str:
 def omnisafe_keys() -> str:
     """What scripts/migrate.py makes of each key of OmniSafe's configs."""
     lines = ["| OmniSafe | here | |", "|---|---|---|"]
-    for key, rule in migrate.OMNISAFE.items():
+    offline = {key: rule for key, rule in migrate.OFFLINE.items() if key not in migrate.OMNISAFE}
+    for key, rule in (migrate.OMNISAFE | offline).items():
         ours = ", ".join(f"`{option}`" for option in rule.ours.split()) or "no option"
         lines.append(f"| `{key}` | {ours} | {rule.note} |")
     return "\n".join(lines)

@@ -12,6 +12,7 @@ COMMANDS = {
     "plot": "compare runs in tables and figures",
     "render": "film the policy of a run",
     "watch": "watch a policy as it acts, or drive a robot",
+    "collect": "record a data set from trained policies",
     "migrate": "turn a config of another library into a command",
     "benchmark": "measure environments and training",
     "study": "train what a study lacks, and draw its page",

@@ -26,12 +26,12 @@ from jaxsafe.envs.registry import IMPLIED
 from jaxsafe.envs.safety_gym import suite
 from jaxsafe.envs.safety_gym.config import config_from_plain as read_config
 from jaxsafe.envs.safety_gym.config import defaults
-from jaxsafe.run.settings import algo_options, as_text
+from jaxsafe.learn.offline import OfflineConfig
+from jaxsafe.run.settings import OFFLINE_UPDATES, TrainConfig, algo_options, as_text
 
 MISSING = {  # OmniSafe's others
     "off-policy": "DDPG DDPGLag DDPGPID TD3 TD3Lag TD3PID SAC SACLag SACPID CRABS",
     "model-based": "PETS CAPPETS CCEPETS RCEPETS LOOP SafeLOOP",
-    "offline": "BCQ BCQLag CCRR CRR COptiDICE VAEBC",
 }
 EPISODE = 1000  # steps
 
@@ -256,6 +256,54 @@ OMNISAFE: dict[str, Rule] = {  # later keys win
     "lagrange_cfgs.penalty_max": Rule("", "OmniSafe does not read it with sum_norm", same=None),
 }
 
+CIRCLE = 500  # steps of an episode of OmniSafe's offline tasks
+OFFLINE: dict[str, Rule] = OMNISAFE | {  # of its offline algorithms; what differs
+    "train_cfgs.dataset": Rule(
+        "dataset",
+        "a path is kept; OmniSafe's named sets have to be downloaded there",
+        lambda value, facts: {"dataset": value} if str(value).endswith(".npz") else None,
+    ),
+    "train_cfgs.total_steps": Rule("total_updates"),
+    "train_cfgs.evaluate_epoisodes": Rule("eval_episodes"),
+    "train_cfgs.vector_env_nums": Rule("", "nothing steps in training", same=None),
+    "algo_cfgs.steps_per_epoch": Rule("algo.updates", "eval_every evaluates in between"),
+    "algo_cfgs.batch_size": Rule("algo.batch_size"),
+    "algo_cfgs.gamma": Rule("algo.discount"),
+    "algo_cfgs.cost_gamma": Rule("algo.cost_discount"),
+    "algo_cfgs.phi": Rule("algo.perturbation", "of BCQ; the others do not read it"),
+    "algo_cfgs.sampled_action_num": Rule("algo.candidates algo.actions", "of BCQ, of CRR"),
+    "algo_cfgs.minimum_weighting": Rule("algo.caution"),
+    "algo_cfgs.polyak": Rule("algo.tau", "COptiDICE does not read it"),
+    "algo_cfgs.lagrange_start_step": Rule("algo.dual_starts"),
+    "algo_cfgs.beta": Rule("algo.temperature"),
+    "algo_cfgs.fn_type": Rule("", "always the soft chi-square", same=("softchi",)),
+    "algo_cfgs.alpha": Rule("algo.alpha"),
+    "algo_cfgs.cost_ub_eps": Rule("algo.cost_divergence"),
+    "algo_cfgs.cost_limit": Rule(
+        "algo.cost_limit",
+        "of a step there, of an episode of 500 steps here",
+        lambda value, facts: {
+            "algo.cost_limit": CIRCLE * convert(value, float, "algo_cfgs.cost_limit")
+        },
+    ),
+    "model_cfgs.hidden_sizes": Rule("algo.vae_hidden"),
+    "model_cfgs.activation": Rule("algo.activation"),
+    "model_cfgs.learning_rate": Rule("algo.lr"),
+    "model_cfgs.actor.lr": Rule("algo.lr"),
+    "model_cfgs.nu.hidden_sizes": Rule("algo.hidden", NETWORK),
+    "model_cfgs.nu.activation": Rule("algo.activation", NETWORK),
+    "model_cfgs.nu.lr": Rule("algo.critic_lr", "one for nu and chi"),
+    "model_cfgs.chi.hidden_sizes": Rule("algo.hidden", NETWORK),
+    "model_cfgs.chi.activation": Rule("algo.activation", NETWORK),
+    "model_cfgs.chi.lr": Rule("algo.critic_lr", "one for nu and chi"),
+    "model_cfgs.lamb.init": Rule("algo.lam_init"),
+    "model_cfgs.lamb.lr": Rule("algo.dual_lr"),
+    "model_cfgs.tau.init": Rule("algo.tau_init"),
+    "model_cfgs.tau.lr": Rule("algo.tau_lr"),
+}
+ONLY_OFFLINE = Rule("", "a key of offline algorithms")
+DEFAULTS_OFFLINE = {"total_updates": 1_000_000, "eval_episodes": 10}  # OmniSafe's
+
 OURS_ALONE = ("rules", "awake", "contact_room")  # options that Engine does not have
 # Engine's options that ours takes, and does not use yet.
 VISION = ("observe_vision", "vision_size", "vision_render", "vision_render_size")
@@ -289,20 +337,27 @@ def omnisafe(config: dict[str, Any], algo: str = "", env: str = "") -> Migrated:
         config = flatten(config["defaults"]) | flatten(config.get(env) or {})
     values = {k: v for k, v in flatten(config).items() if not k.startswith("exp_increment_cfgs.")}
     for key in values:
-        if key not in OMNISAFE:
-            raise ConfigError(f"unknown key {key} of OmniSafe{nearest(key, OMNISAFE)}")
+        if key not in OFFLINE:  # which has those of OMNISAFE too
+            raise ConfigError(f"unknown key {key} of OmniSafe{nearest(key, OFFLINE)}")
     name = find_algorithm(algo or values.get("algo"))
     target = find_environment(env or values.get("env_id"))
     row = algos.ALGOS[name]
     preset = algo_options(row, "published", "omnisafe")
     start = {f"algo.{k}": v for k, v in preset.items()}
-    start |= {"num_envs": preset["num_envs"], "seed": 0, "total_steps": 10_000_000}
+    offline = issubclass(row.config, OfflineConfig)
+    rules, found = (OFFLINE if offline else OMNISAFE), dict(DEFAULTS_OFFLINE if offline else {})
+    ours = {
+        "total_updates": OFFLINE_UPDATES,
+        "eval_episodes": TrainConfig.eval_episodes,
+        "dataset": None,
+    }
+    of_steps = {"num_envs": preset.get("num_envs"), "total_steps": 10_000_000}
+    start |= {"seed": 0, **(ours if offline else of_steps)}
     facts = Facts(values, start)
-    found: dict[str, Any] = {}
     lines = [Line("algo", algo or values.get("algo"), f"algo={name} {DEFAULTS}")]
     lines.append(Line("env_id", env or values.get("env_id"), " ".join(target)))
-    for key in [k for k in OMNISAFE if k in values and k not in ("algo", "env_id")]:
-        rule, value = OMNISAFE[key], values[key]
+    for key in [k for k in OFFLINE if k in values and k not in ("algo", "env_id")]:
+        rule, value = rules.get(key, ONLY_OFFLINE), values[key]
         if not rule.ours:
             lost = rule.same is not None and value not in rule.same
             lines.append(Line(key, value, rule.note, lost))
@@ -324,7 +379,8 @@ def omnisafe(config: dict[str, Any], algo: str = "", env: str = "") -> Migrated:
         row.config, {k[5:]: v for k, v in found.items() if k.startswith("algo.")}, "algo."
     )
     for key, value in found.items():
-        found[key] = getattr(checked, key[5:]) if key.startswith("algo.") else convert(value, int, key)
+        kind = str if key == "dataset" else int
+        found[key] = getattr(checked, key[5:]) if key.startswith("algo.") else convert(value, kind, key)
     changed = [as_option(k, v) for k, v in found.items() if v != start[k]]
     return Migrated([*target, f"algo={name}", *DEFAULTS.split(), *changed], lines)
 

@@ -19,12 +19,15 @@ class GradientStep(NamedTuple):
     remaining: float [], the share of training that is left: 1 at first, 0 at the end.
     key: a random key, for this step on this device.
     dual: the state of the treatment of the constraint, () without one.
+    first_obs: of a data set, float [B, O]: observations at which its episodes begin, normalised; ()
+        where none is known.
     """
 
     number: jax.Array
     remaining: jax.Array
     key: jax.Array
     dual: PyTree = ()
+    first_obs: PyTree = ()
 
 
 class Learner(NamedTuple):

@@ -22,6 +22,7 @@ class Row(NamedTuple):
         or nothing, where the limit is only drawn in plots.
     lever: options with which it learns Lever, the small exact problem of tests/toys.py, if its
         defaults do not.
+    check: check(cfg, data) raises ConfigError for a data set that cannot serve these settings.
     """
 
     config: type[Any]
@@ -31,3 +32,4 @@ class Row(NamedTuple):
     omnisafe: str = ""
     holds: Literal["average", "episode", "nothing"] = "average"
     lever: Mapping[str, Any] = NOTHING
+    check: Callable[[Any, Any], None] = lambda cfg, data: None

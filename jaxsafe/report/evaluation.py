@@ -14,6 +14,7 @@ from jaxsafe.run import memory, run_folder
 from jaxsafe.run.evaluate import Episodes, measures, run_episodes
 from jaxsafe.run.policies import RunPolicies
 from jaxsafe.run.programs import members
+from jaxsafe.types import PyTree
 
 
 class Scores(NamedTuple):
@@ -29,8 +30,11 @@ class Scores(NamedTuple):
         return table(self.rows)
 
 
-def evaluate(run: RunPolicies, num: int, seed: int) -> list[Scores]:
-    """`num` fresh episodes of each seed in each setting."""
+def evaluate(run: RunPolicies, num: int, seed: int, data: PyTree = ()) -> list[Scores]:
+    """`num` fresh episodes of each seed in each setting.
+
+    Of a run on a data set there are DSRL's scores too and, with `data`, the data's own episodes.
+    """
     settings = run.settings
     policies = len(settings.configs) * settings.train.num_seeds
     memory.check_episodes(run.env, num, policies)
@@ -43,6 +47,9 @@ def evaluate(run: RunPolicies, num: int, seed: int) -> list[Scores]:
         limits, metrics = limits_of(member.config), tables[i] if i < len(tables) else {}
         found = measures(own, cost_names, limits)
         rows = summary(settings.env_name, found, float(member.config.cost_limit), metrics)
+        if settings.train.dataset is not None:
+            rows |= dsrl_scores(settings.env_name, rows, float(member.config.cost_limit))
+            rows |= of_data(data, float(member.config.cost_limit))
         by_seed = {name: values.mean(1).tolist() for name, values in found.items()}
         scores.append(Scores(member.setting, limits, own.ret.size, rows, by_seed))
     return scores
@@ -71,6 +78,29 @@ def summary(
                 scores.normalized_cost_rate, rows["cost rate (training)"]
             )
     return rows
+
+
+def dsrl_scores(env_name: str, rows: dict[str, Estimate], cost_limit: float) -> dict[str, Estimate]:
+    """DSRL's normalised scores. Its return needs the task's reference, its cost only the limit."""
+    found = {"DSRL cost": Estimate(*(float(scores.dsrl_cost(x, cost_limit)) for x in rows["cost"]))}
+    if env_name in scores.DSRL:
+        ret = Estimate(*(float(scores.dsrl_return(env_name, x)) for x in rows["return"]))
+        found = {"DSRL return": ret, **found}
+    return found
+
+
+def of_data(data: PyTree, cost_limit: float) -> dict[str, Estimate]:
+    """Of the whole episodes of a data set: mean return and cost, and the best return of a safe one."""
+    if not data or not data.episodes:
+        return {}
+    _, _, ret, cost, whole = (np.asarray(x) for x in data.episodes)
+    ret, cost = ret[whole], cost[whole]
+    if not len(ret):
+        return {}
+    found = {"data return": ret.mean(), "data cost": cost.mean()}
+    if (safe := cost <= cost_limit).any():
+        found["data best safe return"] = ret[safe].max()
+    return {name: Estimate(float(x), float(x), float(x)) for name, x in found.items()}
 
 
 def estimate_over_seeds(values: np.ndarray) -> Estimate:

@@ -33,7 +33,7 @@ def finish(session: Session, report: Reporter, stop: Interrupts) -> None:
         plots.curves(metrics, folder / "curves.png", title, limit, own)
 
     def scores() -> None:
-        found = evaluation.evaluate(run(), train.eval_episodes, train.seed)
+        found = evaluation.evaluate(run(), train.eval_episodes, train.seed, session.program.data)
         tables = {s.name: evaluation.as_json(s.rows) | {"seeds": s.seeds} for s in found}
         text = json.dumps({"episodes": train.eval_episodes, **tables.get("", tables)}, indent=1)
         files.write(folder / "evaluation.json", text)

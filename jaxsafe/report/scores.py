@@ -43,6 +43,32 @@ CHARACTERISTIC = {
     "doggo_push2": Characteristic(1.193, 88.774, 0.097),
 }
 
+# Least and largest return of an episode in DSRL's data sets. Liu et al. (2023), "Datasets and
+# Benchmarks for Offline Safe Reinforcement Learning", arXiv:2306.09303, the scores of their code.
+DSRL = {
+    "point_button1": (0.008822109, 41.19301569),
+    "point_button2": (0.014114166, 42.89859536),
+    "point_circle1": (20.06762695, 61.72819519),
+    "point_circle2": (20.47834778, 54.02184296),
+    "point_goal1": (0.01196012764, 30.07111486),
+    "point_goal2": (0.00261695983, 27.71770979),
+    "point_push1": (0.001400154529, 16.5186543),
+    "point_push2": (0.0012438183, 14.69103915),
+    "car_button1": (0.002892620683, 44.420003346),
+    "car_button2": (0.001767391718, 41.995138156),
+    "car_circle1": (8.037073135, 24.94155502),
+    "car_circle2": (5.113386154, 25.95009804),
+    "car_goal1": (0.01223281954, 39.9078092),
+    "car_goal2": (0.001032874532, 28.90289799),
+    "car_push1": (0.01370017353, 16.3044676),
+    "car_push2": (0.0002939113353, 15.14164849),
+    "ant_velocity": (6.151901245, 2976.276611),
+    "halfcheetah_velocity": (5.750976563, 2806.933105),
+    "hopper_velocity": (37.05154800, 1911.396729),
+    "swimmer_velocity": (0.07114458084, 238.9583129),
+    "walker2d_velocity": (18.66849899, 3418.223877),
+}
+
 # The paper's suites: SG6 by name, the others by level and robot.
 SG6 = ("car_goal1", "doggo_goal1", "point_button1", "point_goal1", "point_goal2", "point_push1")
 SG18 = tuple(CHARACTERISTIC)
@@ -60,6 +86,18 @@ def normalized_return(env: str, ret):
 def normalized_violation(env: str, cost, cost_limit: float = 25.0):
     """0 within the limit, 1 where unconstrained PPO is; `cost` a float or an array."""
     return np.maximum(cost - cost_limit, 0.0) / max(1e-6, CHARACTERISTIC[env].cost - cost_limit)
+
+
+def dsrl_return(env: str, ret):
+    """0 at the least return of DSRL's data set, 1 at the largest."""
+    least, largest = DSRL[env]
+    return (ret - least) / (largest - least)
+
+
+def dsrl_cost(cost, cost_limit: float):
+    """The cost in units of the limit, so that 1 is at the limit; of a limit of 0, the cost and 1."""
+    room = float(cost_limit == 0)
+    return (cost + room) / (cost_limit + room)
 
 
 def normalized_cost_rate(env: str, cost_rate):

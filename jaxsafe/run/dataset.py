@@ -1,28 +1,41 @@
-"""Data sets for offline learning, read from files. Nothing in a file is executed.
+"""Data sets for offline learning: read from files, and written. Nothing in a file is executed.
 
-A data set is an .npz of flat arrays under the names that DSRL and D4RL use:
+What is read:
+
+    .npz, .hdf5   flat arrays under the names of D4RL and DSRL, as below
+    .npz          OmniSafe's names: obs, action, reward, cost, next_obs, done
+    .hdf5         Minari's groups, one an episode, or the folder of such a data set
+
+What is written, as .npz or .hdf5:
 
     observations, next_observations   float [n, O]
     actions                           float [n, A]
     rewards, costs                    float [n]
     terminals                         bool [n]; the end of an episode by its time limit is none
+    timeouts                          bool [n]; that end
+    cost_NAME                         float [n], for each cost with a name
 
-Other arrays in the file are left alone.
+Transitions are in the order of their episodes. Without `timeouts` any order will do, and the episodes
+are not known. Other arrays in a file are left alone.
 
 Source: Liu et al. (2023), "Datasets and Benchmarks for Offline Safe Reinforcement Learning",
     arXiv:2306.09303, for the names.
 """
 
+import contextlib
+import math
 import zipfile
 import zlib
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import h5py
 import numpy as np
 
 from jaxsafe.config import ConfigError, nearest, one_line
-from jaxsafe.learn.offline import DataSet
-from jaxsafe.run import checkpoint
+from jaxsafe.learn.offline import DataSet, data_set
+from jaxsafe.run import checkpoint, files
 
 # name in the file -> the field that it is, and how many axes it has
 ARRAYS = {
@@ -33,49 +46,232 @@ ARRAYS = {
     "next_observations": ("next_obs", 2),
     "terminals": ("terminated", 1),
 }
-BROKEN = (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error)  # of files that are no .npz
+NAMED = "cost_"  # begins the names of costs that have names
+OMNISAFE = {  # OmniSafe's name -> ours
+    "obs": "observations",
+    "action": "actions",
+    "reward": "rewards",
+    "cost": "costs",
+    "next_obs": "next_observations",
+    "done": "terminals",
+}
+BROKEN = (  # of files that hold something else
+    OSError, ValueError, EOFError, TypeError, LookupError, RuntimeError, MemoryError, OverflowError,
+    zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
+HDF5 = b"\x89HDF\r\n\x1a\n"  # how such files begin
+PACKED = 1000  # times that unpacking may make a file larger: arrays of zeros shrink a thousandfold
+FILTERS = ("gzip", "lzf", None)  # ways to pack that h5py brings itself
 
 
-def read_dataset(path: str) -> DataSet:
-    """The data set in an .npz file: float32 and, for `terminated`, bool.
+class Source(NamedTuple):
+    """What a file holds: the names of its arrays, `read(name)`, and the names of its groups."""
 
+    names: tuple[str, ...]
+    read: Callable[[str], np.ndarray]
+    groups: tuple[str, ...] = ()
+
+
+def read_dataset(path: str, episode_length: int | None = None) -> DataSet:
+    """The data set in a file, or in a folder of Minari's. Floats are float32.
+
+    Args:
+        episode_length: the environment's time limit in steps. OmniSafe's `done` tells no end by it from
+            termination; an episode of so many steps ends by it. None: of as many as the longest has.
     Raises:
         ConfigError: no such file, one that is none, or arrays that are missing, of other shapes, or not
             finite.
     """
     file = found(path)
-    try:
-        with np.load(file.open("rb"), allow_pickle=False) as arrays:
-            if missing := [name for name in ARRAYS if name not in arrays]:
-                raise ConfigError(f"dataset={path} has no {missing[0]}{nearest(missing[0], arrays)}")
-            raw = {name: arrays[name] for name in ARRAYS}
-    except (TypeError, *BROKEN) as error:  # TypeError: a lone array
-        if isinstance(error, ConfigError):
-            raise
-        raise ConfigError(f"dataset={path} cannot be read as .npz: {one_line(error)}") from error
-    count = raw["rewards"].shape[:1]
-    fields = {}
-    for name, (field, axes) in ARRAYS.items():
-        x = raw[name]
+    with opened(path, file) as source:
+        if any(name.startswith("episode_") for name in source.groups):
+            return from_minari(path, source)
+        if set(OMNISAFE) <= set(source.names):
+            return from_omnisafe(path, source, episode_length)
+        return from_flat(path, source)
+
+
+def from_flat(path: str, source: Source) -> DataSet:
+    for name in ARRAYS:
+        if name not in source.names:
+            raise ConfigError(f"dataset={path} has no {name}{nearest(name, source.names)}")
+    raw = {name: source.read(name) for name in ARRAYS}
+    axes = {name: axes for name, (_, axes) in ARRAYS.items()}
+    for name in source.names:
+        if name == "timeouts" or name.startswith(NAMED):
+            raw[name], axes[name] = source.read(name), 1
+    raw = {name: checked(path, name, x, axes[name], raw["rewards"]) for name, x in raw.items()}
+    costs = {name.removeprefix(NAMED): x for name, x in raw.items() if name.startswith(NAMED)}
+    fields: Any = {field: raw[name] for name, (field, _) in ARRAYS.items()}
+    return data_set(**fields, truncated=raw.get("timeouts"), costs=costs)
+
+
+def from_omnisafe(path: str, source: Source, episode_length: int | None) -> DataSet:
+    """Numbers of a step are [n, 1] there. Where one policy's share stops, an episode stops without a
+    mark: its last next_obs is not the obs that follows."""
+    raw = {}
+    for theirs, ours in OMNISAFE.items():
+        x = source.read(theirs)
+        raw[ours] = x[:, 0] if ARRAYS[ours][1] == 1 and x.ndim == 2 and x.shape[1] == 1 else x
+    sized = {name: checked(path, name, x, ARRAYS[name][1], raw["rewards"]) for name, x in raw.items()}
+    done = sized["terminals"].astype(bool)
+    follows = (sized["next_observations"][:-1] == sized["observations"][1:]).all(1)
+    cut = ~np.append(follows, True) & ~done
+    last = done | cut
+    begin = np.flatnonzero(np.append(True, last[:-1]))
+    number = np.cumsum(np.append(0, last[:-1]))
+    steps = np.arange(len(done)) - begin[number] + 1
+    limit = episode_length or steps.max()
+    fields: Any = {field: sized[name] for name, (field, _) in ARRAYS.items() if name != "terminals"}
+    late = steps >= limit
+    return data_set(**fields, terminated=done & ~late, truncated=done & late, cut=cut)
+
+
+def from_minari(path: str, source: Source) -> DataSet:
+    """Observations are one more than the steps of an episode, and infos/cost too, or as many."""
+    order = sorted(
+        (g for g in source.groups if g.removeprefix("episode_").isdigit()),
+        key=lambda group: int(group.removeprefix("episode_")),
+    )
+    parts: dict[str, list[np.ndarray]] = {}
+    for group in order:
+        if f"{group}/infos/cost" not in source.names:
+            raise ConfigError(f"dataset={path} has no {group}/infos/cost; Minari has no other costs")
+
+        def read(name: str, axes: int, like: np.ndarray, group: str = group) -> np.ndarray:
+            if f"{group}/{name}" not in source.names:
+                raise ConfigError(f"dataset={path} has no {group}/{name}")
+            return checked(path, f"{group}/{name}", source.read(f"{group}/{name}"), axes, like)
+
+        rewards = source.read(f"{group}/rewards") if f"{group}/rewards" in source.names else np.zeros(0)
+        count = len(rewards)
+        obs = read("observations", 2, np.zeros(count + 1))
+        raw_cost = source.read(f"{group}/infos/cost")
+        cost = checked(path, f"{group}/infos/cost", raw_cost[-count:], 1, rewards)
+        for name, x in {
+            "obs": obs[:-1],
+            "next_obs": obs[1:],
+            "cost": cost,
+            "reward": read("rewards", 1, rewards),
+            "action": read("actions", 2, rewards),
+            "terminated": read("terminations", 1, rewards),
+            "truncated": read("truncations", 1, rewards),
+            "cut": np.arange(count) == count - 1,
+        }.items():
+            parts.setdefault(name, []).append(x)
+    widths = {name: {x.shape[1:] for x in several} for name, several in parts.items()}
+    if not parts or any(len(shapes) > 1 for shapes in widths.values()):
+        raise ConfigError(f"dataset={path}: its episodes have arrays of different widths")
+    whole: Any = {name: np.concatenate(several) for name, several in parts.items()}
+    return data_set(**whole)
+
+
+def checked(path: str, name: str, x: np.ndarray, axes: int, like: np.ndarray) -> np.ndarray:
+    """`x` as float32, if it is numbers of so many axes and as many as `like`."""
+    if x.dtype.kind not in "biuf" or x.ndim != axes or x.shape[:1] != like.shape[:1] or not x.size:
         shape = "[n, size]" if axes == 2 else "[n]"
-        if x.dtype.kind not in "biuf" or x.ndim != axes or x.shape[:1] != count or not x.size:
-            raise ConfigError(
-                f"dataset={path}: {name} is {x.dtype}{list(x.shape)}, expected numbers {shape}, with "
-                "the same n as rewards"
-            )
-        with np.errstate(over="ignore"):
-            x = x.astype(np.float32)
-        if not np.isfinite(x).all():
-            raise ConfigError(f"dataset={path}: {name} holds numbers that are not finite")
-        fields[field] = x.astype(bool) if field == "terminated" else x
-    return DataSet(**fields)
+        raise ConfigError(
+            f"dataset={path}: {name} is {x.dtype}{list(x.shape)}, expected numbers {shape}, with "
+            "the same n as rewards"
+        )
+    with np.errstate(over="ignore"):
+        x = x.astype(np.float32)
+    if not np.isfinite(x).all():
+        raise ConfigError(f"dataset={path}: {name} holds numbers that are not finite")
+    return x
 
 
-def write_dataset(path: str | Path, data: DataSet) -> None:
-    """Write a data set that `read_dataset` reads."""
-    fields = {name: np.asarray(x) for name, x in data._asdict().items()}
-    named: Any = {name: fields[field] for name, (field, _) in ARRAYS.items()}
-    np.savez_compressed(path, **named)
+# ---- files ---------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def opened(path: str, file: Path) -> Iterator[Source]:
+    """What a file holds. Whatever is wrong with it becomes a ConfigError of one line."""
+    hdf5 = file.open("rb").read(len(HDF5)) == HDF5
+    try:
+        if hdf5:
+            with h5py.File(file, "r") as arrays:
+                yield in_hdf5(path, arrays, file.stat().st_size)
+        else:
+            with zipfile.ZipFile(file) as archive:
+                size = sum(x.file_size for x in archive.infolist())
+            check_size(path, size, file.stat().st_size)
+            with np.load(file, allow_pickle=False) as arrays:
+                yield Source(tuple(arrays), arrays.__getitem__)
+    except ConfigError:
+        raise
+    except BROKEN as error:
+        kind = ".hdf5" if hdf5 else ".npz"
+        raise ConfigError(f"dataset={path} cannot be read as {kind}: {one_line(error)}") from error
+
+
+def in_hdf5(path: str, file: h5py.File, size: int) -> Source:
+    """The arrays that lie in the file itself. It may name other files too, which are never opened:
+    links to them are passed over, and arrays that are kept there are refused."""
+    arrays: dict[str, h5py.Dataset] = {}
+    groups: list[str] = []
+
+    def walk(group: h5py.Group, head: str, depth: int) -> None:
+        for name in group:
+            if len(arrays) + len(groups) > 1_000_000:
+                raise ConfigError(f"dataset={path} holds more than a million arrays")
+            if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+                continue
+            inner = group[name]
+            if isinstance(inner, h5py.Dataset):
+                arrays[f"{head}{name}"] = inner
+            elif isinstance(inner, h5py.Group) and depth < 3:  # a group may hold itself
+                groups.append(f"{head}{name}")
+                walk(inner, f"{head}{name}/", depth + 1)
+
+    def read(name: str) -> np.ndarray:
+        x = arrays[name]
+        if x.is_virtual or x.external is not None or x.compression not in FILTERS:
+            raise ConfigError(f"dataset={path}: {name} is not kept in the file itself as plain numbers")
+        if x.dtype.kind not in "biuf":
+            raise ConfigError(f"dataset={path}: {name} is {x.dtype}, expected numbers")
+        check_size(path, math.prod(x.shape or (0,)) * x.dtype.itemsize, size)
+        return np.asarray(x[()])
+
+    walk(file, "", 0)
+    return Source(tuple(arrays), read, tuple(groups))
+
+
+def check_size(path: str, unpacked: int, size: int) -> None:
+    if unpacked > (limit := files.MB + PACKED * size):
+        raise ConfigError(f"dataset={path} unpacks to {unpacked:,} bytes; expected at most {limit:,}")
+
+
+def write_dataset(
+    path: str | Path,
+    data: DataSet,
+    more: Mapping[str, np.ndarray] | None = None,
+    about: Mapping[str, str | int | float] | None = None,
+) -> None:
+    """Write a data set that `read_dataset` reads, as .hdf5 or .npz by the end of its name.
+
+    Args:
+        more: arrays [n] beside it, by name.
+        about: attributes of the file, in .hdf5 alone.
+    Raises:
+        ConfigError: the name ends otherwise.
+    """
+    path = Path(path)
+    arrays = {name: np.asarray(getattr(data, field)) for name, (field, _) in ARRAYS.items()}
+    if data.episodes:
+        arrays["timeouts"] = np.asarray(data.truncated)
+    arrays |= {f"{NAMED}{name}": np.asarray(x) for name, x in data.costs.items()} | dict(more or {})
+    if path.suffix not in (".npz", ".hdf5"):
+        raise ConfigError(f"{path}: expected a name that ends in .hdf5 or .npz")
+    with files.replacing(path) as part:
+        if path.suffix == ".npz":
+            named: Any = arrays
+            np.savez_compressed(part, **named)
+            return
+        with h5py.File(part, "w") as file:
+            for name, x in arrays.items():
+                file.create_dataset(name, data=x, compression="lzf")
+            file.attrs.update(dict(about or {}))
 
 
 def sha256(path: str) -> str:
@@ -88,7 +284,11 @@ def sha256(path: str) -> str:
 
 
 def found(path: str) -> Path:
+    """The file of a data set; of a folder of Minari's, the one with its episodes."""
     file = Path(path).expanduser()
+    if file.is_dir():
+        places = (file / "main_data.hdf5", file / "data" / "main_data.hdf5")
+        file = next((place for place in places if place.is_file()), file)
     if not file.is_file():
         raise ConfigError(f"dataset={path}: there is no such file")
     return file

@@ -142,7 +142,11 @@ def prepare(settings: Settings) -> tuple[Env, Program]:
     check_logger(train.logger)
     env = make_env(settings)
     check_memory(env, settings)
-    data = () if train.dataset is None else dataset.read_dataset(train.dataset)
+    data = ()
+    if train.dataset is not None:
+        data = dataset.read_dataset(train.dataset, env.episode_length)
+        for cfg in settings.configs:
+            settings.row.check(cfg, data)
     program = build(env, settings.row.make, settings.configs, train, data)
     check_state_memory(program, train)
     return env, program

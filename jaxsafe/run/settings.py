@@ -77,7 +77,7 @@ class TrainConfig:
     compat: str = "none"  # whose departures from the papers to follow: none, or omnisafe
     run_dir: str | None = None  # null: runs/<env>-<algo>/<time>-seed<seed>
     resume: bool | str = False  # true: run_dir, or the newest unfinished run like this one; or a folder
-    dataset: str | None = None  # an .npz to learn from, for offline algorithms
+    dataset: str | None = None  # a file to learn from, for offline algorithms
     init_from: str | None = None  # a run folder whose policy to start from
     checkpoint_every: Annotated[float, Bounds(0, 1e9)] = 60.0  # s between checkpoints
     checkpoint_iterations: Period = 0  # also after this many iterations; 0: by time alone

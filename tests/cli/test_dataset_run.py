@@ -1,5 +1,6 @@
 """Runs that learn from a data set: trained, evaluated, stopped, resumed, compared, refused."""
 
+import json
 import shutil
 from typing import Any
 
@@ -10,7 +11,7 @@ from shell import TOY, assert_same_run, start, typed, wait_for
 
 import jaxsafe
 from jaxsafe.config import ConfigError
-from jaxsafe.learn.offline import DataSet
+from jaxsafe.learn.offline import DataSet, data_set
 from jaxsafe.report import read
 from jaxsafe.run import checkpoint, dataset, run_folder, session
 from jaxsafe.run.arguments import compose
@@ -23,8 +24,11 @@ BC = (TOY, "algo=bc", "algo.updates=10", "algo.hidden=[8]", "eval_episodes=2", "
 def make_data(n: int = 100) -> DataSet:
     rng = np.random.default_rng(0)
     obs, action = rng.normal(size=(n, 4)), rng.uniform(-1, 1, (n, 2))
-    fields: Any = (obs, action, rng.normal(size=n), np.zeros(n), obs + 0.1, np.zeros(n))
-    return DataSet(*(x.astype(np.float32) for x in fields[:5]), terminated=fields[5].astype(bool))
+    late = np.arange(n) % 20 == 19
+    costs = {"wall": rng.integers(0, 2, n)}
+    return data_set(
+        obs, action, rng.normal(size=n), costs["wall"], obs + 0.1, np.zeros(n, bool), late, costs
+    )
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +47,7 @@ def whole(tmp_path_factory, data):
 
 
 def test_a_data_set_comes_back_from_its_file(data):
-    for x, y in zip(read_dataset(str(data)), make_data(), strict=True):
+    for x, y in zip(*map(jax.tree.leaves, (read_dataset(str(data)), make_data())), strict=True):
         assert x.dtype == y.dtype
         np.testing.assert_array_equal(x, y)
 
@@ -56,7 +60,13 @@ def test_a_run_counts_gradient_steps_and_needs_no_data_to_be_evaluated(whole, da
     config = run_folder.read_config(whole)
     assert (config["dataset"], config["total_updates"]) == (str(data), 400)
     assert run_folder.dataset_of(whole) == dataset.sha256(str(data))
-    assert (whole / "curves.png").exists() and (whole / "evaluation.json").exists()
+    assert (whole / "curves.png").exists()
+    scores = json.loads((whole / "evaluation.json").read_text())
+    episodes = make_data().episodes
+    assert scores["data return"]["mean"] == pytest.approx(episodes.ret.mean(), rel=1e-5)
+    safe = episodes.ret[episodes.cost <= 25]
+    assert scores["data best safe return"]["mean"] == pytest.approx(safe.max(), rel=1e-5)
+    assert scores["DSRL cost"]["mean"] == pytest.approx(scores["cost"]["mean"] / 25)
     config["dataset"] = "/nowhere.npz"
     copy = whole.parent / "copy"
     shutil.copytree(whole, copy)

@@ -178,8 +178,37 @@ def test_sections_of_environments_count_for_theirs():
 def test_every_option_that_a_key_becomes_exists():
     fields = {f"algo.{f.name}" for e in algos.ALGOS.values() for f in dataclasses.fields(e.config)}
     fields |= {"algo", "env", "env.rules", "seed", "total_steps", "num_envs"}
-    assert {o for rule in migrate.OMNISAFE.values() for o in rule.ours.split()} <= fields
-    assert set(migrate.algorithms().values()) == set(algos.ALGOS) - {"ppo_penalty", "sac", "bc"}
+    fields |= {"dataset", "total_updates", "eval_episodes"}
+    assert {o for rule in migrate.OFFLINE.values() for o in rule.ours.split()} <= fields
+    assert set(migrate.algorithms().values()) == {n for n, e in algos.ALGOS.items() if e.omnisafe}
+    assert {"BCQ", "BCQLag", "CCRR", "CRR", "COptiDICE", "VAEBC"} <= set(migrate.algorithms())
+
+
+BCQ_LAG = {  # of OmniSafe's BCQLag.yaml
+    "train_cfgs": {"total_steps": 1_000_000, "evaluate_epoisodes": 10, "dataset": "mixed.npz"},
+    "algo_cfgs": {
+        "gamma": 0.99, "cost_gamma": 0.99, "batch_size": 256, "steps_per_epoch": 1000, "phi": 0.05,
+        "sampled_action_num": 10, "minimum_weighting": 0.75, "polyak": 0.005,
+        "lagrange_start_step": 150_000,
+    },
+    "model_cfgs": {"actor": {"hidden_sizes": [256, 256, 256], "activation": "relu", "lr": 0.001}},
+    "lagrange_cfgs": {"cost_limit": 25.0, "lagrangian_multiplier_init": 1.0, "lambda_lr": 0.001},
+}  # fmt: skip
+
+
+def test_offline_configs_count_gradient_steps_and_keep_a_path():
+    found = migrated(BCQ_LAG, "BCQLag")
+    assert not lost(found)
+    assert found.argv[2:] == [
+        "algo=bcq_lag", *migrate.DEFAULTS.split(), "total_updates=1000000", "eval_episodes=10",
+        "dataset=mixed.npz",
+    ]  # fmt: skip
+    named = {"train_cfgs": {"dataset": "SafetyPointCircle1-v0_mixed_0.5"}}
+    assert lost(migrated(named, "VAEBC")) == ["train_cfgs.dataset"]
+    dice = {"algo_cfgs": {"cost_limit": 0.1, "alpha": 0.01}, "model_cfgs": {"tau": {"lr": 0.1}}}
+    found = migrated(dice, "COptiDICE").argv
+    assert {"algo.cost_limit=50.0", "algo.alpha=0.01", "algo.tau_lr=0.1"} <= {*found}
+    assert lost(migrated({"algo_cfgs": {"phi": 0.1}}, "PPOLag")) == ["algo_cfgs.phi"]
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,198 @@
+"""Critic-regularised regression, and with a multiplier on cost."""
+
+from functools import partial
+from typing import Annotated, Any
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from jaxsafe.algos import bc
+from jaxsafe.config import Amount, Bounds, Cap, Real, config
+from jaxsafe.learn.actor_critic import cost_values, init_cost_critics, reduced_costs
+from jaxsafe.learn.constraints import each
+from jaxsafe.learn.learner import GradientStep, Learner
+from jaxsafe.learn.offline import (
+    OfflineCostConfig,
+    OfflineTargetConfig,
+    constrained,
+    descended,
+    episode_cost,
+    offline,
+    step_size,
+)
+from jaxsafe.learn.replay import Transitions
+from jaxsafe.learn.row import Row
+from jaxsafe.learn.steps import Trainable, adam
+from jaxsafe.learn.treatments import Treatment, lagrangian, no_treatment
+from jaxsafe.nn.bounded import bounded_action, bounded_policy, init_bounded
+from jaxsafe.nn.critics import init_critics, q_values
+from jaxsafe.nn.gaussian import log_prob
+from jaxsafe.types import Algorithm, Env, Metrics, PyTree
+
+
+@config
+class CRRConfig(OfflineTargetConfig):
+    """CRR: critic-regularised regression, which imitates actions by how much better they are.
+
+        A(s, a) = min_j Q_j(s, a) - mean_i min_j Q_j(s, a_i),   a_i ~ pi(s)
+        maximise_pi  E[min(exp(A(s, a) / temperature), weight_max) log pi(a | s)]
+        y = r + discount (1 - terminated) min_j Q'_j(s', a'),   a' ~ pi'(s')
+        minimise_Q   E[sum_j (Q_j(s, a) - y)^2]
+        Q' <- Q' + tau (Q - Q'),   pi' <- pi' + tau (pi - pi')
+
+    j = 1, 2. The policy is a Gaussian about a mean in (-1, 1); its samples are clipped to [-1, 1].
+
+    Source: Wang et al. (2020), "Critic Regularized Regression", arXiv:2006.15134, algorithm 1 with the
+    weights exp and the advantage's mean.
+    Differs from it: the critics are twins instead of one that is distributional, and the policy is one
+    Gaussian instead of several, as in OmniSafe. The targets follow at each step.
+    """
+
+    # A by which the weight grows e-fold, in units of the return, as in the paper.
+    temperature: Annotated[float, Bounds(1e-6, 1e6)] = 1.0
+    weight_max: Cap = 20.0  # The largest weight, as in the paper. OmniSafe has none.
+    actions: Amount = 4  # Actions of the policy over which the mean is taken, as in the paper.
+    # The log standard deviation of actions at first, as in OmniSafe.
+    init_log_std: Real = 0.0
+
+
+@config
+class CCRRConfig(OfflineCostConfig, CRRConfig):
+    """C-CRR: constrained CRR, whose weights pay for cost at an adaptive price.
+
+        A(s, a) = A_r(s, a) - lam A_c(s, a),   A_r as A in CRR,   A_c = Q_c(s, a) - mean_i Q_c(s, a_i)
+        y_c = c + cost_discount (1 - terminated) Q'_c(s', a'),    a' as in CRR
+        minimise_Q    E[sum_j (Q_cj(s, a) - y_c)^2], and the loss of Q as in CRR
+        minimise_lam  -lam (J_c - cost_limit),  lam >= 0,  by Adam, after each gradient step
+        J_c = (1 - cost_discount) T E[Q'_c(s', a')],   T the steps of an episode
+
+    The rest is as in CRR. Values go on after the time limit, so J_c is the undiscounted cost of an
+    episode at the rate that Q_c says.
+
+    Source: CRR of Wang et al. (2020), arXiv:2006.15134, with the multiplier of OmniSafe's CCRR.
+    Differs from OmniSafe: there the critic of reward also learns the costs, and the critic of cost
+    learns nothing. Its published numbers depend on that, and no option brings it back.
+    """
+
+
+def learner(env: Env, treatment: Treatment = no_treatment) -> Learner:
+    priced = treatment is not no_treatment
+    names = treatment.constrained_costs
+
+    def init(key: jax.Array, obs_size: int, action_size: int, cfg: Any) -> Trainable:
+        actor_key, critic_key = jax.random.split(key)
+        params = {
+            "actor": init_bounded(actor_key, obs_size, action_size, cfg),
+            "critic_r": init_critics(critic_key, obs_size, action_size, 2, cfg),
+        }
+        if priced:
+            cost_key = jax.random.fold_in(critic_key, 1)
+            params["critic_c"] = init_cost_critics(cost_key, obs_size, action_size, names(cfg), cfg)
+        opt_state = {name: adam(cfg.lr, cfg).init(x) for name, x in params.items()}
+        return Trainable(params | {"targets": params}, opt_state)
+
+    def act(params: PyTree, obs: jax.Array, key: jax.Array | None, cfg: Any) -> jax.Array:
+        return bounded_action(bounded_policy(params["actor"], obs, cfg), key)
+
+    def step(
+        nets: Trainable, batch: Transitions, at: GradientStep, cfg: Any, axis_name: str | None
+    ) -> tuple[Trainable, Metrics]:
+        params, targets, states = nets.params, nets.params["targets"], nets.opt_state
+        next_key, key = jax.random.split(at.key)
+        goes_on = (~batch.terminated).astype(jnp.float32)
+
+        # critics
+        next_action = bounded_action(bounded_policy(targets["actor"], batch.next_obs, cfg), next_key)
+        next_q = q_values(targets["critic_r"], batch.next_obs, next_action, cfg).min(0)
+        y_r = batch.reward + cfg.discount * goes_on * next_q
+        critics = {"critic_r": params["critic_r"]}
+        y_c = next_c = jnp.zeros(())
+        if priced:
+            critics["critic_c"] = params["critic_c"]
+            q_c = reduced_costs(targets["critic_c"], batch.next_obs, next_action, names(cfg), cfg)
+            next_c = each(lambda x: goes_on * x, names(cfg))(q_c)
+            y_c = constrained(batch, names(cfg)) + cfg.cost_discount * next_c
+
+        def errors(critics: dict[str, PyTree]) -> tuple[jax.Array, Metrics]:
+            q = q_values(critics["critic_r"], batch.obs, batch.action, cfg)
+            loss = ((q - y_r) ** 2).sum(0).mean()
+            metrics = {"train/critic_loss": loss, "train/q": q.mean()}
+            if priced:
+                q_c = cost_values(critics["critic_c"], batch.obs, batch.action, names(cfg), cfg)
+                loss_c = ((q_c - y_c) ** 2).sum(0).mean(0)
+                metrics |= {"train/critic_loss_c": loss_c, "train/q_c": q_c.mean((0, 1))}
+                loss += loss_c.sum()
+            return loss, metrics
+
+        critic_lr = step_size(cfg.critic_lr, at, cfg)
+        new, new_states, metrics = descended(errors, critics, states, critic_lr, cfg)
+
+        # policy
+        dist = bounded_policy(params["actor"], batch.obs, cfg)
+        keys = jax.random.split(key, cfg.actions)
+        own = jax.vmap(lambda key: bounded_action(dist, key))(keys)  # [actions, B, A]
+
+        def better(value: Any) -> jax.Array:
+            """By how much the data's action is, of value(action) -> [B] or [B, K]."""
+            return value(batch.action) - jax.vmap(value)(own).mean(0)
+
+        advantage = better(lambda a: q_values(new["critic_r"], batch.obs, a, cfg).min(0))
+        if priced:
+            adv_c = better(lambda a: reduced_costs(new["critic_c"], batch.obs, a, names(cfg), cfg))
+            advantage = treatment.advantage(at.dual, advantage, adv_c)
+        weight = jnp.minimum(jnp.exp(advantage / cfg.temperature), cfg.weight_max)
+
+        def loss(net: dict[str, PyTree]) -> tuple[jax.Array, Metrics]:
+            log_pi = log_prob(bounded_policy(net["actor"], batch.obs, cfg), batch.action)
+            loss = -(weight * log_pi).mean()
+            return loss, {"train/actor_loss": loss, "train/weight": weight.mean()}
+
+        lr = step_size(cfg.lr, at, cfg)
+        actor, actor_states, found = descended(loss, {"actor": params["actor"]}, states, lr, cfg)
+        new, metrics = new | actor, metrics | found
+        if priced:
+            metrics["train/cost_estimate"] = episode_cost(next_c.mean(0), cfg, env)
+        followed = optax.incremental_update(new, targets, cfg.tau)
+        return Trainable(new | {"targets": followed}, new_states | actor_states), metrics
+
+    return Learner(init=init, act=act, step=step)
+
+
+def minus_price(dual: Any, adv_r: jax.Array, adv_c: jax.Array) -> jax.Array:
+    """A = A_r - sum_i lam_i A_ci: the temperature sets the scale of A, so that nothing divides it."""
+    return adv_r - jnp.dot(adv_c, dual.lam, precision=jax.lax.Precision.HIGHEST)
+
+
+unscaled = lagrangian._replace(advantage=minus_price)
+
+
+def make(env: Env, axis_name: str | None = None, treatment: Treatment = no_treatment) -> Algorithm:
+    """`axis_name` splits nothing here: there are no environments."""
+    return offline(env, learner(env, treatment), treatment)
+
+
+# OmniSafe @15603dd, configs/offline: CRR.yaml, CCRR.yaml
+OMNISAFE: dict[str, Any] = bc.OMNISAFE | {"actions": 10, "weight_max": float("inf")}
+# for a problem of two levers
+LEVER: dict[str, Any] = {"hidden": (64,), "discount": 0.9, "tau": 0.02, "temperature": 0.05}
+
+ROWS = {
+    "crr": Row(
+        CRRConfig,
+        make,
+        "regression on the better actions of a data set, no constraint",
+        {"omnisafe": OMNISAFE},
+        omnisafe="CRR",
+        holds="nothing",
+        lever=LEVER,
+    ),
+    "ccrr": Row(
+        CCRRConfig,
+        partial(make, treatment=unscaled),
+        "CRR with an adaptive price on cost",
+        {"omnisafe": OMNISAFE | {"lam_init": 1.0, "dual_starts": 150_000}},
+        omnisafe="CCRR",
+        lever=LEVER | {"cost_discount": 0.9, "dual_lr": 3e-3},
+    ),
+}

@@ -1,0 +1,84 @@
+"""The command collect: a data set from trained policies."""
+
+import argparse
+import functools
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import jax
+import numpy as np
+
+from jaxsafe.commands.guard import guarded
+from jaxsafe.config import Bounds, ConfigError, Seed, convert, nearest
+from jaxsafe.run import dataset
+from jaxsafe.run.arguments import fail
+from jaxsafe.run.collect import Ingredient, attributes, collect, shares
+from jaxsafe.run.devices import use_compilation_cache
+from jaxsafe.run.interrupts import Interrupts
+from jaxsafe.run.policies import CODE, open_run
+
+Size = Annotated[int, Bounds(1, 10**9)]
+OPTIONS = {"size": 1e6, "out": "data.hdf5", "actions": "sampled", "seed": 1}
+
+
+def main() -> int:
+    """Exit status: 2 for bad input, 130 if stopped."""
+    return guarded(command)
+
+
+def command() -> int:
+    parser = argparse.ArgumentParser(description="Record whole episodes of trained policies in a file.")
+    parser.error = fail  # type: ignore[method-assign]
+    parser.add_argument(
+        "words",
+        nargs="+",
+        metavar="RUN:SHARE",
+        help="run folders, each with its share of the transitions; then size=1e6, out=data.hdf5 or "
+        f".npz, actions=sampled or mean, seed=1; and {', '.join(CODE)} where they are yours",
+    )
+    words = parser.parse_args().words
+    given = dict(word.split("=", 1) for word in words if "=" in word)
+    code = [f"{k}={v}" for k, v in given.items() if k not in OPTIONS]
+    for name in given:
+        if name not in (*OPTIONS, *(text.partition("=")[0] for text in CODE)):
+            raise ConfigError(f"unknown option {name}{nearest(name, OPTIONS)}")
+    size, out, sampled, seed = settings(OPTIONS | given)
+    recipe = shares([word for word in words if "=" not in word])
+    use_compilation_cache()
+    with Interrupts(functools.partial(print, flush=True)) as stop:
+        stop.nothing_to_save = "stopped; nothing is written"
+        runs = [Ingredient(open_run(folder, code), share) for folder, share in recipe]
+        begun = time.perf_counter()
+        made = collect(runs, size, seed, sampled)
+        env = runs[0].run.settings.plain()["env"]
+        more = {"run": made.run, "policy": made.policy, "episode": made.data.episodes.number}
+        about = attributes(made, env, sampled)
+        out.parent.mkdir(parents=True, exist_ok=True)
+        dataset.write_dataset(out, jax.tree.map(np.asarray, made.data), more, about)
+    episodes = made.data.episodes
+    print(
+        f"{out}: {len(made.data.reward):,} transitions in {len(episodes.ret):,} episodes, return "
+        f"{episodes.ret.mean():.4g}, cost {episodes.cost.mean():.4g}, "
+        f"in {time.perf_counter() - begun:.1f} s"
+    )
+    return 0
+
+
+def settings(given: dict[str, Any]) -> tuple[int, Path, bool, int]:
+    """size, out, whether actions are sampled, seed."""
+    numbers = {}
+    for name, kind in (("size", Size), ("seed", Seed)):
+        try:
+            text = str(given[name])
+            numbers[name] = convert(int(text) if text.isdecimal() else float(text), kind, name)
+        except ValueError as error:
+            if isinstance(error, ConfigError):
+                raise
+            raise ConfigError(f"{name}={given[name]}: expected a number") from error
+    if given["actions"] not in ("sampled", "mean"):
+        raise ConfigError(f"actions={given['actions']}{nearest(given['actions'], ('sampled', 'mean'))}")
+    out = Path(given["out"]).expanduser()
+    if out.suffix not in (".hdf5", ".npz"):
+        raise ConfigError(f"out={out}: expected a name that ends in .hdf5 or .npz")
+    return numbers["size"], out, given["actions"] == "sampled", numbers["seed"]

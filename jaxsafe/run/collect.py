@@ -1,0 +1,213 @@
+"""Data sets from trained policies: whole episodes of several runs of the same task, in one file."""
+
+import json
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxsafe
+from jaxsafe.config import ConfigError, flat
+from jaxsafe.learn.acting import Player
+from jaxsafe.learn.offline import DataSet, data_set
+from jaxsafe.run import run_folder
+from jaxsafe.run.policies import RunPolicies
+from jaxsafe.types import PyTree
+
+AT_ONCE = 1000  # episodes that one call of the compiled program plays, at most
+
+
+class Ingredient(NamedTuple):
+    """A run, and its share of the transitions."""
+
+    run: RunPolicies
+    share: float
+
+
+class Steps(NamedTuple):
+    """T steps of an episode, as they are recorded; `obs` is [T + 1, O]."""
+
+    obs: jax.Array
+    action: jax.Array
+    reward: jax.Array
+    cost: jax.Array
+    costs: jax.Array
+    terminated: jax.Array
+    alive: jax.Array  # bool [T], the step is part of the episode
+
+
+def shares(texts: Sequence[str]) -> list[tuple[Path, float]]:
+    """'RUN:SHARE', or 'RUN' for what the others leave, as folders and shares that sum to 1.
+
+    Raises:
+        ConfigError: shares that are no numbers in (0, 1], or do not sum to 1.
+    """
+    found: list[tuple[Path, float | None]] = []
+    for text in texts:
+        folder, colon, share = text.rpartition(":")
+        folder, share = (folder, share) if colon else (text, "")
+        try:
+            number = float(share) if colon else None
+        except ValueError:
+            number = math.nan
+        if number is not None and not 0 < number <= 1:
+            raise ConfigError(f"{text}: expected RUN:SHARE, with a share between 0 and 1")
+        found.append((Path(folder).expanduser(), number))
+    given = sum(share for _, share in found if share is not None)
+    rest = sum(share is None for _, share in found)
+    if rest > 1 or (rest and given >= 1) or (not rest and abs(given - 1) > 1e-6):
+        raise ConfigError(f"the shares sum to {given:g}; expected 1, or one run without a share")
+    return [(folder, 1 - given if share is None else share) for folder, share in found]
+
+
+def check_same_task(runs: Sequence[RunPolicies]) -> None:
+    """Raise ConfigError if the runs were trained on different environments."""
+    first = flat(runs[0].settings.plain()["env"])
+    for run in runs[1:]:
+        other = flat(run.settings.plain()["env"])
+        for name in sorted({*first, *other} - {"engine"}):
+            if first.get(name) != other.get(name):
+                raise ConfigError(
+                    f"env.{name} is {first.get(name)} in {runs[0].folder}, {other.get(name)} in "
+                    f"{run.folder}; expected runs of the same task"
+                )
+
+
+def episode(player: Player, key: jax.Array, obs_size: int, sampled: bool) -> Steps:
+    """One episode, pure, of `episode_length` steps; those after its end are not `alive`.
+
+    What an augmentation appends to the observation is left out. Actions are clipped to [-1, 1], as
+    environments clip them.
+    """
+    reset_key, act_key = jax.random.split(key)
+    env = player.task
+
+    def step(now: Any, t: jax.Array) -> Any:
+        state, carry, alive = now
+        own_key = jax.random.fold_in(act_key, t) if sampled else None
+        action, carry = player.act(carry, state, own_key)
+        action = jnp.clip(action, -1.0, 1.0)
+        after = env.step(state, action)
+        made = (after.obs[:obs_size], action, after.reward, after.cost, after.costs, after.terminated)
+        return (after, carry, alive & ~after.terminated), (*made, alive)
+
+    start = env.reset(reset_key)
+    begin = start, player.begin(), jnp.bool_(True)
+    _, (obs, *rest) = jax.lax.scan(step, begin, jnp.arange(env.episode_length))
+    return Steps(jnp.concatenate([start.obs[None, :obs_size], obs]), *rest)
+
+
+def episodes(run: RunPolicies, seed: int, sampled: bool) -> Iterator[tuple[int, Steps]]:
+    """Episodes without end, the policies of the run in turn: (index of the policy, steps).
+
+    They come from one compiled program, which plays some of each policy at once.
+    """
+    policies = len(jax.tree.leaves(run.learned)[0])
+    task = run.algo.task(jax.tree.map(lambda x: x[0], run.learned))
+    each = max(1, AT_ONCE // policies)
+
+    def of_one(params: PyTree, keys: jax.Array) -> Steps:
+        player = Player(run.algo.policy, params, task)
+        return jax.vmap(lambda key: episode(player, key, run.env.obs_size, sampled))(keys)
+
+    play = jax.jit(jax.vmap(of_one))
+    key, turn = jax.random.fold_in(jax.random.key(seed), 0x636F6C6C), 0
+    while True:
+        keys = jax.random.split(jax.random.fold_in(key, turn), (policies, each))
+        played: Any = jax.tree.map(np.asarray, play(run.learned, keys))
+        for i in range(each):
+            for policy in range(policies):
+                yield policy, jax.tree.map(lambda x, p=policy, i=i: x[p, i], played)
+        turn += 1
+
+
+class Collected(NamedTuple):
+    """A data set, which run and policy each transition is from, int32 [n], and the recipe."""
+
+    data: DataSet
+    run: np.ndarray
+    policy: np.ndarray
+    recipe: dict[str, Any]
+
+
+def collect(
+    ingredients: Sequence[Ingredient], size: int, seed: int = 0, sampled: bool = True
+) -> Collected:
+    """At least `size` transitions in whole episodes, each run's share of them.
+
+    A run gives episodes until it has its share; the one that passes it is the last. An episode that
+    holds a number that is not finite is left out.
+
+    Raises:
+        ConfigError: runs of different tasks, or a run whose every episode has such numbers.
+    """
+    check_same_task([x.run for x in ingredients])
+    parts: list[dict[str, np.ndarray]] = []
+    recipe = []
+    for number, (run, share) in enumerate(ingredients):
+        wanted, have, kept, lost = math.ceil(share * size - 1e-6), 0, 0, 0
+        source = episodes(run, seed + number, sampled)
+        while have < wanted:
+            policy, steps = next(source)
+            made = arrays(steps)
+            if not all(np.isfinite(x).all() for x in made.values()):
+                lost += 1
+                if lost > max(10, 10 * kept):
+                    raise ConfigError(f"{run.folder} plays episodes with numbers that are not finite")
+                continue
+            count = len(made["reward"])
+            have, kept = have + count, kept + 1
+            parts.append(
+                made
+                | {"run": np.full(count, number, np.int32), "policy": np.full(count, policy, np.int32)}
+            )
+        recipe.append(about(run) | {"share": share, "episodes": kept, "transitions": have})
+    whole: dict[str, Any] = {name: np.concatenate([x[name] for x in parts]) for name in parts[0]}
+    run, policy, costs = (whole.pop(name) for name in ("run", "policy", "costs"))
+    names = ingredients[0].run.env.cost_names
+    data = data_set(**whole, costs={name: costs[:, k] for k, name in enumerate(names)})
+    return Collected(data, run, policy, {"runs": recipe, "seed": seed, "size": size})
+
+
+def arrays(steps: Steps) -> dict[str, Any]:
+    """The steps that are part of the episode; the last one ends it."""
+    count = int(np.asarray(steps.alive).sum())
+    terminated = np.asarray(steps.terminated)[:count]
+    last = np.arange(count) == count - 1
+    return {
+        "obs": steps.obs[:count],
+        "next_obs": steps.obs[1 : count + 1],
+        "action": steps.action[:count],
+        "reward": steps.reward[:count],
+        "cost": steps.cost[:count],
+        "costs": steps.costs[:count],
+        "terminated": terminated,
+        "truncated": last & ~terminated,
+    }
+
+
+def about(run: RunPolicies) -> dict[str, Any]:
+    settings = run.settings
+    return {
+        "run": run.folder.name,
+        "algo": settings.algo_name,
+        "cost_limit": float(settings.algo.cost_limit),
+        "seeds": settings.train.num_seeds,
+        "first_seed": settings.train.seed,
+        "trained_by": run_folder.trained_by(run.folder),
+    }
+
+
+def attributes(collected: Collected, env: dict[str, Any], sampled: bool) -> dict[str, str]:
+    """What the file says of itself."""
+    return {
+        "recipe": json.dumps(collected.recipe),
+        "env": json.dumps(env),
+        "actions": "sampled" if sampled else "mean",
+        "jaxsafe": jaxsafe.__version__,
+        "commit": run_folder.commit() or "",
+    }

@@ -1,0 +1,242 @@
+"""Data sets that are collected from runs, and those of other libraries."""
+
+import json
+import os
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from shell import SMALL, TOY, typed
+from toys import Corridor
+
+from jaxsafe.config import ConfigError
+from jaxsafe.run import collect, dataset
+from jaxsafe.run.dataset import read_dataset, write_dataset
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("collect") / "run"
+    options = ("total_steps=64", "num_seeds=2", "eval_episodes=0", f"run_dir={folder}")
+    assert typed("train", *SMALL, *options) == 0
+    return folder
+
+
+def flat(data) -> dict[str, np.ndarray]:
+    named = {k: np.asarray(x) for k, x in data._asdict().items() if k not in ("costs", "episodes")}
+    named |= {f"cost {k}": np.asarray(x) for k, x in data.costs.items()}
+    return named | {k: np.asarray(x) for k, x in data.episodes._asdict().items()}
+
+
+def assert_equal(one, other):
+    one, other = flat(one), flat(other)
+    assert one.keys() == other.keys()
+    for name in one:
+        assert one[name].dtype == other[name].dtype, name
+        np.testing.assert_array_equal(one[name], other[name], err_msg=name)
+
+
+def test_whole_episodes_of_every_policy_with_dsrls_keys_and_a_recipe(run, tmp_path, capsys):
+    out = tmp_path / "mixed.hdf5"
+    args = (f"{run}:0.25", f"{run}:0.75", TOY, "size=200", f"out={out}", "actions=mean")
+    assert typed("collect", *args) == 0
+    said = capsys.readouterr().out
+    assert "220 transitions in 11 episodes" in said and len(said.splitlines()) == 1
+    with h5py.File(out) as file:
+        arrays: dict[str, Any] = {name: file[name][()] for name in file}  # type: ignore[index]
+        attrs: dict[str, Any] = {**file.attrs}
+    dsrl = {"observations", "next_observations", "actions", "rewards", "costs", "terminals", "timeouts"}
+    assert {*arrays} == dsrl | {"cost_wall", "run", "policy", "episode"}
+    # 50 transitions are 3 episodes of 20 steps, 150 are 8
+    assert np.bincount(arrays["run"]).tolist() == [60, 160]
+    assert np.bincount(arrays["policy"][60:]).tolist() == [80, 80]
+    assert arrays["timeouts"].nonzero()[0].tolist() == list(range(19, 220, 20))
+    assert not arrays["terminals"].any()
+    recipe = json.loads(attrs["recipe"])
+    assert [x["share"] for x in recipe["runs"]] == [0.25, 0.75] and attrs["actions"] == "mean"
+    assert recipe["runs"][0]["algo"] == "ppo_lag" and recipe["runs"][0]["seeds"] == 2
+    # the recorded steps are those of the environment
+    env, size = Corridor(), np.float32(0.02)
+    obs, after, action = (arrays[k] for k in ("observations", "next_observations", "actions"))
+    np.testing.assert_allclose(after[:, 2:], obs[:, 2:] + size * env.max_accel * action, atol=1e-6)
+    np.testing.assert_allclose(arrays["rewards"], after[:, 2], atol=1e-6)
+    inside = ~arrays["timeouts"][:-1]
+    np.testing.assert_array_equal(after[:-1][inside], obs[1:][inside])
+
+
+def test_the_same_command_collects_the_same_and_mean_actions_are_not_sampled_ones(run, tmp_path):
+    files = [tmp_path / f"{i}.npz" for i in range(3)]
+    for out, actions in zip(files, ("sampled", "sampled", "mean"), strict=True):
+        assert typed("collect", str(run), TOY, "size=40", f"out={out}", f"actions={actions}") == 0
+    first, again, mean = (read_dataset(str(path)) for path in files)
+    assert_equal(first, again)
+    assert np.abs(first.action - mean.action).max() > 0.1
+
+
+@pytest.mark.parametrize(
+    "args, message",
+    [
+        (("RUN:0.5",), "the shares sum to 0.5; expected 1, or one run without a share"),
+        (("RUN:2",), "expected RUN:SHARE, with a share between 0 and 1"),
+        (("RUN:a",), "expected RUN:SHARE"),
+        (("RUN", "size=0"), "size=0: expected a whole number between 1 and"),
+        (("RUN", "size=many"), "size=many: expected a number"),
+        (("RUN", "out=data.txt"), "expected a name that ends in .hdf5 or .npz"),
+        (("RUN", "actions=meen"), "did you mean 'mean'?"),
+        (("RUN", "sizes=3"), "unknown option sizes; did you mean 'size'?"),
+        (("nowhere",), "nowhere is not a run folder"),
+    ],
+)
+def test_what_cannot_be_collected_is_one_line(run, tmp_path, capsys, args, message):
+    args = [word.replace("RUN", str(run)) for word in args]
+    given = () if any("out=" in word for word in args) else (f"out={tmp_path / 'data.npz'}",)
+    assert typed("collect", *args, *given) == 2
+    said = capsys.readouterr()
+    assert message in said.err and len((said.out + said.err).strip().splitlines()) == 1
+
+
+def test_a_run_that_terminates_gives_shorter_episodes():
+    alive = np.array([True, True, False])
+    terminated = np.array([False, True, True])
+    x = np.arange(3, dtype=np.float32)
+    obs = np.arange(4, dtype=np.float32)[:, None]
+    recorded: Any = (obs, x[:, None], x, x, x[:, None], terminated, alive)
+    steps = collect.Steps(*recorded)
+    made = collect.arrays(steps)
+    assert made["terminated"].tolist() == [False, True] and not made["truncated"].any()
+    assert made["next_obs"][:, 0].tolist() == [1, 2]
+
+
+# ---- formats -----------------------------------------------------------------------------------
+
+
+def made(ends: str = "..t..T.c..T"):
+    """A data set with 3 numbers a step: t terminates, T runs out of time, c is cut, as is the end."""
+    rng, n = np.random.default_rng(0), len(ends)
+    marks = np.array(list(ends))
+    numbers = rng.normal(size=(n + 1, 3)).astype(np.float32)
+    costs = {"a": rng.normal(size=n), "b": rng.normal(size=n)}
+    obs, after = numbers[:-1], numbers[1:].copy()
+    after[marks != "."] += 1  # a reset follows
+    cut = marks == "c"
+    return dataset.data_set(
+        obs, rng.uniform(-1, 1, (n, 2)), rng.normal(size=n), rng.normal(size=n), after,
+        marks == "t", marks == "T", costs, cut,
+    ), cut  # fmt: skip
+
+
+def test_episodes_are_found_and_those_that_are_cut_are_not_whole():
+    data, _ = made("..t..T.c..")
+    assert data.episodes.number.tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 3, 3]
+    assert data.episodes.whole.tolist() == [True, True, False, False]
+    np.testing.assert_array_equal(data.episodes.first_obs, data.obs[[0, 3, 6, 8]])
+    np.testing.assert_allclose(data.episodes.cost[1], data.cost[3:6].sum(), rtol=1e-6)
+
+
+@pytest.mark.parametrize("suffix", [".hdf5", ".npz"])
+def test_our_files_come_back_bit_for_bit(tmp_path, suffix):
+    data, _ = made("..t..T...T")
+    write_dataset(tmp_path / f"data{suffix}", data)
+    assert_equal(read_dataset(str(tmp_path / f"data{suffix}")), data)
+
+
+def test_a_file_with_dsrls_keys_written_by_h5py_alone_loads(tmp_path):
+    data, _ = made("..t..T...T")
+    data = data._replace(costs={})
+    with h5py.File(tmp_path / "dsrl.hdf5", "w") as file:
+        file.create_dataset("timeouts", data=data.truncated)
+        for name, (field, _) in dataset.ARRAYS.items():
+            file.create_dataset(name, data=getattr(data, field), compression="gzip")
+    assert_equal(read_dataset(str(tmp_path / "dsrl.hdf5")), data)
+
+
+def test_omnisafes_done_is_told_apart_by_the_length_of_the_episode(tmp_path):
+    data, _ = made("..t..T.c..T")  # no episode but those that end by T has 3 steps, save the first
+    columns = {
+        theirs: getattr(data, dataset.ARRAYS[ours][0]) for theirs, ours in dataset.OMNISAFE.items()
+    }
+    columns["done"] = data.terminated | data.truncated
+    np.savez(tmp_path / "omni.npz", **{k: x if x.ndim == 2 else x[:, None] for k, x in columns.items()})
+    found = read_dataset(str(tmp_path / "omni.npz"), episode_length=3)
+    assert found.truncated.nonzero()[0].tolist() == [2, 5, 10] and not found.terminated.any()
+    assert found.episodes.number.tolist() == data.episodes.number.tolist()
+    assert found.episodes.whole.tolist() == [True, True, False, True]
+    found = read_dataset(str(tmp_path / "omni.npz"), episode_length=4)
+    assert found.terminated.nonzero()[0].tolist() == [2, 5, 10]
+
+
+@pytest.mark.parametrize("extra", [0, 1])
+def test_minaris_episodes_load(tmp_path, extra):
+    data, _ = made("..t..T...T")
+    folder = tmp_path / "set" / "data"
+    folder.mkdir(parents=True)
+    with h5py.File(folder / "main_data.hdf5", "w") as file:
+        for k in (2, 0, 1):  # in any order
+            own = data.episodes.number == k
+            group = file.create_group(f"episode_{k}")
+            group["observations"] = np.concatenate([data.obs[own], data.next_obs[own][-1:]])
+            for name, field in (
+                ("actions", "action"), ("rewards", "reward"), ("terminations", "terminated"),
+                ("truncations", "truncated"),
+            ):  # fmt: skip
+                group[name] = getattr(data, field)[own]
+            group["infos/cost"] = np.concatenate([np.zeros(extra, np.float32), data.cost[own]])
+    assert_equal(read_dataset(str(tmp_path / "set")), data._replace(costs={}))
+
+
+def test_without_timeouts_the_episodes_are_not_known(tmp_path):
+    data, _ = made()
+    write_dataset(tmp_path / "data.hdf5", data._replace(episodes=()))
+    assert read_dataset(str(tmp_path / "data.hdf5")).episodes == ()
+
+
+def broken(tmp_path, change):
+    path = tmp_path / "data.hdf5"
+    write_dataset(path, made()[0])
+    with h5py.File(path, "a") as file:
+        del file["costs"]
+        change(file)
+    with pytest.raises(ConfigError) as error:
+        read_dataset(str(path))
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+def test_a_strangers_hdf5_reads_no_other_file_and_takes_no_more_memory_than_it_has(tmp_path):
+    secret = tmp_path / "secret"
+    secret.write_bytes(bytes(44))
+    with h5py.File(tmp_path / "other.hdf5", "w") as file:
+        file["costs"] = np.zeros(11, np.float32)
+
+    def external(file):
+        file.create_dataset("costs", (11,), "f4", external=[(str(secret), 0, 44)])
+
+    def virtual(file):
+        layout = h5py.VirtualLayout((11,), "f4")
+        layout[:] = h5py.VirtualSource(str(tmp_path / "other.hdf5"), "costs", (11,))
+        file.create_virtual_dataset("costs", layout)
+
+    def linked(file):
+        file["costs"] = h5py.ExternalLink(str(tmp_path / "other.hdf5"), "costs")
+
+    def bomb(file):
+        file.create_dataset("costs", (10**14,), "f4", chunks=(10**6,), compression="gzip")
+
+    assert "costs is not kept in the file itself" in broken(tmp_path, external)
+    assert "costs is not kept in the file itself" in broken(tmp_path, virtual)
+    assert "has no costs" in broken(tmp_path, linked)
+    assert "unpacks to" in broken(tmp_path, bomb)
+    assert "expected numbers" in broken(tmp_path, lambda file: file.create_dataset("costs", data="x"))
+    assert "expected numbers [n]" in broken(
+        tmp_path, lambda file: file.create_dataset("costs", data=1.0)
+    )
+
+
+@pytest.mark.parametrize("size", [4, 100, 2000])
+def test_a_torn_hdf5_is_one_line(tmp_path, size):
+    path = tmp_path / "data.hdf5"
+    write_dataset(path, made()[0])
+    os.truncate(path, size)
+    with pytest.raises(ConfigError, match="cannot be read as"):
+        read_dataset(str(path))

@@ -1,0 +1,474 @@
+"""The offline learners against NumPy: gradients of linear networks, values, limits, an LP."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from compiling import FAST
+from scipy.optimize import linprog
+from toys import Corridor, Lever
+
+from jaxsafe.algos import ALGOS, bc, bcq, coptidice, crr
+from jaxsafe.config import ConfigError
+from jaxsafe.learn.learner import GradientStep
+from jaxsafe.learn.offline import batch_at, constrained, data_set, first_obs_at
+from jaxsafe.learn.treatments import Multiplier, lagrangian
+from jaxsafe.run import evaluate
+from jaxsafe.types import Shared
+
+LINEAR: dict[str, Any] = {"hidden": (), "obs_normalize": False, "max_grad_norm": 1e9, "discount": 0.9}
+LAM = 0.7
+DUAL = Multiplier(jnp.float32(LAM), ())
+
+
+def random_data(n=5, seed=0):
+    rng = np.random.default_rng(seed)
+    ends = np.arange(n) % 3 == 2
+    return data_set(
+        rng.normal(size=(n, 4)), rng.uniform(-1, 1, (n, 2)), rng.normal(size=n), rng.random(n),
+        rng.normal(size=(n, 4)), ends, np.zeros(n, bool),
+    )  # fmt: skip
+
+
+def prepared(learner, cfg, n=5):
+    """Networks, a batch of n, the moment, and the batch in float64."""
+    data = random_data(n)
+    nets = learner.init(jax.random.key(0), 4, 2, cfg)
+    batch = batch_at(data, jnp.arange(n), cfg, ())
+    first = first_obs_at(data, jax.random.key(3), cfg, ())
+    at = GradientStep(jnp.int32(0), jnp.ones(()), jax.random.key(1), DUAL, first)
+    return nets, batch, at, double(batch._asdict())
+
+
+def stepped(learner, nets, batch, at, cfg):
+    step: Any = jax.jit(lambda *args: learner.step(*args, None), compiler_options=FAST)
+    return step(nets, batch, at, cfg)
+
+
+def double(tree):
+    return jax.tree.map(lambda x: np.asarray(x, np.float64), tree)
+
+
+def linear(net, x):
+    """A network of one layer, or a stack of them: [..., I] -> [..., out] or [J, ..., out]."""
+    layer = net["params"]["Dense_0"]
+    if layer["kernel"].ndim == 3:
+        return np.stack([x @ k + b for k, b in zip(layer["kernel"], layer["bias"], strict=True)])
+    return x @ layer["kernel"] + layer["bias"]
+
+
+def q(net, obs, action):
+    return linear(net, np.concatenate([obs, action], -1))[..., 0]
+
+
+def differences(loss, params):
+    """The gradient of `loss` by central differences, in float64."""
+    leaves, tree = jax.tree.flatten(double(params))
+    grads = []
+    for i, leaf in enumerate(leaves):
+        grad = np.zeros_like(leaf)
+        for place in np.ndindex(leaf.shape):
+            ends = []
+            for side in (1e-5, -1e-5):
+                moved = [x.copy() for x in leaves]
+                moved[i][place] += side
+                ends.append(loss(tree.unflatten(moved)))
+            grad[place] = (ends[0] - ends[1]) / 2e-5
+        grads.append(grad)
+    return tree.unflatten(grads)
+
+
+def assert_gradient(after, name, loss, params):
+    """The first moment of Adam after one step is a tenth of the gradient."""
+    moment: Any = optax.tree_utils.tree_get(after.opt_state[name], "mu")
+    for x, y in zip(*map(jax.tree.leaves, (moment, differences(loss, params))), strict=True):
+        np.testing.assert_allclose(
+            np.asarray(x) / (1 - np.float64(np.float32(0.9))), y, atol=1e-5, rtol=1e-5
+        )
+
+
+def noise(key, shape):
+    return np.asarray(jax.random.normal(key, shape), np.float64)
+
+
+def elbo(vae, obs, action, eps, weight):
+    mean, log_std = np.split(linear(vae["encoder"], np.concatenate([obs, action], -1)), 2, -1)
+    z = mean + np.exp(log_std) * eps
+    error = (np.tanh(linear(vae["decoder"], np.concatenate([obs, z], -1))) - action) ** 2
+    divergence = -0.5 * (1 + 2 * log_std - mean**2 - np.exp(2 * log_std))
+    return error.mean() + weight * divergence.mean()
+
+
+def test_a_gradient_of_vae_bc():
+    cfg = bc.VAEBCConfig(**LINEAR, vae_hidden=(), kl_weight=0.3)
+    learner = bc.autoencoder(2)
+    nets, batch, at, b = prepared(learner, cfg)
+    after, metrics = stepped(learner, nets, batch, at, cfg)
+    eps = noise(at.key, (5, 4))
+
+    def loss(vae):
+        return elbo(vae, b["obs"], b["action"], eps, 0.3)
+
+    assert_gradient(after, "vae", loss, nets.params["vae"])
+    whole = metrics["train/vae_error"] + 0.3 * metrics["train/vae_kl"]
+    np.testing.assert_allclose(whole, loss(double(nets.params["vae"])), rtol=1e-5)
+
+
+@pytest.mark.parametrize("target", ["chosen", "max"])
+def test_gradients_of_bcq_lag(target):
+    cfg = bcq.BCQLagConfig(
+        **LINEAR, vae_hidden=(), candidates=3, cost_discount=0.8, cost_target=target, perturbation=0.2
+    )
+    learner = bcq.learner(Corridor(), lagrangian)
+    nets, batch, at, b = prepared(learner, cfg)
+    # targets of their own, so that a mistaken network shows
+    other = learner.init(jax.random.key(5), 4, 2, cfg).params["targets"]
+    nets = nets._replace(params=nets.params | {"targets": other})
+    after, metrics = stepped(learner, nets, batch, at, cfg)
+    vae_key, next_key, key = jax.random.split(at.key, 3)
+    eps = noise(vae_key, (5, 4))
+    loss = lambda vae: elbo(vae, b["obs"], b["action"], eps, 0.5)  # noqa: E731
+    assert_gradient(after, "vae", loss, nets.params["vae"])
+    new, old = double(after.params), double(other)
+
+    def xi(actor, obs, z):
+        likely = np.tanh(linear(new["vae"]["decoder"], np.concatenate([obs, z], -1)))
+        out = linear(actor, np.concatenate([obs, likely], -1))
+        return np.clip(likely + 0.2 * np.tanh(out), -1, 1)
+
+    y, y_c, chosen = [], [], []
+    latents = np.clip(noise(next_key, (5, 3, 4)), -0.5, 0.5)
+    for i in range(5):  # one transition at a time, one action at a time
+        values = []
+        for z in latents[i]:
+            s = b["next_obs"][i]
+            a = xi(old["actor"], s, z)
+            q_r = q(old["critic_r"], s, a)
+            values.append((0.75 * q_r.min() + 0.25 * q_r.max(), q(old["critic_c"], s, a).mean()))
+        best = max(values, key=lambda pair: pair[0] - LAM * pair[1])
+        go = 1 - b["terminated"][i]
+        next_r, next_c = best if target == "chosen" else [max(x) for x in zip(*values, strict=True)]
+        y.append(b["reward"][i] + 0.9 * go * next_r)
+        y_c.append(b["cost"][i] + 0.8 * go * next_c)
+        chosen.append(go * best[1])
+
+    def error(aims):
+        return lambda net: ((q(net, b["obs"], b["action"]) - np.array(aims)) ** 2).sum(0).mean()
+
+    assert_gradient(after, "critic_r", error(y), nets.params["critic_r"])
+    assert_gradient(after, "critic_c", error(y_c), nets.params["critic_c"])
+    np.testing.assert_allclose(metrics["train/cost_estimate"], 0.2 * 20 * np.mean(chosen), rtol=1e-4)
+    z = np.clip(noise(key, (5, 4)), -0.5, 0.5)
+
+    def climb(actor):
+        a = xi(actor, b["obs"], z)
+        gain = q(new["critic_r"], b["obs"], a)[0] - LAM * q(new["critic_c"], b["obs"], a).mean(0)
+        return -gain.mean() / (1 + LAM)
+
+    assert_gradient(after, "actor", climb, nets.params["actor"])
+    for name in ("actor", "critic_r", "critic_c"):
+        followed = jax.tree.map(lambda x, y: 0.995 * x + 0.005 * y, old[name], new[name])
+        for x, z in zip(*map(jax.tree.leaves, (new["targets"][name], followed)), strict=True):
+            np.testing.assert_allclose(x, z, atol=1e-6)
+
+
+def test_without_a_price_bcq_takes_the_best_of_the_candidates():
+    cfg = bcq.BCQConfig(**LINEAR, vae_hidden=(), act_candidates=20)
+    learner = bcq.learner(Corridor())
+    nets, batch, _, b = prepared(learner, cfg)
+    params, key = double(nets.params), jax.random.key(2)
+    assert "critic_c" not in params
+    taken = learner.act(nets.params, batch.obs, key, cfg)
+    z = np.clip(noise(key, (5, 20, 4)), -0.5, 0.5)
+    for i in range(5):
+        obs = np.tile(b["obs"][i], (20, 1))
+        likely = np.tanh(linear(params["vae"]["decoder"], np.concatenate([obs, z[i]], -1)))
+        out = linear(params["actor"], np.concatenate([obs, likely], -1))
+        a = np.clip(likely + 0.05 * np.tanh(out), -1, 1)
+        best = a[q(params["critic_r"], obs, a)[0].argmax()]
+        np.testing.assert_allclose(taken[i], best, atol=1e-5)
+    first, again = (learner.act(nets.params, batch.obs, None, cfg) for _ in range(2))
+    np.testing.assert_array_equal(first, again)
+
+
+def density(actor, obs, action):
+    log_std = np.clip(actor["log_std"], -5, 2)
+    z = (action - np.tanh(linear(actor["mean"], obs))) / np.exp(log_std)
+    return (-0.5 * z**2 - log_std - 0.5 * np.log(2 * np.pi)).sum(-1)
+
+
+def test_gradients_of_ccrr():
+    cfg = crr.CCRRConfig(**LINEAR, actions=3, cost_discount=0.8, temperature=0.5, weight_max=1.1)
+    learner = crr.learner(Corridor(), crr.unscaled)
+    nets, batch, at, b = prepared(learner, cfg)
+    other = learner.init(jax.random.key(5), 4, 2, cfg).params["targets"]
+    nets = nets._replace(params=nets.params | {"targets": other})
+    after, metrics = stepped(learner, nets, batch, at, cfg)
+    new, old = double(after.params), double(other)
+    next_key, key = jax.random.split(at.key)
+
+    def sample(actor, obs, key):
+        std = np.exp(np.clip(actor["log_std"], -5, 2))
+        return np.clip(np.tanh(linear(actor["mean"], obs)) + std * noise(key, (5, 2)), -1, 1)
+
+    ahead, go = sample(old["actor"], b["next_obs"], next_key), 1 - b["terminated"]
+    y = b["reward"] + 0.9 * go * q(old["critic_r"], b["next_obs"], ahead).min(0)
+    next_c = go * q(old["critic_c"], b["next_obs"], ahead).mean(0)
+
+    def error(aims):
+        return lambda net: ((q(net, b["obs"], b["action"]) - aims) ** 2).sum(0).mean()
+
+    assert_gradient(after, "critic_r", error(y), nets.params["critic_r"])
+    assert_gradient(after, "critic_c", error(b["cost"] + 0.8 * next_c), nets.params["critic_c"])
+    np.testing.assert_allclose(metrics["train/cost_estimate"], 0.2 * 20 * next_c.mean(), rtol=1e-4)
+
+    own = [sample(double(nets.params["actor"]), b["obs"], k) for k in jax.random.split(key, 3)]
+
+    def better(net, reduce):
+        mean = np.mean([reduce(q(net, b["obs"], a)) for a in own], 0)
+        return reduce(q(net, b["obs"], b["action"])) - mean
+
+    adv_r = better(new["critic_r"], lambda x: x.min(0))
+    adv_c = better(new["critic_c"], lambda x: x.mean(0))
+    weight = np.minimum(np.exp((adv_r - LAM * adv_c) / 0.5), 1.1)
+    assert 0 < (weight == 1.1).sum() < 5
+
+    def imitate(actor):
+        return -(weight * density(actor, b["obs"], b["action"])).mean()
+
+    assert_gradient(after, "actor", imitate, nets.params["actor"])
+
+
+def visits(nu, b, alpha, rows=slice(None)):
+    """e and w of COptiDICE, one number a transition."""
+    ahead, here = linear(nu, b["next_obs"][rows])[:, 0], linear(nu, b["obs"][rows])[:, 0]
+    e = b["reward"][rows] - LAM * b["cost"][rows] + 0.9 * (1 - b["terminated"][rows]) * ahead - here
+    x = e / alpha
+    return e, np.where(x < 0, np.exp(np.minimum(x, 0)), x + 1)
+
+
+def test_gradients_of_coptidice():
+    cfg = coptidice.COptiDICEConfig(
+        **LINEAR, alpha=0.5, cost_divergence=0.02, tau_init=0.6, batch_size=5
+    )
+    learner = coptidice.learner(Corridor())
+    nets, batch, at, b = prepared(learner, cfg)
+    after, metrics = stepped(learner, nets, batch, at, cfg)
+    params, first = double(nets.params), double(at.first_obs)
+
+    def nu_loss(nu):
+        e, w = visits(nu, b, 0.5)
+        f = np.where(w < 1, w * (np.log(w) - 1) + 1, 0.5 * (w - 1) ** 2)
+        return 0.1 * linear(nu, first).mean() + (w * e - 0.5 * f).mean()
+
+    assert_gradient(after, "nu", nu_loss, nets.params["nu"])
+    w = visits(params["nu"], b, 0.5)[1]
+
+    def ell(chi):
+        ahead = (1 - b["terminated"]) * linear(chi, b["next_obs"])[:, 0]
+        inside = b["cost"] + 0.9 * ahead - linear(chi, b["obs"])[:, 0]
+        return 0.1 * linear(chi, first)[:, 0] + w * inside
+
+    weight = np.exp(ell(params["chi"]) / 0.6)
+    weight /= weight.mean()
+    assert_gradient(after, "chi", lambda chi: (weight * ell(chi)).mean(), nets.params["chi"])
+    divergence = (weight * np.log(weight)).mean()
+    assert_gradient(after, "tau", lambda tau: tau * (0.02 - divergence), nets.params["tau"])
+    bound = 20 * (weight * w * b["cost"]).mean()
+    np.testing.assert_allclose(metrics["train/cost_estimate"], bound, rtol=1e-5)
+    imitate = lambda actor: -(w * density(actor, b["obs"], b["action"])).mean()  # noqa: E731
+    assert_gradient(after, "actor", imitate, nets.params["actor"])
+
+
+def test_a_loss_of_coptidice_over_a_batch_is_the_mean_over_its_transitions():
+    cfg = coptidice.COptiDICEConfig(**LINEAR, alpha=0.5, batch_size=7)
+    learner = coptidice.learner(Corridor())
+    nets, batch, at, _ = prepared(learner, cfg, n=7)
+
+    step: Any = jax.jit(lambda *args: learner.step(*args, None), compiler_options=FAST)
+
+    def losses(rows):
+        own = jax.tree.map(lambda x: x[rows], batch)
+        moment = at._replace(first_obs=at.first_obs[rows])
+        metrics = step(nets, own, moment, cfg)[1]
+        return np.array([metrics["train/nu_loss"], metrics["train/actor_loss"]])
+
+    alone = np.mean([losses(np.array([i])) for i in range(7)], 0)
+    np.testing.assert_allclose(losses(np.arange(7)), alone, rtol=1e-5)
+
+
+# ---- values and limits --------------------------------------------------------------------------
+
+
+VALUES: dict[str, Any] = {
+    "hidden": (), "obs_normalize": False, "updates": 1500, "batch_size": 32, "discount": 0.9,
+    "cost_discount": 0.9, "critic_lr": 0.05, "tau": 0.1, "lam_init": 0.0, "dual_starts": 1400,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["bcq_lag", "ccrr"])
+def test_each_critic_learns_its_own_signal_beyond_the_time_limit_in_units_of_the_limit(name):
+    """A cost of 1 at each step, no reward, and an end by time after every 10 steps: Q_c is
+    1 / (1 - 0.9) = 10, Q_r is 0, and an episode of 20 steps costs 20."""
+    n = 200
+    rng = np.random.default_rng(0)
+    obs, zero = np.zeros((n, 4)), np.zeros(n)
+    late = np.arange(n) % 10 == 9
+    data = data_set(obs, rng.uniform(-1, 1, (n, 2)), zero, zero + 1, obs, late & False, late)
+    algo, shared = ALGOS[name].make(Corridor()), Shared(np.int32(0), data=data)
+    more = {"vae_hidden": (), "candidates": 2} if name == "bcq_lag" else {"actions": 2}
+
+    def trained(limit, ends):
+        cfg = ALGOS[name].config(**VALUES, **more, cost_limit=limit, time_limit_ends=ends)
+        return algo.update(algo.init(jax.random.key(0), cfg, shared), shared)
+
+    run = jax.jit(jax.vmap(lambda limit: trained(limit, False)), compiler_options=FAST)
+    ts, metrics = run(jnp.array([19.0, 21.0]))
+    again = shared._replace(iteration=np.int32(1))
+    ts, metrics = jax.jit(jax.vmap(algo.update, (0, None)), compiler_options=FAST)(ts, again)
+    np.testing.assert_allclose(metrics["train/q_c"], 10, rtol=0.02)
+    np.testing.assert_allclose(metrics["train/cost_estimate"], 20, rtol=0.02)
+    np.testing.assert_allclose(metrics["train/q"], 0, atol=0.05)
+    assert ts.dual.lam[0] > 0.1 and ts.dual.lam[1] == 0
+    if name == "ccrr":  # OmniSafe's convention: 10 steps of it at most
+        ended, _ = jax.jit(lambda: trained(19.0, True), compiler_options=FAST)()
+        critic = double(ended.params["critic_c"])
+        assert (q(critic, np.zeros(4), np.zeros(2)) < 9).all()
+
+
+def test_limits_of_named_costs_are_held_apart():
+    batch = batch_at(
+        random_data()._replace(costs={"a": np.arange(5.0), "b": np.ones(5)}), jnp.arange(5),
+        crr.CCRRConfig(cost_limits={"a": 1.0, "b": 2.0}), (), ("a", "b"),
+    )  # fmt: skip
+    np.testing.assert_array_equal(
+        constrained(batch, ("a", "b")), np.stack([np.arange(5), np.ones(5)], -1)
+    )
+
+
+@pytest.mark.parametrize(
+    "name, cfg", [("bc_safe", bc.BCSafeConfig), ("coptidice", coptidice.COptiDICEConfig)]
+)
+def test_what_needs_episodes_says_so(name, cfg):
+    with pytest.raises(ConfigError, match="the data set has no timeouts"):
+        ALGOS[name].check(cfg(), random_data()._replace(episodes=()))
+
+
+def test_bc_safe_draws_from_whole_episodes_within_the_limit_alone():
+    n = 12
+    costs = np.repeat([3.0, 0.0, 1.0, 0.0], 3)
+    late = np.arange(n) % 3 == 2
+    late[-1] = False  # the last episode is cut off
+    zero = np.zeros((n, 4))
+    data = data_set(zero, zero[:, :2], zero[:, 0], costs, zero, late & False, late)
+    cfg = bc.BCSafeConfig(cost_limit=3.0, batch_size=500)
+    rows = np.asarray(bc.safe_episodes(data, cfg)(jax.random.key(0)))
+    assert np.unique(rows).tolist() == [3, 4, 5, 6, 7, 8]
+    cfg = bc.BCSafeConfig(cost_limit=2.0, batch_size=500)
+    assert np.unique(np.asarray(bc.safe_episodes(data, cfg)(jax.random.key(0)))).tolist() == [3, 4, 5]
+    data = data._replace(episodes=data.episodes._replace(cost=np.full(4, 9.0)))
+    with pytest.raises(ConfigError, match="no episode of at most that; the least costs 9"):
+        bc.check_safe(cfg, data)
+
+
+# ---- optima -------------------------------------------------------------------------------------
+
+
+def test_coptidice_finds_the_visits_of_the_linear_program():
+    """Two states, two actions: each leads to the state of its number. The data has all four alike."""
+    reward, cost = np.array([0.0, 1.0, 0.6, 0.2]), np.array([0.0, 1.0, 0.2, 0.0])  # of (s, a)
+    state, action = np.array([0, 0, 1, 1]), np.array([0, 1, 0, 1])
+    discount, limit = 0.9, 0.3  # cost of a step
+    flow = np.eye(2)[:, state] - discount * np.eye(2)[:, action]
+    best = linprog(
+        -reward, A_ub=cost[None], b_ub=[limit], A_eq=flow, b_eq=[(1 - discount), 0], bounds=(0, None)
+    ).x
+    free = linprog(-reward, A_eq=flow, b_eq=[(1 - discount), 0], bounds=(0, None)).x
+    assert cost @ free > 1.3 * limit  # the limit binds
+    signs = 2.0 * action[:, None] - 1
+    no = np.zeros(4, bool)
+    data = data_set(np.eye(2)[state], signs, reward, cost, np.eye(2)[action], no, ~no)
+
+    class Small:
+        episode_length = 10
+
+    env: Any = Small()
+    cfg = coptidice.COptiDICEConfig(
+        hidden=(), obs_normalize=False, discount=discount, alpha=0.015,
+        cost_divergence=0.0, tau_init=1e5, tau_lr=0.0, critic_lr=3e-3,
+        dual_lr=3e-3, cost_limit=10 * limit, batch_size=4,
+    )  # fmt: skip
+    learner = coptidice.learner(env)
+    batch = batch_at(data, jnp.arange(4), cfg, ())
+    first = jnp.tile(jnp.array([1.0, 0.0]), (4, 1))
+
+    def step(now, share):
+        nets, dual = now
+        cfg_now = cfg.__class__(**{**vars(cfg), "critic_lr": 3e-3 * share, "dual_lr": 3e-3 * share})
+        at = GradientStep(jnp.int32(0), jnp.ones(()), jax.random.key(0), dual, first)
+        nets, metrics = learner.step(nets, batch, at, cfg_now, None)
+        return (nets, lagrangian.update(dual, metrics["train/cost_estimate"], cfg_now, 0)), metrics
+
+    start = learner.init(jax.random.key(0), 2, 1, cfg), lagrangian.init(cfg)
+    run = jax.jit(
+        lambda now: jax.lax.scan(step, now, jnp.linspace(1, 0, 20_000)), compiler_options=FAST
+    )
+    (nets, dual), metrics = run(start)
+    nu = linear(double(nets.params["nu"]), np.eye(2))[:, 0]
+    e = reward - float(dual.lam) * cost + discount * nu[action] - nu[state]
+    w = np.asarray(coptidice.inverse_slope(jnp.array(e / cfg.alpha)))
+    np.testing.assert_allclose(w / 4, best, atol=0.02 * best.max())
+    np.testing.assert_allclose(metrics["train/cost_estimate"][-1], 10 * limit, rtol=0.02)
+
+
+LIMIT, BEST = 2.5, 14.375  # of Lever: cost of an episode, and the best return within it
+
+
+def lever_data(name, n=20_000):
+    """Both levers anywhere, evenly. COptiDICE weighs the luck of a step as if it were an action's
+    merit, so it is shown mean rewards."""
+    rng = np.random.default_rng(0)
+    signs = rng.choice([-1.0, 1.0], (n + 1, 2))
+    u = rng.random((n, 2))
+    luck = 0.5 * rng.choice([-1.0, 1.0], n) * (name != "coptidice")
+    reward = u[:, 0] * (2 - u[:, 0]) + u[:, 1] + luck
+    late = np.arange(n) % 10 == 9
+    return data_set(
+        signs[:-1], signs[:-1] * (2 * u - 1), reward, u[:, 0], signs[1:], late & False, late,
+        {"lever": u[:, 0]},
+    )  # fmt: skip
+
+
+def trained_on_lever(name, iterations=10, **options):
+    """Return and cost of a whole episode by the mean action, of 2 seeds."""
+    row = ALGOS[name]
+    sizes = {"updates": 1000, "obs_normalize": False, "cost_limit": LIMIT, "lr_decay": True}
+    sizes |= {"total_iterations": float(iterations), "critic_lr": 1e-3}
+    settings: dict[str, Any] = {**sizes, **row.lever, **options}
+    cfg, algo, data = row.config(**settings), row.make(Lever()), lever_data(name)
+    update = jax.jit(jax.vmap(algo.update, (0, None)))
+    shared = Shared(np.int32(0), data=data)
+    keys = jax.random.split(jax.random.key(0), 2)
+    ts = jax.jit(jax.vmap(lambda key: algo.init(key, cfg, shared)))(keys)
+    metrics = {}
+    for i in range(iterations):
+        ts, metrics = update(ts, shared._replace(iteration=np.int32(i)))
+    whole = evaluate.run_episodes(algo, jax.vmap(algo.learned)(ts), 200, seed=0)
+    return whole.ret.mean(1), whole.cost.mean(1), metrics
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["bcq", "crr"])
+def test_without_a_constraint_the_best_of_the_data_is_found(name):
+    ret, cost, _ = trained_on_lever(name)
+    assert (ret > 18.5).all() and (cost > 8).all()  # 20 and 10 at best, 11.7 in the data
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["bcq_lag", "ccrr", "coptidice"])
+def test_with_a_constraint_the_best_within_the_limit_is_found(name):
+    ret, cost, _ = trained_on_lever(name)
+    assert (cost < 1.15 * LIMIT).all() and (ret > 0.9 * BEST).all()
