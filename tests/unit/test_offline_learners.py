@@ -44,7 +44,9 @@ def prepared(learner, cfg, n=5):
 
 
 def stepped(learner, nets, batch, at, cfg):
-    step: Any = jax.jit(lambda *args: learner.step(*args, None), compiler_options=FAST)
+    step = jax.jit(
+        lambda nets, batch, at, cfg: learner.step(nets, batch, at, cfg, None), compiler_options=FAST
+    )
     return step(nets, batch, at, cfg)
 
 
@@ -288,7 +290,9 @@ def test_a_loss_of_coptidice_over_a_batch_is_the_mean_over_its_transitions():
     learner = coptidice.learner(Corridor())
     nets, batch, at, _ = prepared(learner, cfg, n=7)
 
-    step: Any = jax.jit(lambda *args: learner.step(*args, None), compiler_options=FAST)
+    step = jax.jit(
+        lambda nets, batch, at, cfg: learner.step(nets, batch, at, cfg, None), compiler_options=FAST
+    )
 
     def losses(rows):
         own = jax.tree.map(lambda x: x[rows], batch)
