@@ -78,7 +78,9 @@ class BCQLagConfig(OfflineCostConfig, BCQConfig):
         minimise_lam  -lam (J_c - cost_limit),  lam >= 0,  by Adam, after each gradient step
         J_c = (1 - cost_discount) T E[Q'_c(s', a'_i*)],   T the steps of an episode
 
-    Acts with the a_i that earns most at the price. The rest is as in BCQ. Values go on after the time
+    Acts with the a_i that earns most at the price, out of as many as the target has: out of more it
+    would find cheaper ones, and J_c would not be its cost. J_c is of drawn z_i, so `eval/cost_sampled`
+    is what to compare it with. The rest is as in BCQ. Values go on after the time
     limit, so J_c is the undiscounted cost of an episode at the rate that Q_c says.
 
     Source: Liu et al. (2023), "Datasets and Benchmarks for Offline Safe Reinforcement Learning",
@@ -95,6 +97,9 @@ class BCQLagConfig(OfflineCostConfig, BCQConfig):
         ),
     )
 
+    # Actions among which the policy takes the best: as many as the target has, so that J_c is the cost
+    # of the policy that acts.
+    act_candidates: Amount = 10
     # Whose cost the target has: that of the action that is chosen, or the largest of all.
     cost_target: Literal["chosen", "max"] = "chosen"
 
@@ -237,6 +242,7 @@ LAG: dict[str, Any] = {"lam_init": 1.0, "dual_starts": 150_000}
 # for a problem of two levers
 LEVER: dict[str, Any] = {
     "hidden": (64,), "vae_hidden": (64,), "discount": 0.9, "tau": 0.02, "perturbation": 0.1,
+    "latent_clip": 3.0, "kl_weight": 0.05,
 }  # fmt: skip
 
 ROWS = {
@@ -255,6 +261,6 @@ ROWS = {
         "BCQ with an adaptive price on cost",
         {"omnisafe": OMNISAFE | LAG},
         omnisafe="BCQLag",
-        lever=LEVER | {"cost_discount": 0.9, "dual_lr": 3e-3},
+        lever=LEVER | {"cost_discount": 0.9, "dual_lr": 3e-3, "candidates": 30, "act_candidates": 30},
     ),
 }
