@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compiling import FAST
+from learners import on_policy_names, options_of
 from scipy.optimize import linprog, minimize
 from toys import START, Corridor, Ticker, updated
 
@@ -26,7 +27,8 @@ from jaxsafe.run import loop
 from jaxsafe.types import State
 
 SLOW = partial(pytest.param, marks=pytest.mark.slow)
-SEVERAL = [name for name in ALGOS if "cost_limits" in ALGOS[name].config.__dataclass_fields__]
+# on-policy; tests/contract/test_actor_critic.py has the others
+SEVERAL = [name for name in on_policy_names() if "cost_limits" in options_of(name)]
 
 
 # ---- prices ----------------------------------------------------------------------------------
