@@ -193,6 +193,6 @@ ROWS = {
         "CRR with an adaptive price on cost",
         {"omnisafe": OMNISAFE | {"lam_init": 1.0, "dual_starts": 150_000}},
         omnisafe="CCRR",
-        lever=LEVER | {"cost_discount": 0.9, "dual_lr": 3e-3},
+        lever=LEVER | {"cost_discount": 0.9, "dual_lr": 5e-4, "temperature": 0.1},
     ),
 }

@@ -41,9 +41,10 @@ Noise = Annotated[float, Bounds(0, 10)]  # a standard deviation; actions lie in 
 class DeterministicConfig(ActorCriticConfig):
     """What methods with a deterministic policy share."""
 
-    # Standard deviation of the noise on actions in training, of the calmest and of the boldest
-    # environment; the others lie between, evenly. OmniSafe has 0.1 for all.
+    # Standard deviation of the noise on actions in training, in the calmest environment. The others
+    # lie evenly between this and `noise_max`. OmniSafe has 0.1 in all.
     noise_min: Noise = 0.05
+    # The same in the boldest environment.
     noise_max: Noise = 0.5
 
 

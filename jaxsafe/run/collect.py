@@ -101,14 +101,16 @@ def episode(player: Player, key: jax.Array, obs_size: int, sampled: bool) -> Ste
     return Steps(jnp.concatenate([start.obs[None, :obs_size], obs]), *rest)
 
 
-def episodes(run: RunPolicies, seed: int, sampled: bool) -> Iterator[tuple[int, Steps]]:
+def episodes(run: RunPolicies, steps: int, seed: int, sampled: bool) -> Iterator[tuple[int, Steps]]:
     """Episodes without end, the policies of the run in turn: (index of the policy, steps).
 
-    They come from one compiled program, which plays some of each policy at once.
+    They come from one compiled program, which plays some of each policy at once: as many as `steps`
+    fill if none ends early, within `AT_ONCE`.
     """
     policies = len(jax.tree.leaves(run.learned)[0])
     task = run.algo.task(jax.tree.map(lambda x: x[0], run.learned))
-    each = max(1, AT_ONCE // policies)
+    wanted = math.ceil(steps / run.env.episode_length)
+    each = math.ceil(min(AT_ONCE, wanted) / policies)
 
     def of_one(params: PyTree, keys: jax.Array) -> Steps:
         player = Player(run.algo.policy, params, task)
@@ -150,7 +152,7 @@ def collect(
     recipe = []
     for number, (run, share) in enumerate(ingredients):
         wanted, have, kept, lost = math.ceil(share * size - 1e-6), 0, 0, 0
-        source = episodes(run, seed + number, sampled)
+        source = episodes(run, wanted, seed + number, sampled)
         while have < wanted:
             policy, steps = next(source)
             made = arrays(steps)

@@ -53,7 +53,7 @@ def test_another_run_starts_from_it(trained, tmp_path, capsys):
     assert typed("train", *GRU, *rest, f"init_from={trained}") == 0
     before, after = (checkpoint.load(x / "policy")[0] for x in (trained, run))
     networks = [name for name in before if name.startswith("params.")]
-    assert networks and "params.policy.mean.params.GRU_0.gates.kernel" in networks
+    assert networks and "params.actor.mean.params.GRU_0.gates.kernel" in networks
     for name in networks:
         np.testing.assert_array_equal(before[name], after[name])
     other = tmp_path / "other"

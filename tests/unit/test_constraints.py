@@ -396,7 +396,7 @@ BAD = {
     "algo=ppo algo.cost_limits.hazards=5": "ppo takes one limit",
     "algo.clip.hazards=5": "unknown option algo.clip.hazards",
     "algo.cost_limits.hazards.x=5": "unknown option algo.cost_limits.hazards.x",
-    "algo=p3o algo.cost_limits={hazards: 5}": "takes one limit, algo.cost_limit; several are for cpo,",
+    "algo=p3o algo.cost_limits={hazards: 5}": "takes one limit, algo.cost_limit; several are for ",
     "algo=ppo algo.cost_limits={hazards: 5}": "ppo takes one limit",
     "env=point_goal0 algo.cost_limits={hazards: 5}": "the environment has none",
 }
