@@ -32,13 +32,15 @@ class StepRecord(NamedTuple):
     """What T steps of N environments came to, [T, N], costs [T, N, K]. A reset and a bad step are none:
     `real` is false.
 
-    ended marks complete episodes that end with the step; episode and length are their sums.
+    terminated marks episodes that fail with the step. ended marks complete episodes that end with it;
+    episode and length are their sums.
     """
 
     real: jax.Array
     reward: jax.Array
     cost: jax.Array
     costs: jax.Array
+    terminated: jax.Array
     ended: jax.Array
     episode: Episode
     length: jax.Array
@@ -97,6 +99,7 @@ def collect_records(
             reward=rollout.state.reward,
             cost=rollout.state.cost,
             costs=rollout.state.costs,
+            terminated=terminated,
             ended=(terminated | truncated) & rollout.complete & ~bad.any,
             episode=rollout.episode,
             length=rollout.steps,

@@ -57,7 +57,7 @@ from jaxsafe.learn.replay import (
     usable,
     write,
 )
-from jaxsafe.learn.returns import mean_length
+from jaxsafe.learn.returns import LostTime, expected_length, no_lost_time
 from jaxsafe.learn.rollout import check_steps, init_rollout
 from jaxsafe.learn.steps import Trainable, remaining
 from jaxsafe.learn.treatments import Treatment, no_treatment
@@ -139,7 +139,7 @@ class TrainState:
     normaliser: Normaliser, or () without `obs_normalize`.
     stepping: this device's environments.
     replay: their ring, [R, N, ...].
-    episode_length: float [], running mean length of an episode, in steps.
+    lost_time: LostTime, from which the mean length of an episode follows.
     """
 
     config: Any
@@ -150,7 +150,7 @@ class TrainState:
     normaliser: PyTree
     stepping: Stepping
     replay: Record
-    episode_length: jax.Array
+    lost_time: LostTime
     key: jax.Array
 
 
@@ -192,7 +192,7 @@ def off_policy(
             normaliser=init_normaliser(env.obs_size) if cfg.obs_normalize else (),
             stepping=stepping,
             replay=empty_ring(arrival_record(stepping, actions), sizes.rows),
-            episode_length=jnp.float32(env.episode_length),
+            lost_time=no_lost_time(),
             key=key,
         )
 
@@ -264,8 +264,14 @@ def off_policy(
         now, (steps, metrics, ready, skipped) = jax.lax.scan(one_round, now, rounds)
 
         steps = jax.tree.map(lambda x: x.reshape(cfg.horizon, *x.shape[2:]), steps)
-        length = mean_length(ts.episode_length, steps.ended, steps.length, axis_name)
-        length = jnp.where(jnp.isfinite(length), length, ts.episode_length)
+        length, lost_time = expected_length(
+            ts.lost_time,
+            env.episode_length,
+            steps.terminated,
+            steps.length,
+            steps.real.sum(),
+            axis_name,
+        )
         nonfinite = metrics.pop("train/nonfinite").sum() + skipped.sum()
         metrics = {k: masked_mean(x.mean(1), ready, None) for k, x in metrics.items()}
         metrics |= episode_metrics(env, steps, axis_name) | world_metrics(steps.bad, axis_name)
@@ -294,7 +300,7 @@ def off_policy(
             normaliser=now.normaliser,
             stepping=now.stepping,
             replay=now.replay,
-            episode_length=length,
+            lost_time=lost_time,
             key=key,
         )
         return ts, jax.tree.map(jnp.float32, metrics)

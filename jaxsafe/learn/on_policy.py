@@ -365,7 +365,12 @@ def on_policy_loop(env: Env, method: Method, axis_name: str | None) -> Algorithm
         seen = Experience(augmented, signals, ts.rollout.carry)
         batch, explained = estimate_batch(learned_of(ts), seen, names, axis_name)
         length, lost_time = expected_length(
-            ts.lost_time, env.episode_length, traj.terminated, traj.length, axis_name
+            ts.lost_time,
+            env.episode_length,
+            traj.terminated,
+            traj.length,
+            traj.terminated.size,
+            axis_name,
         )
         cost = episode_cost(ts.past_costs, charged, weight, length, axis_name)
 

@@ -159,32 +159,6 @@ def window_mean(window: Window, value: jax.Array) -> tuple[jax.Array, Window]:
     return values.sum(0) / count, Window(values, count)
 
 
-def mean_length(
-    length: jax.Array, ended: jax.Array, lengths: jax.Array, axis_name: str | None = None
-) -> jax.Array:
-    """A running mean of episode lengths, in steps: what a cost per step is multiplied by.
-
-    By the renewal-reward theorem an episode's mean cost is the mean cost per step times the mean
-    length of an episode. The batch gives the first factor without lag, whether or not an episode
-    ended in it. This is the second: it starts at the time limit, where it stays, exactly, while
-    nothing terminates early; else it is a mean over about the last N complete episodes. So
-
-    - over synchronous whole episodes the product is their plain mean cost, Safety Gym's J_c;
-    - over parts of staggered episodes that only time ends, it is unbiased: rate times limit;
-    - early terminations reach the length with a lag of an episode, since one that is shortened is
-      known at once and one that is not only when it ends. The cost rate never lags.
-
-    Args:
-        length: float [], the mean so far, at first `env.episode_length`.
-        ended: bool [T, N], complete episodes that ended.
-        lengths: int [T, N], their lengths there.
-    """
-    excess, count, memory = psum(
-        (jnp.where(ended, lengths - length, 0.0).sum(), ended.sum(), ended.shape[1]), axis_name
-    )
-    return length + excess / (count + memory)
-
-
 class LostTime(NamedTuple):
     """Sums over the recent past, float [] each: steps that failures took from their episodes, which
     would have lasted to the time limit, and steps taken."""
@@ -202,6 +176,7 @@ def expected_length(
     limit: int,
     terminated: jax.Array,
     lengths: jax.Array,
+    taken: jax.Array | int,
     axis_name: str | None = None,
 ) -> tuple[jax.Array, LostTime]:
     """The mean length L of an episode in steps, float [], by which a cost per step is multiplied.
@@ -226,9 +201,10 @@ def expected_length(
         limit: T, `env.episode_length`.
         terminated: bool [T, N], where episodes failed.
         lengths: int [T, N], the steps of the episodes so far.
+        taken: how many of the T N entries are steps; resets are none.
     """
     lost = jnp.where(terminated, limit - lengths, 0).sum(dtype=jnp.float32)
-    lost, taken, num_envs = psum((lost, jnp.float32(terminated.size), terminated.shape[1]), axis_name)
+    lost, taken, num_envs = psum((lost, jnp.float32(taken), terminated.shape[1]), axis_name)
     lost, taken = past.lost + lost, past.taken + taken
     length = limit / (1 + lost / taken)
     keep = jnp.minimum(1.0, num_envs * length / taken)

@@ -177,7 +177,7 @@ def test_a_world_that_is_not_finite_costs_the_others_nothing_and_is_counted(name
         assert metrics["train/bad_worlds"] == (iteration == 0)  # it is reset
     assert metrics["train/nonfinite"] > 0 and jnp.isnan(ts.replay.reward[:, 0]).any()
     assert jnp.isfinite(metrics["train/critic_loss"])
-    learned = (ts.params, ts.opt_state, ts.normaliser, ts.episode_length)
+    learned = (ts.params, ts.opt_state, ts.normaliser, ts.lost_time)
     assert all(jnp.isfinite(x).all() for x in jax.tree.leaves(learned))
     assert all(differ(before.params, ts.params))
 
@@ -362,7 +362,7 @@ def training(name, axis_name, num_envs, updates):
 for name in sys.argv[2:]:
     keys = jnp.stack([jax.random.key(0)] * 2)
     ts, metrics = split(training(name, "devices", 16, UPDATES))(keys)  # one seed, 2 x 16 environments
-    for x in jax.tree.leaves((ts.params, ts.opt_state, ts.normaliser, ts.episode_length, metrics)):
+    for x in jax.tree.leaves((ts.params, ts.opt_state, ts.normaliser, ts.lost_time, metrics)):
         np.testing.assert_array_equal(x[0], x[1])  # the devices agree
     rings = np.asarray(ts.replay.obs)
     assert rings.shape[2] == 16 and (rings[0] != rings[1]).any()  # each with a ring of its own

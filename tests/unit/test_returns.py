@@ -11,7 +11,6 @@ from jaxsafe.learn.returns import (
     advantages,
     expected_length,
     gae,
-    mean_length,
     no_lost_time,
     vtrace,
 )
@@ -67,47 +66,30 @@ def test_without_decay_the_sum_is_the_discounted_return():
     np.testing.assert_allclose(advantage[0] + value[0], ret, rtol=1e-5)
 
 
-def test_the_mean_length_stays_exactly_at_the_time_limit():
-    length, ended = jnp.float32(1000), jax.random.bernoulli(jax.random.key(0), 0.1, (7, 13))
-    assert mean_length(length, ended, jnp.full((7, 13), 1000)) == 1000
-    assert mean_length(length, jnp.zeros((7, 13), bool), jnp.full((7, 13), 3)) == 1000
-
-
 def test_episode_cost_is_the_plain_mean_over_synchronous_episodes():
     cost = jax.random.uniform(jax.random.key(0), (10, 4))
-    ended = jnp.zeros((10, 4), bool).at[-1].set(True)
-    length = mean_length(jnp.float32(10), ended, jnp.full((10, 4), 10))
+    failed = jnp.zeros((10, 4), bool)
+    length, _ = expected_length(no_lost_time(), 10, failed, jnp.full((10, 4), 10), 40)
     np.testing.assert_allclose(batch_mean(cost, None) * length, cost.sum(0).mean(), rtol=1e-6)
-
-
-def test_the_mean_length_finds_that_of_early_terminations():
-    rng, length, clock = np.random.default_rng(0), jnp.float32(50), np.zeros(64, int)
-    step = jax.jit(mean_length)
-    for _ in range(60):  # each step ends an episode with probability 1/10: mean length 10
-        ended, lengths = [], []
-        for _ in range(20):
-            clock += 1
-            done = (rng.random(64) < 0.1) | (clock == 50)
-            ended, lengths = [*ended, done], [*lengths, clock.copy()]
-            clock[done] = 0
-        length = step(length, jnp.array(ended), jnp.array(lengths))
-    np.testing.assert_allclose(length, 10 * (1 - 0.9**50), rtol=0.15)
 
 
 def test_the_length_by_lost_time_by_hand():
     # of 8 steps one fails at step 2 of 10 and loses 8: x = 1, and 10 / (1 + 1) = 5
     failed, lengths = jnp.zeros((4, 2), bool).at[1, 0].set(True), jnp.full((4, 2), 2)
-    length, past = expected_length(no_lost_time(), 10, failed, lengths)
+    length, past = expected_length(no_lost_time(), 10, failed, lengths, 8)
     assert length == 5 and past == (8, 8)  # 2 episodes of 5 steps are remembered: all of it
     # 8 more steps without a failure: x = 8 / 16, of which 2 episodes of 6 2/3 steps stay
-    length, past = expected_length(past, 10, ~failed & False, lengths)
+    length, past = expected_length(past, 10, ~failed & False, lengths, 8)
     np.testing.assert_allclose((length, *past), (20 / 3, 20 / 3, 40 / 3), rtol=1e-6)
+    # where 4 of the first 8 entries are resets: x = 8 / 4
+    length, _ = expected_length(no_lost_time(), 10, failed, lengths, 4)
+    np.testing.assert_allclose(length, 10 / 3, rtol=1e-6)
 
 
 def test_the_length_by_lost_time_stays_exactly_at_the_time_limit():
     past = no_lost_time()
     for _ in range(3):
-        length, past = expected_length(past, 1000, jnp.zeros((7, 13), bool), jnp.full((7, 13), 3))
+        length, past = expected_length(past, 1000, jnp.zeros((7, 13), bool), jnp.full((7, 13), 3), 91)
         assert length == 1000
 
 
@@ -125,7 +107,7 @@ def test_the_length_by_lost_time_is_right_from_the_first_batch(limit, hazard, st
             clock += 1
             failed, lengths = [*failed, rng.random(envs) < hazard], [*lengths, clock.copy()]
             clock[failed[-1] | (clock == limit)] = 0
-        length, past = step(past, limit, jnp.array(failed), jnp.array(lengths))
+        length, past = step(past, limit, jnp.array(failed), jnp.array(lengths), envs * horizon)
         found.append(length / exact)
     np.testing.assert_allclose(found[0], 1, atol=0.3)
     np.testing.assert_allclose(found[-1], 1, atol=0.1)
