@@ -15,6 +15,7 @@ has Newton's solver, and no tendons, which pull nothing there. Humanoid's action
 others' are, there in [-0.4, 0.4]. A physics error ends the episode in its last good state.
 """
 
+import dataclasses
 from pathlib import Path
 
 import flax.struct
@@ -156,7 +157,8 @@ class Velocity:
                 "overflow": jnp.zeros(()),
             },
         )
-        kept = state.replace(  # type: ignore[attr-defined]
+        kept = dataclasses.replace(
+            state,
             reward=jnp.zeros(()),
             cost=jnp.zeros(()),
             costs=jnp.zeros(1),
@@ -164,7 +166,7 @@ class Velocity:
             info={"velocity": jnp.zeros(()), "exception": jnp.ones(()), "overflow": jnp.zeros(())},
         )
         after = jax.tree.map(lambda old, new: jnp.where(bad, old, new), kept, good)
-        return after.replace(info=after.info | {"overflow": readings.overflow})
+        return dataclasses.replace(after, info=after.info | {"overflow": readings.overflow})
 
     # Its parts -------------------------------------------------------------------------------------
 
