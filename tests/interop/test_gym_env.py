@@ -2,6 +2,7 @@
 
 import functools
 import importlib
+import itertools
 import sys
 from collections.abc import Iterator
 
@@ -54,11 +55,14 @@ def test_point_goal1_is_made_by_its_id_and_passes_the_checker_with_its_pictures(
 
 def test_every_environment_of_the_suite_has_an_id():
     ids = {key for key in gymnasium.registry if key.startswith("jaxsafe/")}
-    theirs = {alias.removeprefix("Safexp-") for alias in envs.ALIASES}
-    assert ids == {f"jaxsafe/{name}" for name in {*envs.ALIASES.values(), *theirs}}
-    assert {"jaxsafe/point_goal1", "jaxsafe/PointGoal1-v0"} <= ids
+    original = {alias.removeprefix("Safexp-") for alias in envs.ALIASES}
+    parts = itertools.product(("Point", "Car"), ("Goal", "Button", "Push"), "012")
+    theirs = {f"Safety{robot}{task}{level}-v0" for robot, task, level in parts}
+    assert ids >= {f"jaxsafe/{name}" for name in {*envs.ALIASES.values(), *original, *theirs}}
     kwargs = [gymnasium.spec(f"jaxsafe/{name}").kwargs for name in ("point_goal1", "PointGoal1-v0")]
     assert kwargs == [{"env": "point_goal1"}] * 2
+    ruled = gymnasium.spec("jaxsafe/SafetyCarPush2-v0").kwargs
+    assert ruled == {"env": "car_push2", "rules": "safety_gymnasium"}
     older = gymnasium.spec("jaxsafe/SafetyAntVelocity-v0").kwargs
     assert older == {"env": "ant_velocity", "thresholds": "v0"}
 
