@@ -141,7 +141,9 @@ Run along x as fast as the threshold allows. A robot is paid for its speed and f
 pays for control. A step costs 1 if the robot is faster than the threshold. The tasks are
 Safety-Gymnasium's `Safe Velocity`, on Gymnasium's environments of version 4.
 
-    python scripts/train.py env=hopper_velocity algo=ppo_lag
+```sh
+python scripts/train.py env=hopper_velocity algo=ppo_lag
+```
 
 {pictures}
 
@@ -314,7 +316,9 @@ def page(name: str) -> str:
     data = " dataset=data.npz" if issubclass(row.config, OfflineConfig) else ""
     return f"""# {title.removesuffix(".")}
 
-    python scripts/train.py env=point_goal1 algo={name}{data}
+```sh
+python scripts/train.py env=point_goal1 algo={name}{data}
+```
 
 {text}
 
@@ -404,7 +408,9 @@ def task_page(task: str) -> str:
 
 {TASKS[kind]}
 
-    python scripts/train.py env=point_{task} algo=ppo_lag
+```sh
+python scripts/train.py env=point_{task} algo=ppo_lag
+```
 
 {pictures if drawn else ""}
 
