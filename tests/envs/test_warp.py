@@ -320,7 +320,8 @@ def test_the_dynamics_go_where_c_goes(where, what):
 
 LOOSE = (
     '<body pos="3 0 1"><freejoint/><geom type="ellipsoid" size=".1 .2 .3" pos=".1 0 0"/>'
-    '<body pos=".5 0 0"><joint type="ball" damping=".1"/><geom type="box" size=".2 .1 .05"/></body></body>'
+    '<body pos=".5 0 0"><joint type="ball" damping=".1"/><geom type="box" size=".2 .1 .05"/></body>'
+    "</body>"
 )
 
 

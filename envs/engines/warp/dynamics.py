@@ -1,4 +1,4 @@
-"""A physics step of engine `warp` in a dozen kernels, dynamics and a step of the integrator in one each.
+"""A physics step of engine `warp` in a dozen kernels: one for the dynamics, one to integrate.
 
 MuJoCo Warp takes some 50 kernels of a few microseconds each to get from positions and velocities to the
 forces without constraints, for robots of 4 to 30 bodies. Here that is one kernel, in which 8, 16 or 32
@@ -8,9 +8,9 @@ too. The solver is `solver.py`.
 
 Of `Data` only what later kernels and this project read is written: no `qacc_smooth`, no parts of
 `qfrc_smooth`, no inertial frames, cameras, lights or energy. A pass whose sensors read more is MuJoCo
-Warp's. Forces are those of gravity, springs, dampers and actuators: `xfrc_applied` and `qfrc_applied`
-count nothing. Of fluids there are the forces on boxes of a body's inertia, not those on ellipsoids. The rates of axes in equalities are those of the state, as in MuJoCo; MuJoCo Warp's are
-of the state before.
+Warp's. Forces are those of gravity, springs, dampers, actuators and fluids: `xfrc_applied` and
+`qfrc_applied` count nothing. A fluid sees a body as the box of its inertia, never as ellipsoids. The
+rates of axes in equalities are those of the state, as in MuJoCo; MuJoCo Warp's are of the state before.
 
 Source: MuJoCo's documentation, Computation; Featherstone (2008), Rigid Body Dynamics Algorithms.
 """
@@ -166,7 +166,8 @@ def dynamics_kernel(
 ) -> Any:
     sizes = (
         f"BODIES = {bodies}, JOINTS = {joints}, DOFS = {dofs}, ACTUATORS = {actuators}, "
-        f"FLUID = {int(fluid)}, LANES = {lanes}, WORLDS = {worlds}, SHARED = {shared_size(bodies, joints, dofs, actuators)}"
+        f"FLUID = {int(fluid)}, LANES = {lanes}, WORLDS = {worlds}, "
+        f"SHARED = {shared_size(bodies, joints, dofs, actuators)}"
     )
 
     @wp.func_native(f"constexpr int {sizes};\n{ENUMS}{DYNAMICS}")
