@@ -364,14 +364,8 @@ def on_policy_loop(env: Env, method: Method, axis_name: str | None) -> Algorithm
         augmented = dataclasses.replace(traj, next_obs=augmentation.last_obs(traj, cfg))
         seen = Experience(augmented, signals, ts.rollout.carry)
         batch, explained = estimate_batch(learned_of(ts), seen, names, axis_name)
-        length, lost_time = expected_length(
-            ts.lost_time,
-            env.episode_length,
-            traj.terminated,
-            traj.length,
-            traj.terminated.size,
-            axis_name,
-        )
+        taken = traj.terminated.size
+        length, lost_time = expected_length(ts.lost_time, env.episode_length, traj, taken, axis_name)
         cost = episode_cost(ts.past_costs, charged, weight, length, axis_name)
 
         violation = cost.recent - limit(cfg, names)
