@@ -144,7 +144,7 @@ class RoundCarry(NamedTuple):
 
 
 class Moment(NamedTuple):
-    """The round that the loop's clock is at. It is the same for all members.
+    """The round that the loop's clock is at. All but `remaining` is the same for all members.
 
     before, after: Span, what the ring holds before and after the rows of the round are written.
     warming_up: bool [], whether actions are random.

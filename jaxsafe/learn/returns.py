@@ -6,7 +6,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from jaxsafe.learn.batch import psum
+from jaxsafe.learn.batch import batch_mean, psum
 
 Estimator = Literal["gae", "gae_rtg", "plain", "vtrace"]
 
@@ -135,6 +135,35 @@ def window_mean(window: Window, value: jax.Array) -> tuple[jax.Array, Window]:
     values = jnp.concatenate([window.values[1:], value[None]])
     count = jnp.minimum(window.count + 1, len(values))
     return values.sum(0) / count, Window(values, count)
+
+
+class EpisodeCost(NamedTuple):
+    """J_c, the undiscounted cost of an episode: [] or, of several constraints, [K].
+
+    of_iteration: this iteration's estimate, the mean cost of a step times the mean length.
+    recent: the mean of the estimates in `past`, which is what the method gets.
+    past: Window of the last `cost_window` estimates, this one included.
+    """
+
+    of_iteration: jax.Array
+    recent: jax.Array
+    past: Window
+
+
+def episode_cost(
+    past: Window, charged: jax.Array, weight: jax.Array, length: jax.Array, axis_name: str | None
+) -> EpisodeCost:
+    """J_c after a rollout.
+
+    Args:
+        past: of the iterations before it.
+        charged: float [T, N] or [T, N, K], what is held under the limit, 0 in bad steps.
+        weight: float [], of a good step.
+        length: float [], mean length of an episode, in steps.
+    """
+    of_iteration = batch_mean(charged, axis_name, (0, 1)) * weight * length
+    recent, past = window_mean(past, of_iteration)
+    return EpisodeCost(of_iteration, recent, past)
 
 
 class LostTime(NamedTuple):
