@@ -6,7 +6,7 @@ import jax
 import pytest
 
 from jaxsafe import algos, envs
-from jaxsafe.envs.view import render
+from jaxsafe.envs.view import backend
 from jaxsafe.run.devices import use_compilation_cache
 
 use_compilation_cache()  # what a first run of the tests compiles, the next one reads
@@ -51,6 +51,6 @@ def forgotten_code() -> Iterator[None]:
 def display() -> None:
     """What draws pictures, where the machine has it."""
     try:
-        render.find_backend()
-    except render.NoDisplay as error:
+        backend.find_backend()
+    except backend.NoDisplay as error:
         pytest.skip(str(error))

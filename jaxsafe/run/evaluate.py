@@ -43,8 +43,8 @@ def episode(
 
     def step(now, t):
         state, carry, alive = now
-        own_key = jax.random.fold_in(act_key, t) if sampled else None
-        action, carry = player.act(carry, state, own_key)
+        sample_key = jax.random.fold_in(act_key, t) if sampled else None
+        action, carry = player.act(carry, state, sample_key)
         state = env.step(state, action)
         # what comes after the end may be anything, NaN included
         reward, cost, costs = (
