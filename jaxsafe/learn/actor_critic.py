@@ -3,13 +3,14 @@
     y_r = r + discount^n (1 - terminated) (min_i Q'_i(s', a') + bonus'),    a' the method's next action
     y_c = c + cost_discount^n (1 - terminated) reduce_j Q'_cj(s', a')
     minimise_Q   E[sum_i (Q_i(s, a) - y_r)^2 + sum_j (Q_cj(s, a) - y_c)^2]
-    maximise_pi  E[(Q_r - lam Q_c) / (1 + lam)],   Q_r = pick_i Q_i(s, a) + bonus,
-                                                   Q_c = reduce_j Q_cj(s, a),   a from pi(s)
+    maximise_pi  E[(Q_r / unit - lam Q_c) / (1 + lam)],   Q_r = pick_i Q_i(s, a) + bonus,
+                                                          Q_c = reduce_j Q_cj(s, a),   a from pi(s)
     Q' <- Q' + tau (Q - Q')
 
 The methods differ in a', in what is picked and in the bonus, which is an entropy or 0: see `Actor`. How
-Q_r and Q_c are mixed is the treatment's: (Q_r - lam Q_c) / (1 + lam) is a Lagrangian's. A limit is on
-the undiscounted cost of an episode; Q_c, which is discounted, only gives the direction.
+Q_r and Q_c are mixed is the treatment's: (Q_r / unit - lam Q_c) / (1 + lam) is a Lagrangian's. The unit
+is the standard deviation of Q_r over the batch, or 1: see `price_unit`. A limit is on the undiscounted
+cost of an episode; Q_c, which is discounted, only gives the direction.
 """
 
 from collections.abc import Callable
@@ -19,7 +20,8 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from jaxsafe.config import Iterations, config
+from jaxsafe.config import Iterations, Rate, Weight, config
+from jaxsafe.learn.batch import pmean
 from jaxsafe.learn.bill import PriceClockConfig
 from jaxsafe.learn.constraints import metrics_by_constraint, signal
 from jaxsafe.learn.critics import (
@@ -34,7 +36,7 @@ from jaxsafe.learn.learner import GradientStep, Learner
 from jaxsafe.learn.off_policy import OffPolicyConfig
 from jaxsafe.learn.replay import Transitions
 from jaxsafe.learn.steps import Trainable, adam, descend_each, follow
-from jaxsafe.learn.treatments import Treatment
+from jaxsafe.learn.treatments import LagrangianConfig, PIDConfig, Treatment, no_treatment
 from jaxsafe.nn.critics import q_values
 from jaxsafe.types import Env, Metrics, PyTree
 
@@ -51,9 +53,33 @@ class ActorCriticConfig(OffPolicyConfig):
 class CostCriticConfig(PriceClockConfig):
     """For the methods whose actor weighs reward against cost."""
 
-    # How the values of two cost critics become one. max is cautious: it takes estimates that are too
-    # high. one: a single critic, as in OmniSafe.
-    cost_reduce: Literal["mean", "max", "one"] = "mean"
+    # How the values of two cost critics become one. max is cautious: its estimates are too high. With
+    # mean the policy finds actions whose cost is estimated too low, below 0 even, and on point_goal1 it
+    # then stops learning. one: a single critic, as in OmniSafe.
+    cost_reduce: Literal["mean", "max", "one"] = "max"
+    # What a price of 1 on one unit of cost weighs as much as. deviation: the standard deviation of Q_r
+    # over the batch, so that one step of the price suits rewards of any size. reward: one unit of
+    # reward, as in OmniSafe.
+    price_unit: Literal["deviation", "reward"] = "deviation"
+
+
+@config
+class MultiplierConfig(LagrangianConfig, CostCriticConfig):
+    """For `lagrangian`."""
+
+    # Adam's step of the price, whatever the size of the violation. A policy answers a price only after
+    # some hundred thousand steps: on point_goal1 a step of 0.03 ends in policies that stand still.
+    dual_lr: Rate = 0.01
+
+
+@config
+class ControllerConfig(PIDConfig, CostCriticConfig):
+    """For `pid`."""
+
+    pid_kp: Weight = 0.004  # Price for each unit of the smoothed violation.
+    # Price that each unit of violation adds a move. 25 units add as much as the multiplier's step.
+    pid_ki: Weight = 4e-4
+    pid_kd: Weight = 0.004  # Price for each unit that the smoothed cost rose.
 
 
 class Proposal(NamedTuple):
@@ -124,7 +150,7 @@ def actor_critic(env: Env, actor: Actor, treatment: Treatment) -> Learner:
 
         def improve(nets: Trainable) -> tuple[Trainable, Metrics]:
             """The policy climbs what the new critics say, and the targets follow."""
-            loss = policy_loss(nets.params, batch, at._replace(key=policy_key), cfg)
+            loss = policy_loss(nets.params, batch, at._replace(key=policy_key), cfg, axis_name)
             nets, metrics = descend_each(loss, nets, actor.optimisers(cfg, share), axis_name)
             return follow(nets, cfg.tau), metrics
 
@@ -141,15 +167,23 @@ def actor_critic(env: Env, actor: Actor, treatment: Treatment) -> Learner:
         return targets_of(batch, charged, Values(q_r + bonus, q_c), names(cfg), cfg)
 
     def policy_loss(
-        params: dict[str, PyTree], batch: Transitions, at: GradientStep, cfg: Any
+        params: dict[str, PyTree],
+        batch: Transitions,
+        at: GradientStep,
+        cfg: Any,
+        axis_name: str | None,
     ) -> Callable[[dict[str, PyTree]], tuple[jax.Array, Metrics]]:
         """The loss of the actor's parameters, with the critics among `params`."""
 
         def loss(parts: dict[str, PyTree]) -> tuple[jax.Array, Metrics]:
             proposal = actor.propose(parts, batch.obs, at.key, cfg)
             q_r = actor.pick(q_values(params["critic_r"], batch.obs, proposal.action, cfg))
-            q_c = expected_cost(params, batch.obs, proposal.action, names(cfg), cfg)
-            climbed = batch.mean(treatment.advantage(at.dual, q_r + proposal.bonus, q_c))
+            worth = q_r + proposal.bonus
+            if treatment is not no_treatment:
+                q_c = expected_cost(params, batch.obs, proposal.action, names(cfg), cfg)
+                unit = price_unit(batch, worth, cfg, axis_name)
+                worth = treatment.advantage(at.dual, worth / unit, q_c)
+            climbed = batch.mean(worth)
             metrics = {"train/actor_loss": -climbed, **jax.tree.map(batch.mean, proposal.metrics)}
             return batch.mean(proposal.extra) - climbed, metrics
 
@@ -161,6 +195,15 @@ def actor_critic(env: Env, actor: Actor, treatment: Treatment) -> Learner:
         step=step,
         explore=lambda learned, obs, key: explore(learned.params, obs, key, learned.config),
     )
+
+
+def price_unit(batch: Transitions, worth: jax.Array, cfg: Any, axis_name: str | None) -> jax.Array:
+    """What a price of 1 on one unit of cost weighs as much as, float []; `worth` [B] is Q_r."""
+    if cfg.price_unit == "reward":
+        return jnp.ones(())
+    centre = pmean(batch.mean(worth), axis_name)
+    variance = pmean(batch.mean((worth - centre) ** 2), axis_name)
+    return jax.lax.stop_gradient(jnp.sqrt(variance + 1e-12))
 
 
 def at_every(
