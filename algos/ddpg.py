@@ -54,7 +54,8 @@ class DDPGLagConfig(MultiplierConfig, DDPGConfig):
 
     Source: Ray, Achiam and Amodei (2019), "Benchmarking Safe Exploration in Deep Reinforcement
     Learning", for the multiplier.
-    Differs from OmniSafe as SAC-Lagrangian does. OmniSafe's critic of cost takes mu(s').
+    Differs from OmniSafe: there lam moves at every gradient step, so that its speed depends on
+    `replay_ratio`. There is one critic of cost, whose target takes mu(s'), and unit is 1.
     """
 
 
@@ -65,11 +66,13 @@ class DDPGPIDConfig(ControllerConfig, DDPGConfig):
         maximise_mu  E[(Q(s, mu(s)) / unit - lam Q_c(s, mu(s))) / (1 + lam)]
         lam <- (K_p P + I + K_d D)+,   I <- (I + K_i (J_c - cost_limit))+
 
-    once every `dual_every` steps. P, D and unit are as in SAC-PID, critics as in DDPG-Lagrangian.
+    once every `dual_every` steps. P is the smoothed J_c - cost_limit. D is what the smoothed J_c rose
+    over `pid_delay` moves, and 0 if it fell. unit and the critics are those of DDPG-Lagrangian.
 
     Source: Stooke, Achiam and Abbeel (2020), "Responsive Safety in Reinforcement Learning by PID
     Lagrangian Methods", arXiv:2007.03964, algorithm 2, for the controller.
-    Differs from OmniSafe as SAC-PID does.
+    Differs from OmniSafe: there the controller runs at every gradient step, on a J_c that only changes
+    when an episode ends.
     """
 
 

@@ -87,7 +87,9 @@ class TD3LagConfig(MultiplierConfig, TD3Config):
 
     Source: Ray, Achiam and Amodei (2019), "Benchmarking Safe Exploration in Deep Reinforcement
     Learning", for the multiplier.
-    Differs from OmniSafe as SAC-Lagrangian does. OmniSafe's critic of cost takes mu(s') without noise.
+    Differs from OmniSafe: there lam moves at every gradient step, so that its speed depends on
+    `replay_ratio`. There is one critic of cost, whose target takes mu(s') without noise,
+    and unit is 1.
     """
 
 
@@ -98,11 +100,13 @@ class TD3PIDConfig(ControllerConfig, TD3Config):
         maximise_mu  E[(Q_1(s, mu(s)) / unit - lam Q_c(s, mu(s))) / (1 + lam)]
         lam <- (K_p P + I + K_d D)+,   I <- (I + K_i (J_c - cost_limit))+
 
-    once every `dual_every` steps. P, D and unit are as in SAC-PID, critics as in TD3-Lagrangian.
+    once every `dual_every` steps. P is the smoothed J_c - cost_limit. D is what the smoothed J_c rose
+    over `pid_delay` moves, and 0 if it fell. unit and the critics are those of TD3-Lagrangian.
 
     Source: Stooke, Achiam and Abbeel (2020), "Responsive Safety in Reinforcement Learning by PID
     Lagrangian Methods", arXiv:2007.03964, algorithm 2, for the controller.
-    Differs from OmniSafe as SAC-PID does.
+    Differs from OmniSafe: there the controller runs at every gradient step, on a J_c that only changes
+    when an episode ends.
     """
 
 

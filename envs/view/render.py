@@ -18,8 +18,8 @@ from jaxsafe.envs.velocity.task import Velocity
 from jaxsafe.envs.view.backend import gl_context
 from jaxsafe.envs.view.stage import drawable, stage_of
 from jaxsafe.envs.wrap import raw_steps
-from jaxsafe.learn.acting import Player
-from jaxsafe.types import PyTree, State
+from jaxsafe.learn.acting import Player, Playing
+from jaxsafe.types import State
 
 FPS = 30
 CAPTION, GAP = 24, 4  # height of the line over a labelled frame, width between two panels, pixels
@@ -143,16 +143,15 @@ def run_episode(player: Player, key: jax.Array, length: int) -> State:
     """The states of an episode of mean actions on the host, [length + 1, ...], from the reset on."""
     reset_key, _ = jax.random.split(key)
 
-    def step(now: tuple[State, PyTree], _: None) -> tuple[tuple[State, PyTree], State]:
-        state, carry = now
-        action, carry = player.act(carry, state)
-        state = player.task.step(state, action)
-        return (state, carry), state
+    def step(now: Playing, _: None) -> tuple[Playing, State]:
+        action, carry = player.act(now.carry, now.state)
+        state = player.task.step(now.state, action)
+        return Playing(state, carry, now.alive & ~state.terminated), state
 
     def episode() -> State:
-        first = player.task.reset(reset_key)
-        _, rest = jax.lax.scan(step, (first, player.begin()), None, length)
-        return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, rest)
+        start = player.start(reset_key)
+        _, rest = jax.lax.scan(step, start, None, length)
+        return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start.state, rest)
 
     return jax.device_get(jax.jit(episode)())
 

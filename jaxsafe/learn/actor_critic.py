@@ -175,20 +175,15 @@ def actor_critic(env: Env, actor: Actor, treatment: Treatment) -> Learner:
     ) -> Callable[[dict[str, PyTree]], tuple[jax.Array, Metrics]]:
         """The loss of the actor's parameters, with the critics among `params`."""
 
-        def unit(q_r: jax.Array) -> jax.Array:
-            """What a price of 1 on one unit of cost weighs as much as, float []."""
-            if treatment is no_treatment or cfg.price_unit == "reward":
-                return jnp.ones(())
-            centre = pmean(batch.mean(q_r), axis_name)
-            variance = pmean(batch.mean((q_r - centre) ** 2), axis_name)
-            return jax.lax.stop_gradient(jnp.sqrt(variance + 1e-12))
-
         def loss(parts: dict[str, PyTree]) -> tuple[jax.Array, Metrics]:
             proposal = actor.propose(parts, batch.obs, at.key, cfg)
             q_r = actor.pick(q_values(params["critic_r"], batch.obs, proposal.action, cfg))
-            q_r += proposal.bonus
-            q_c = expected_cost(params, batch.obs, proposal.action, names(cfg), cfg)
-            climbed = batch.mean(treatment.advantage(at.dual, q_r / unit(q_r), q_c))
+            worth = q_r + proposal.bonus
+            if treatment is not no_treatment:
+                q_c = expected_cost(params, batch.obs, proposal.action, names(cfg), cfg)
+                unit = price_unit(batch, worth, cfg, axis_name)
+                worth = treatment.advantage(at.dual, worth / unit, q_c)
+            climbed = batch.mean(worth)
             metrics = {"train/actor_loss": -climbed, **jax.tree.map(batch.mean, proposal.metrics)}
             return batch.mean(proposal.extra) - climbed, metrics
 
@@ -200,6 +195,15 @@ def actor_critic(env: Env, actor: Actor, treatment: Treatment) -> Learner:
         step=step,
         explore=lambda learned, obs, key: explore(learned.params, obs, key, learned.config),
     )
+
+
+def price_unit(batch: Transitions, worth: jax.Array, cfg: Any, axis_name: str | None) -> jax.Array:
+    """What a price of 1 on one unit of cost weighs as much as, float []; `worth` [B] is Q_r."""
+    if cfg.price_unit == "reward":
+        return jnp.ones(())
+    centre = pmean(batch.mean(worth), axis_name)
+    variance = pmean(batch.mean((worth - centre) ** 2), axis_name)
+    return jax.lax.stop_gradient(jnp.sqrt(variance + 1e-12))
 
 
 def at_every(

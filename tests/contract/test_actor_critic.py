@@ -378,9 +378,10 @@ def test_the_critics_find_the_values_of_a_chain(name, circle, n_step):
 @pytest.mark.parametrize("num_envs, horizon", [(1, 50), (8, 25), (500, 4), (1000, 16)])
 def test_the_price_moves_by_environment_steps_alone(num_envs, horizon):
     """J_c is 10 above its limit, so that each of Adam's moves is dual_lr: 0.1 for each 1,000 steps."""
-    clock = {"dual_every": 1000, "dual_starts": 16_000}
-    cfg = sac.SACLagConfig(cost_limit=10.0, lam_init=0.0, dual_lr=0.1, **clock)
-    cfg = jax.tree.map(jnp.float32, cfg)
+    cfg = jax.tree.map(
+        jnp.float32,
+        sac.SACLagConfig(cost_limit=10.0, dual_every=1000, dual_starts=16_000, lam_init=0, dual_lr=0.1),
+    )
     real = jnp.ones((horizon, num_envs), bool).at[0].set(False)  # the first of them are resets
     cost = jnp.where(real, 0.2, 7.0)
 
