@@ -42,7 +42,8 @@ def forgotten_code() -> Iterator[None]:
             registry.clear()
             registry.update(before)
     for name in {*sys.modules} - modules:
-        if str(getattr(sys.modules[name], "__file__", None)).startswith(tempfile.gettempdir()):
+        file = str(getattr(sys.modules[name], "__file__", None))
+        if file.startswith(tempfile.gettempdir()) and "site-packages" not in file:  # an environment there
             del sys.modules[name]
     sys.path[:] = path
 

@@ -23,11 +23,11 @@ def command() -> int:
     parser = viewing.parser_of(
         "Watch the policy of a run as it acts, or drive a robot with the arrow keys.",
         "RUN or env=NAME",
-        "a run folder; or a task to drive, and options of it: env=car_goal1 env.vases_num=5",
+        "a run folder, or a task to drive with its options: env=car_goal1 env.vases_num=5",
     )
-    parser.add_argument("--page", action="store_true", help="a page, though there is a display")
+    parser.add_argument("--page", action="store_true", help="serve a page even if there is a display")
     parser.add_argument("--port", type=number(Port), default=8080, help="of the page (default 8080)")
-    parser.add_argument("--open", action="store_true", help="open the page in a browser here")
+    parser.add_argument("--open", action="store_true", help="also open the page in a browser here")
     args, what = viewing.parse(parser)
     if len(what.folders) > 1:
         raise ConfigError(

@@ -381,7 +381,7 @@ def run_table(
     lines = [f"| {' | '.join(header)} |", f"|{'|'.join(ends)}|"]
     for text, row in sorted(origins.items(), key=lambda item: study_files.name_of(item[0])):
         run = named[study_files.name_of(text)]
-        ret, cost = (tables.cell(stats.estimate(run.values[k]), ".2f") for k in ("return", "cost"))
+        ret, cost = (tables.cell(stats.of_measure(k, run.values[k]), ".2f") for k in ("return", "cost"))
         words = " ".join(f"`{re.sub('^(env|algo)=', '', word)}`" for word in text.split())
         odd = ", ".join(sorted(states[text] - {"done"}))
         cells = [f"{words}{f' ({odd})' if odd else ''}", str(len(run.seeds)), ret, cost]
@@ -398,7 +398,7 @@ def final_policy(run: SettingRun, otherwise: str) -> str:
     """What the mean action made in fresh episodes, mean over seeds and its interval."""
     if not {"final return", "final cost"} <= run.values.keys():
         return otherwise
-    ret, cost = (stats.estimate(run.values[f"final {k}"]) for k in ("return", "cost"))
+    ret, cost = (stats.of_measure(k, run.values[f"final {k}"]) for k in ("return", "cost"))
     return "{:.2f} [{:.2f}, {:.2f}], cost {:.2f} [{:.2f}, {:.2f}]".format(*ret, *cost)
 
 

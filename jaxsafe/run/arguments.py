@@ -162,7 +162,7 @@ def check_kind(override: Override) -> None:
 
 def each_job(argv: list[str], job: Callable[[dict[str, Any], int | None], None]) -> None:
     """Let Hydra compose the arguments and call `job(config, number)`: once, or for each run of a
-    --multirun with its number. --help and --cfg print instead. A launcher of Hydra's may call `job` in
+    --multirun with its number. --cfg prints instead. A launcher of Hydra's may call `job` in
     another process or on another host, to which `called` is pickled.
 
     Raises:
@@ -295,7 +295,7 @@ def env_options(name: str) -> dict[str, Any]:
 
 
 def register(request: Request) -> None:
-    """Give Hydra the groups and their defaults, so that --help and --cfg show every option."""
+    """Give Hydra the groups and their defaults, so that --cfg shows every option."""
     store = ConfigStore.instance()
     for group, options in request.groups.items():
         for name, node in options.items():
@@ -317,10 +317,6 @@ def register(request: Request) -> None:
             "sweep": {"dir": "runs/.multirun", "subdir": "."},
             "output_subdir": None,
             "job": {"name": "train", "chdir": False},
-            "help": {
-                "header": "jaxsafe train env=car_push1 algo=cpo [key=value ...]",
-                "footer": "Several values with -m: seed=0,1,2. A list is written [a,b].",
-            },
         },
     }
     store.store(name="train", node=OmegaConf.create(node))

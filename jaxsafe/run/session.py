@@ -91,11 +91,13 @@ def agree_on_folder(settings: Settings, job: int | None, say: Callable[[str], No
     """`choose_folder` of process 0, for all processes.
 
     Raises:
-        ConfigError: as there, or this process has other settings than process 0.
+        ConfigError: as there, or this process has other settings, or another data set, than process 0.
     """
     if jax.process_count() == 1:
         return choose_folder(settings, job, say)
     mine = flat(settings.plain())
+    if settings.train.dataset is not None:
+        mine["the data set's SHA-256"] = dataset.sha256(settings.train.dataset)
     folder = choose_folder(settings, job, say) if distributed.leads() else ""
     folder, theirs = json.loads(distributed.text_from_process_0(json.dumps([str(folder), mine])))
     for name, (here, there) in differences(mine, theirs).items():

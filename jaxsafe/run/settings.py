@@ -61,29 +61,39 @@ COST_LIMITS = "cost_limits"  # an option of algorithms: floats by name, as {haza
 class TrainConfig:
     """The settings beside `env` and `algo`."""
 
-    total_steps: RunSteps = 10_000_000  # environment steps of one seed, rounded up to whole updates
-    # gradient steps of one seed, which then end the run; null: total_steps, or 100,000 with a data set
+    # environment steps of each seed, rounded up to whole updates
+    total_steps: RunSteps = 10_000_000
+    # gradient steps of each seed; if given, they end the run. null: total_steps, or 100,000 with a data
+    # set
     total_updates: RunSteps | None = None
-    num_envs: Amount | None = None  # of one seed; null: algo.num_envs
-    num_seeds: Annotated[int, Bounds(1, 2**16)] = 1  # trained at once: seed, seed + 1, ...
-    seed: Seed = 0
-    devices: Devices = 1  # the seeds are split over them or, for a lone one, its environments
-    coordinator: str | None = None  # host:port of process 0 where several train one run together
-    num_processes: Devices | None = None  # of them; under SLURM all three are known
-    process_index: Period | None = None  # 0 .. num_processes - 1
-    preset: str = "fast"  # the algorithm's defaults: fast, published, or one of its published settings
+    num_envs: Amount | None = None  # environments of each seed; null: algo.num_envs
+    # how many seeds are trained at once: seed, seed + 1, ...
+    num_seeds: Annotated[int, Bounds(1, 2**16)] = 1
+    seed: Seed = 0  # the first seed
+    # devices over which the seeds are split or, of a lone seed, its environments
+    devices: Devices = 1
+    # host:port of process 0, for one run in several processes; SLURM tells this and the next two
+    coordinator: str | None = None
+    num_processes: Devices | None = None  # how many processes there are
+    process_index: Period | None = None  # which of them this is, from 0
+    preset: str = "fast"  # the algorithm's defaults: fast, published, or another of its presets
     compat: str = "none"  # whose departures from the papers to follow: none, or omnisafe
-    run_dir: str | None = None  # null: runs/<env>-<algo>/<time>-seed<seed>
-    resume: bool | str = False  # true: run_dir, or the newest unfinished run like this one; or a folder
-    dataset: str | None = None  # a file to learn from, for offline algorithms
+    run_dir: str | None = None  # the run folder; null: runs/ENV-ALGO/TIME-seedN
+    # true: go on in run_dir or, without it, with the newest unfinished run of these settings; or the
+    # folder of a run
+    resume: bool | str = False
+    dataset: str | None = None  # the file that an offline algorithm learns from
     init_from: str | None = None  # a run folder whose policy to start from
-    checkpoint_every: Annotated[float, Bounds(0, 1e9)] = 60.0  # s between checkpoints
-    checkpoint_iterations: Period = 0  # also after this many iterations; 0: by time alone
-    checkpoint_replay: bool | None = None  # keep the replay, to resume bit for bit; null: up to 2 GB
-    eval_every: Period = 0  # evaluate after so many environment steps, or updates without any; 0: never
-    # of an evaluation, for each seed; 0: none, at the end either
+    checkpoint_every: Annotated[float, Bounds(0, 1e9)] = 60.0  # seconds between checkpoints
+    # also a checkpoint after so many iterations; 0: by time alone
+    checkpoint_iterations: Period = 0
+    # whether checkpoints keep the replay, to resume bit for bit; null: up to 2 GB
+    checkpoint_replay: bool | None = None
+    # also evaluate after so many environment steps or, offline, gradient steps; 0: at the end alone
+    eval_every: Period = 0
+    # episodes of an evaluation, for each seed; 0: no evaluation, also not at the end
     eval_episodes: Annotated[int, Bounds(0, 10**6)] = 20
-    video: bool = True  # of the first seed's policy, at the end
+    video: bool = True  # film the first seed's policy at the end
     logger: Literal["none", "wandb"] = "none"  # where metrics go beside the run folder
 
     def __post_init__(self) -> None:
