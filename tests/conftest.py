@@ -43,7 +43,8 @@ def forgotten_code() -> Iterator[None]:
             registry.update(before)
     for name in {*sys.modules} - modules:
         file = str(getattr(sys.modules[name], "__file__", None))
-        if file.startswith(tempfile.gettempdir()) and "site-packages" not in file:  # an environment there
+        # a virtual environment may lie there, too
+        if file.startswith(tempfile.gettempdir()) and "site-packages" not in file:
             del sys.modules[name]
     sys.path[:] = path
 
