@@ -57,14 +57,14 @@ def train(options: list[str], place: Place) -> int:
     """Run `jaxsafe train` with its output in a log beside the run folder. Returns its exit status."""
     place.folder.parent.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, "-m", "jaxsafe", "train", *in_folder(options, place.folder)]
-    own = {} if place.gpu is None else {"CUDA_VISIBLE_DEVICES": place.gpu}
-    own |= {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}  # several share a GPU
+    visible = {} if place.gpu is None else {"CUDA_VISIBLE_DEVICES": place.gpu}
+    visible |= {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}  # several share a GPU
     with files.appending(log_of(place.folder)) as log:
         process = subprocess.Popen(
             command,
             stdout=log,
             stderr=subprocess.STDOUT,
-            env=os.environ | own,
+            env=os.environ | visible,
             start_new_session=True,  # Ctrl-C is passed on once, below
         )
         while process.poll() is None:

@@ -6,7 +6,9 @@ from jaxsafe.commands import viewing
 from jaxsafe.commands.guard import guarded
 from jaxsafe.commands.jaxsafe import called
 from jaxsafe.config import ConfigError, Port, one_line
-from jaxsafe.envs.view import watch
+from jaxsafe.envs.view import page, window
+from jaxsafe.envs.view.backend import NoDisplay
+from jaxsafe.envs.view.playback import Playback
 from jaxsafe.report.film import NoVideo
 from jaxsafe.run.arguments import compose, number
 from jaxsafe.run.settings import make_env
@@ -31,9 +33,9 @@ def command() -> int:
         raise ConfigError(
             f"{what.folders[1]}: expected one run, or env=NAME; side by side: {called('render')}"
         )
-    page = args.page or args.open or not watch.has_display()
-    if page:
-        watch.check_page(args.port, args.open)
+    in_browser = args.page or args.open or not window.has_display()
+    if in_browser:
+        page.check_page(args.port, args.open)
     if what.folders:
         (policy,) = what.policies(args.index)
         title = f"{policy.settings.env_name}, {policy.settings.algo_name}"
@@ -46,12 +48,12 @@ def command() -> int:
     print(f"{title}: compiling a step ...", flush=True)
     try:
         with contextlib.suppress(KeyboardInterrupt):  # the page's server may have taken it
-            session = watch.Playback(env, player, args.seed)  # type: ignore[arg-type]
-            if page:
-                watch.serve_page(session, title, args.port, args.open)
+            playback = Playback(env, player, args.seed)  # type: ignore[arg-type]
+            if in_browser:
+                page.serve_page(playback, title, args.port, args.open)
             else:
-                watch.open_window(session)
+                window.open_window(playback)
         print("closed")
-    except watch.render.NoDisplay as error:
+    except NoDisplay as error:
         raise NoVideo(one_line(error)) from error
     return 0

@@ -43,15 +43,15 @@ def evaluate(run: RunPolicies, num: int, seed: int, data: PyTree = ()) -> list[S
     cost_names = run.algo.task(jax.tree.map(lambda x: x[0], run.learned)).cost_names
     seeds, scores = settings.train.num_seeds, []
     for i, member in enumerate(members(settings.configs, settings.train)[::seeds]):
-        own = Episodes(*(x[i * seeds : (i + 1) * seeds] for x in episodes))
+        of_setting = Episodes(*(x[i * seeds : (i + 1) * seeds] for x in episodes))
         limits, metrics = limits_of(member.config), tables[i] if i < len(tables) else {}
-        found = measures(own, cost_names, limits)
+        found = measures(of_setting, cost_names, limits)
         rows = summary(settings.env_name, found, float(member.config.cost_limit), metrics)
         if settings.train.dataset is not None:
             rows |= dsrl_scores(settings.env_name, rows, float(member.config.cost_limit))
             rows |= of_data(data, float(member.config.cost_limit))
         by_seed = {name: values.mean(1).tolist() for name, values in found.items()}
-        scores.append(Scores(member.setting, limits, own.ret.size, rows, by_seed))
+        scores.append(Scores(member.setting, limits, of_setting.ret.size, rows, by_seed))
     return scores
 
 

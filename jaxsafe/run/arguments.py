@@ -27,6 +27,7 @@ from omegaconf.errors import OmegaConfBaseException
 from jaxsafe import algos, envs
 from jaxsafe.config import ConfigError, convert, kind_in_words
 from jaxsafe.run import distributed
+from jaxsafe.run.plain import repeated, to_plain
 from jaxsafe.run.settings import (
     COST_LIMITS,
     DEFAULT,
@@ -39,10 +40,8 @@ from jaxsafe.run.settings import (
     find_env,
     load,
     nested,
-    repeated,
     settings_from_config,
     settings_from_options,
-    to_plain,
 )
 
 ERRORS = (HydraException, OmegaConfBaseException)  # of arguments that only Hydra can judge

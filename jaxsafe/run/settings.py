@@ -8,12 +8,9 @@ caller left out. Only this module looks up the names of environments and algorit
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
-
-import jax
-import numpy as np
 
 from jaxsafe import algos, envs
 from jaxsafe.algos import Row
@@ -37,6 +34,7 @@ from jaxsafe.envs.safety_gym import scene
 from jaxsafe.learn.constraints import check_cost_names, limits_by_name
 from jaxsafe.run import run_folder
 from jaxsafe.run.compat import COMPAT, overrides
+from jaxsafe.run.plain import as_text, differences, merged, repeated, replaced, to_plain, together
 from jaxsafe.types import Env
 
 DEFAULT = {"env": "point_goal1", "algo": "ppo_lag"}
@@ -366,6 +364,31 @@ def make_env(settings: Settings) -> Env:
     return env
 
 
+# ---- options by group --------------------------------------------------------------------------
+
+
+def nested(options: Mapping[str, Any]) -> dict[str, Any]:
+    """{'env': 'car_push1', 'algo.clip': 0.1} as config.yaml has it, {'env': {'name': ...}, ...}.
+
+    Of an option that is there twice the later one counts; dicts are merged.
+    """
+    out: dict[str, Any] = {}
+    for name, value in options.items():
+        for part in reversed(f"{name}.name".split(".") if name in DEFAULT else name.split(".")):
+            value = {part: value}
+        out = merged(out, value)
+    return out
+
+
+def parted(config: dict[str, Any]) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+    """The options beside 'env' and 'algo', and a copy of those two groups; a missing one is empty."""
+    for kind in DEFAULT:
+        if not isinstance(config.get(kind) or {}, Mapping):
+            raise ConfigError(f"{kind}={shown(config[kind])}: expected options by name")
+    groups = {kind: dict(config.get(kind) or {}) for kind in DEFAULT}
+    return {k: v for k, v in config.items() if k not in DEFAULT}, groups
+
+
 # ---- checks ----------------------------------------------------------------------------------
 
 
@@ -438,97 +461,7 @@ def settings_in(algo: dict[str, Any], kind: type) -> list[dict[str, Any]]:
     return [replaced(algo, dict(zip(lists, row, strict=True))) for row in rows]
 
 
-def repeated(values: Iterable[Any]) -> Any:
-    """The first value that was there before; None if all differ. 5 and 5.0 are the same."""
-
-    def key(value: Any) -> Any:
-        if isinstance(value, list | tuple):
-            return tuple(map(key, value))
-        return value if isinstance(value, int | float) else repr(value)
-
-    known = set()
-    for value in values:
-        if (found := key(value)) in known:
-            return value
-        known.add(found)
-    return None
-
-
-def replaced(options: dict[str, Any], new: dict[str, Any], where: str = "") -> dict[str, Any]:
-    """`options` with some values, by their names in `flat`, replaced."""
-    return {
-        k: replaced(v, new, f"{where}{k}.") if isinstance(v, dict) else new.get(f"{where}{k}", v)
-        for k, v in options.items()
-    }
-
-
-def together(settings: list[Any]) -> Any:
-    """The inverse of `settings_in`: a list stands where the settings differ."""
-    first = settings[0]
-    if isinstance(first, dict):
-        return {name: together([each[name] for each in settings]) for name in first}
-    return first if all(each == first for each in settings) else settings
-
-
-# ---- plain values ----------------------------------------------------------------------------
-
-
-def to_plain(value: Any, name: str = "") -> Any:
-    """Dicts, lists and scalars of Python only, as YAML writes and reads them.
-
-    Raises:
-        ConfigError: a value that has no such form.
-    """
-    if isinstance(value, Mapping):
-        return {str(k): to_plain(v, f"{name}.{k}" if name else str(k)) for k, v in value.items()}
-    if isinstance(value, list | tuple | range):
-        return [to_plain(v, f"{name}[{i}]") for i, v in enumerate(value)]
-    if isinstance(value, np.generic | np.ndarray | jax.Array):
-        return value.tolist()
-    if isinstance(value, Path):
-        return str(value)
-    if value is None or isinstance(value, bool | int | float | str):
-        return value
-    raise ConfigError(
-        f"{name}={value!r}: expected a number, a string, true or false, None, a list or a dict"
-    )
-
-
-def nested(options: Mapping[str, Any]) -> dict[str, Any]:
-    """{'env': 'car_push1', 'algo.clip': 0.1} as config.yaml has it, {'env': {'name': ...}, ...}.
-
-    Of an option that is there twice the later one counts; dicts are merged.
-    """
-    out: dict[str, Any] = {}
-    for name, value in options.items():
-        for part in reversed(f"{name}.name".split(".") if name in DEFAULT else name.split(".")):
-            value = {part: value}
-        out = merged(out, value)
-    return out
-
-
-def merged(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any]:
-    """`old` with the values of `new`, dicts in dicts likewise."""
-    out = dict(old)
-    for name, value in new.items():
-        inside = isinstance(value, dict) and isinstance(out.get(name), dict)
-        out[name] = merged(out[name], value) if inside else value
-    return out
-
-
-def parted(config: dict[str, Any]) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-    """The options beside 'env' and 'algo', and a copy of those two groups; a missing one is empty."""
-    for kind in DEFAULT:
-        if not isinstance(config.get(kind) or {}, Mapping):
-            raise ConfigError(f"{kind}={shown(config[kind])}: expected options by name")
-    groups = {kind: dict(config.get(kind) or {}) for kind in DEFAULT}
-    return {k: v for k, v in config.items() if k not in DEFAULT}, groups
-
-
-def differences(a: dict[str, Any], b: dict[str, Any]) -> dict[str, tuple[Any, Any]]:
-    """The names that have not the same value in both, with both values."""
-    pairs = {name: (a.get(name), b.get(name)) for name in {**a, **b}}
-    return {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
+# ---- in words ----------------------------------------------------------------------------------
 
 
 def unusual_in_words(settings: Settings, most: int = 4) -> str:
@@ -551,14 +484,3 @@ def unusual_in_words(settings: Settings, most: int = 4) -> str:
     told = [f"{k}={as_text(other[k][0])} (default {as_text(other[k][1])})" for k in ranked[:most]]
     more = [f"and {len(ranked) - most} more"] if len(ranked) > most else []
     return f"unusual: {', '.join([*told, *more])}" if told else "all its settings are the defaults"
-
-
-def as_text(value: Any) -> str:
-    """A plain value as it is typed on the command line: [a,b], {a:1}, true, null."""
-    if isinstance(value, list | tuple):
-        return f"[{','.join(map(as_text, value))}]"
-    if isinstance(value, dict):
-        return f"{{{','.join(f'{k}:{as_text(v)}' for k, v in value.items())}}}"
-    if value is None or isinstance(value, bool):
-        return {None: "null", True: "true", False: "false"}[value]
-    return str(value)
