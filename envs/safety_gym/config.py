@@ -71,6 +71,9 @@ class SafetyGymConfig:
     continue_goal: bool = True  # after a success a new goal, else the end of the episode
     terminate_resample_failure: bool = True  # no room for a new goal ends the episode, else keeps it
     # What is observed
+    # ours: components, those below; coordinates, of Goal: where the goal and the hazards are, in the
+    # robot's frame, instead of lidars and all other components
+    observation: Literal["components", "coordinates"] = "components"
     observation_flatten: bool = True  # one vector, components sorted by name; else a dict
     observe_sensors: bool = True
     observe_goal_dist: bool = False
@@ -249,6 +252,8 @@ def check_config(cfg: SafetyGymConfig) -> None:
         raise ConfigError("env.observe_vision=true: vision is not available yet; use the lidars")
     if cfg.task not in TASKS:
         raise ConfigError(f"env.task={cfg.task!r}{nearest(cfg.task, TASKS)}")
+    if cfg.observation == "coordinates" and cfg.task != "goal":
+        raise ConfigError(f"env.observation=coordinates: expected env.task=goal, not {cfg.task}")
     if cfg.task == "button" and cfg.buttons_num < 1:
         raise ConfigError("env.buttons_num=0: the button task needs at least 1")
     rectangles = [("placements_extents", (cfg.placements_extents,))]
