@@ -26,6 +26,7 @@ from jaxsafe.envs import make
 from jaxsafe.envs.safety_gym import suite
 from jaxsafe.envs.velocity import config as velocity_config
 from jaxsafe.envs.velocity import suite as velocities
+from jaxsafe.learn.model_based import ModelBasedConfig
 from jaxsafe.learn.offline import OfflineConfig
 from jaxsafe.report import stats, studies
 from jaxsafe.report import tables as report
@@ -49,7 +50,9 @@ FAMILIES = {  # the pages of docs/theory
     "trust_region": ("cpo", "pcpo"),
     "penalties": ("ipo", "p3o", "focops"),
     "budgets": ("ppo_saute", "trpo_saute", "ppo_simmer_pid", "trpo_simmer_pid"),
+    "planning": ("pets", "cce_pets", "rce_pets", "cap_pets", "loop", "safe_loop"),
 }
+PLANNING = " env.observation=coordinates env.wrap.action_repeat=5 algo.learn_cost=false"
 ALGORITHMS = """# Algorithms
 
 Each page has the equations, the sources, every setting with its origin, the departures from the paper,
@@ -57,7 +60,7 @@ and what it made in our runs. Which one to take: [choosing](../choosing.md#an-al
 
 How families work, step by step: [prices](../theory/prices.md),
 [trust regions](../theory/trust_region.md), [penalties](../theory/penalties.md),
-[budgets in the state](../theory/budgets.md).
+[budgets in the state](../theory/budgets.md), [planning](../theory/planning.md).
 
 The on-policy algorithms share these options:
 
@@ -306,10 +309,11 @@ def page(name: str) -> str:
     row = ALGOS[name]
     title, text = prose(row.config.__doc__ or "")
     module = row.config.__module__.rsplit(".", 1)[1]
-    data = " dataset=data.npz" if issubclass(row.config, OfflineConfig) else ""
+    extra = " dataset=data.npz" if issubclass(row.config, OfflineConfig) else ""
+    extra += PLANNING if issubclass(row.config, ModelBasedConfig) else ""
     return f"""# {title.removesuffix(".")}
 
-    python scripts/train.py env=point_goal1 algo={name}{data}
+    python scripts/train.py env=point_goal1 algo={name}{extra}
 
 {text}
 
