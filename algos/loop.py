@@ -72,7 +72,7 @@ class LOOPConfig(ModelBasedConfig, sac.SACConfig):
     # A plan of no larger variance is not improved any further, as in OmniSafe.
     var_stop: Weight = 1e-3
     # How strongly the better of two plans is preferred. OmniSafe multiplies it by 1000 / H.
-    temperature: Weight = 10.0
+    temperature: Annotated[float, Bounds(1e-6, 1e6)] = 10.0
 
 
 @config

@@ -159,7 +159,7 @@ def init_model(key: jax.Array, env: Env, cfg: Any) -> tuple[PyTree, PyTree]:
     if not cfg.learn_cost:
         observed_cost(env)
     inputs, outputs = env.obs_size + env.action_size, 1 + cfg.learn_cost + env.obs_size
-    ensemble = init_ensemble(key, cfg.models, inputs, cfg.model_hidden, outputs)
+    ensemble: PyTree = init_ensemble(key, cfg.models, inputs, cfg.model_hidden, outputs)
     return Fitted(ensemble, unscaled(inputs)), optax.adam(cfg.model_lr).init(ensemble)
 
 

@@ -100,8 +100,9 @@ def imagine(model: Model, learned: Learned, seen: PyTree, plans: jax.Array, key:
 
     start = particles_of(seen, shape), jnp.ones(shape, bool)
     keys = jax.random.split(key, plans.shape[1])
-    (latent, alive), steps = jax.lax.scan(step, start, (jnp.moveaxis(plans, 1, 0), keys))
-    return Imagined(*steps, model.observe(latent), alive)
+    (latent, alive), told = jax.lax.scan(step, start, (jnp.moveaxis(plans, 1, 0), keys))
+    reward, cost, spread = told
+    return Imagined(reward, cost, spread, model.observe(latent), alive)
 
 
 # ---- scores ------------------------------------------------------------------------------------

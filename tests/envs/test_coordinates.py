@@ -1,5 +1,7 @@
 """What planning algorithms observe of Goal: by hand, and the cost that follows from it."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -35,15 +37,16 @@ def test_the_coordinates_by_hand():
 
 def test_the_cost_follows_from_the_coordinates_and_of_a_repeated_step_from_the_last_of_it():
     t = task("point_goal1", observation="coordinates", placements_extents=(-0.9, -0.9, 0.9, 0.9))
+    charged: Any = t.env.observed_cost
     state = t.begin(16)
     for i in range(40):
         action = jax.random.uniform(jax.random.key(i), (16, 2), minval=-1.0, maxval=1.0)
         state = t.step(state, action.at[:, 0].set(1.0))
-        np.testing.assert_array_equal(t.env.observed_cost(state.obs), state.cost)
+        np.testing.assert_array_equal(charged(state.obs), state.cost)
         if 0 < state.cost.sum() < 16:
             break
     assert 0 < state.cost.sum() < 16
-    repeated = FrameStack(ActionRepeat(t.env, 5), 2)
+    repeated: Any = FrameStack(ActionRepeat(t.env, 5), 2)
     frames = jnp.concatenate([state.obs, jnp.zeros_like(state.obs)], -1)  # the newest first
     np.testing.assert_array_equal(repeated.observed_cost(frames), 5 * state.cost)
 

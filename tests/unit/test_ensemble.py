@@ -3,6 +3,7 @@
 import dataclasses
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -44,6 +45,9 @@ class Line:
         return jnp.zeros(obs.shape[:-1])
 
 
+LINE: Any = Line()  # as much of an environment as a model needs
+
+
 def ring_of(x, reward, **marks):
     """A ring of [R, N] whose step from x pays `reward`, which stands in the row that follows."""
     no = jnp.zeros(x.shape, bool)
@@ -74,7 +78,7 @@ def fitted():
     ring, span = ring_of(x, y), Span(jnp.int32(0), jnp.int32(ROWS))
 
     def train(key):
-        model, state = init_model(key, Line(), cfg)
+        model, state = init_model(key, LINE, cfg)
         return model, *fit(model, state, ring, span, key, cfg)
 
     return jax.jit(train, compiler_options=FAST)(jax.random.key(1))
@@ -120,7 +124,7 @@ def test_the_bounds_of_the_variance_move_towards_the_data():
 
 def test_the_loss_by_hand():
     """One model of one linear layer: mu = w x + b, and a log variance in the middle of its range."""
-    ensemble = init_ensemble(jax.random.key(0), 1, 1, (), 1)
+    ensemble: Any = init_ensemble(jax.random.key(0), 1, 1, (), 1)
     layer = ensemble.layers[0].replace(weight=jnp.array([[[2.0, 0.0]]]), bias=jnp.array([[0.5, -3.0]]))
     ensemble = ensemble.replace(layers=(layer,))
     x, y = jnp.array([[[1.0], [2.0]]]), jnp.array([[[3.0], [4.0]]])
@@ -160,8 +164,8 @@ def test_the_model_learns_from_steps_within_an_episode_without_a_jump_and_finite
     np.testing.assert_array_equal(targets[0, 1], 1.0 - 11.0)  # the ring goes on at row 0
     scale = scale_of(ring, jnp.asarray(expected), None)
     kept = x[expected]
-    np.testing.assert_allclose(scale.centre, [kept.mean(), 0.0], rtol=1e-6)
-    np.testing.assert_allclose(scale.spread, [kept.std(), 1.0], rtol=1e-6)
+    np.testing.assert_allclose(scale.centre, jnp.array([kept.mean(), 0.0]), rtol=1e-6)
+    np.testing.assert_allclose(scale.spread, jnp.array([kept.std(), 1.0]), rtol=1e-6)
 
 
 def test_a_model_is_put_back_to_its_best():
@@ -171,7 +175,7 @@ def test_a_model_is_put_back_to_its_best():
     ring, span = ring_of(x, y), Span(jnp.int32(0), jnp.int32(64))
 
     def train(epochs):
-        model, state = init_model(jax.random.key(1), Line(), cfg)
+        model, state = init_model(jax.random.key(1), LINE, cfg)
         most = dataclasses.replace(cfg, max_epochs=epochs)
         return fit(model, state, ring, span, jax.random.key(2), most)
 

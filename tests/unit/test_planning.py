@@ -80,10 +80,13 @@ class Shore:
         return State(x, x[None], reward, cost, cost[None], jnp.bool_(False), {})
 
 
+SHORE: Any = Shore()  # as much of an environment as planning needs
+
+
 @cache
 def walk(name: str):
     """From x = 0 and from x = 0.95, planning in the simulator: x [2, 9] and plans [2, 8, H]."""
-    env, row = Shore(), ALGOS[name]
+    env, row = SHORE, ALGOS[name]
     planner = {"pets": pets.PETS, "cce_pets": pets.CCE, "rce_pets": pets.RCE, "cap_pets": pets.CAP}
     policy = planning_policy(env, planner[name])
     learned = learned_by(row.config(**PLAIN, true_model=True, cost_limit=1.0), dual=jnp.ones(()))
@@ -210,7 +213,7 @@ def test_the_plan_is_worth_the_smaller_value_of_what_the_actor_does_at_its_end()
     critics = {"params": {"Dense_0": {"kernel": weight, "bias": bias}}}
     actor = {"params": {"Dense_0": {"kernel": jnp.array([[-5.0, 0.0]]), "bias": jnp.zeros(2)}}}
     learned = learned_by(cfg, critic_r=critics, actor=actor)
-    planner = loop.planner(Shore())
+    planner = loop.planner(SHORE)
 
     def ret(s, alive=True):
         obs = jnp.broadcast_to(s[:, None], (1, 1, len(s), 1))
@@ -233,7 +236,7 @@ def test_what_the_actor_does_in_each_model_is_among_the_plans():
         return Prediction(latent + action, zero, zero, zero, zero > 0)
 
     model = Model(lambda cfg: (5, cfg.particles), predict, lambda latent: latent)
-    planner = loop.planner(Shore())
+    planner = loop.planner(SHORE)
     (plans,) = planner.propose(model, learned_by(cfg, actor=actor), jnp.zeros(1), jax.random.key(0))
     assert plans.shape == (5 * 2, 3, 1)
     np.testing.assert_allclose(plans, np.tanh(0.5), rtol=1e-4)
