@@ -111,8 +111,10 @@ grids are the original's tests. Vision is not there yet. The six [velocity tasks
 Safety-Gymnasium's: `ant_velocity` is `SafetyAntVelocity-v1`.
 
 Every other option of Safety Gym's Engine is `env.OPTION`.
-[`env.rules`](../howto/safety_gymnasium.md) takes Safety-Gymnasium's rules where they differ. How close
-the physics is to the original: [fidelity](../fidelity.md).
+[`env.rules`](../howto/safety_gymnasium.md) takes Safety-Gymnasium's rules where they differ.
+`env.observation=coordinates` shows Goal as positions instead of lidars, 29 numbers in `point_goal1`
+([what for](../concepts.md#planning-with-a-model)). How close the physics is to the original:
+[fidelity](../fidelity.md).
 
 In Python an environment is two pure functions without a batch axis. `jax.vmap(env.step)` steps
 thousands.

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from compiling import FAST
+from toys import Ticker
 
 from jaxsafe.config import config
 from jaxsafe.learn.models import (
@@ -18,10 +19,13 @@ from jaxsafe.learn.models import (
     fit,
     init_model,
     learnable,
+    record_by,
     scale_of,
     transitions_at,
 )
+from jaxsafe.learn.next_step_rollout import collect_records, started
 from jaxsafe.learn.replay import Span
+from jaxsafe.learn.rollout import init_rollout
 from jaxsafe.nn.ensemble import ensemble_loss, init_ensemble, outputs_of, unscaled
 
 ROWS, ENVS = 640, 8
@@ -166,6 +170,21 @@ def test_the_model_learns_from_steps_within_an_episode_without_a_jump_and_finite
     kept = x[expected]
     np.testing.assert_allclose(scale.centre, jnp.array([kept.mean(), 0.0]), rtol=1e-6)
     np.testing.assert_allclose(scale.spread, jnp.array([kept.std(), 1.0]), rtol=1e-6)
+
+
+def test_a_row_says_whether_what_the_environment_reports_made_it_jump():
+    env, keys = Ticker(episode_length=3), jax.random.split(jax.random.key(1), 8)
+    stepping = started(init_rollout(env, jax.random.key(0), 2, stagger=False))
+
+    def behave(carry, state, first, key):
+        return jnp.zeros((2, 1)), carry
+
+    ticks = record_by(dataclasses.replace(Config(), jump="ticks"))  # it reports a tick of each step
+    run = jax.jit(lambda x: collect_records(env, behave, x, keys, ticks), compiler_options=FAST)
+    rows: Any = run(stepping)[1][0]
+    np.testing.assert_array_equal(rows.jump, ~rows.first)
+    assert rows.first.sum() == 2 * 2
+    assert not record_by(Config())(stepping, jnp.zeros((2, 1))).jump.any()  # and no goal_met
 
 
 def test_a_model_is_put_back_to_its_best():
