@@ -7,8 +7,9 @@ import jax
 import jax.numpy as jnp
 
 from jaxsafe.config import Amount, Bounds, Iterations, Weight, config
+from jaxsafe.learn.bill import PriceClockConfig
 from jaxsafe.learn.model_based import ModelBasedConfig, model_based
-from jaxsafe.learn.off_policy import PriceClockConfig, ReplayConfig
+from jaxsafe.learn.off_policy import ReplayConfig
 from jaxsafe.learn.planning import (
     Planner,
     cautious_cost,

@@ -38,8 +38,9 @@ class Learner(NamedTuple):
     step(nets, batch, at, cfg, axis_name) -> (Trainable, metrics), one gradient step. The weights of
         `batch` sum to 1 over a device's share, on average over devices: a mean is
         `pmean((weight * x).sum())`.
-    act(params, obs [..., O], key, cfg) -> action [..., A], the mean one where key is None.
-    explore(params, obs [N, O], key, cfg) -> action [N, A], how training acts; None: as `act`.
+    act(learned, obs [..., O], key) -> action [..., A], the mean one where key is None. `learned` holds
+        networks, `params`, the treatment's state, `dual`, and `config`.
+    explore(learned, obs [N, O], key) -> action [N, A], how training acts; None: as `act`.
     policy: how a method acts that remembers, or that looks into the simulator. Such a method explores
         as its policy does, and its `act` and `explore` are not used.
     refit(nets, replay, shared, key, cfg, axis_name) -> (Trainable, metrics), after the rounds of an
@@ -49,8 +50,8 @@ class Learner(NamedTuple):
 
     init: Callable[[jax.Array, int, int, Any], Trainable]
     step: Callable[[Trainable, Transitions, GradientStep, Any, str | None], tuple[Trainable, Metrics]]
-    act: Callable[[PyTree, jax.Array, jax.Array | None, Any], jax.Array] | None = None
-    explore: Callable[[PyTree, jax.Array, jax.Array, Any], jax.Array] | None = None
+    act: Callable[[Learned, jax.Array, jax.Array | None], jax.Array] | None = None
+    explore: Callable[[Learned, jax.Array, jax.Array], jax.Array] | None = None
     policy: Policy | None = None
     refit: Callable[..., tuple[Trainable, Metrics]] | None = None
     record: Callable[[Any], Callable[[Stepping, jax.Array], Record]] = lambda cfg: arrival_record
@@ -66,6 +67,6 @@ def policy_by(learner: Learner) -> Policy:
     ) -> tuple[jax.Array, PyTree, dict[str, Any]]:
         assert learner.act is not None
         inputs = network_inputs(learned.normaliser, obs)
-        return learner.act(learned.params, inputs, key, learned.config), carry, {}
+        return learner.act(learned, inputs, key), carry, {}
 
     return Policy(init=lambda learned: (), act=act)
