@@ -71,10 +71,10 @@ class SafetyGymConfig:
     continue_goal: bool = True  # after a success a new goal, else the end of the episode
     terminate_resample_failure: bool = True  # no room for a new goal ends the episode, else keeps it
     # What is observed
-    # ours: components, those below; coordinates, of Goal: where the goal and the hazards are, in the
+    observation_flatten: bool = True  # one vector, components sorted by name; else a dict
+    # ours: components, those below. coordinates, of Goal: where the goal and the hazards are, in the
     # robot's frame, instead of lidars and all other components
     observation: Literal["components", "coordinates"] = "components"
-    observation_flatten: bool = True  # one vector, components sorted by name; else a dict
     observe_sensors: bool = True
     observe_goal_dist: bool = False
     observe_goal_comp: bool = False
