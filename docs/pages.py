@@ -23,6 +23,7 @@ from jaxsafe.envs import make
 from jaxsafe.envs.safety_gym import suite
 from jaxsafe.envs.velocity import config as velocity_config
 from jaxsafe.envs.velocity import suite as velocities
+from jaxsafe.learn.model_based import ModelBasedConfig
 from jaxsafe.learn.off_policy import OffPolicyConfig
 from jaxsafe.learn.offline import OfflineConfig
 from jaxsafe.learn.on_policy import OnPolicyConfig
@@ -52,8 +53,15 @@ FAMILIES = {  # the pages of docs/theory
         f"{name}{more}" for name in ("ddpg", "td3", "sac") for more in ("", "_lag", "_pid")
     ),
     "recorded_data": ("bcq", "bcq_lag", "crr", "ccrr", "coptidice"),
+    "planning": ("pets", "cce_pets", "rce_pets", "cap_pets", "loop", "safe_loop"),
 }
-LOOPS = {OnPolicyConfig: "on-policy", OffPolicyConfig: "off-policy", OfflineConfig: "offline"}
+PLANNING = " env.observation=coordinates env.wrap.action_repeat=5 algo.learn_cost=false"
+LOOPS = {  # the first that an algorithm's config is one of
+    ModelBasedConfig: "planning",
+    OnPolicyConfig: "on-policy",
+    OffPolicyConfig: "off-policy",
+    OfflineConfig: "offline",
+}
 ABSENT = object()  # where there is no default
 ALGORITHMS = """# Algorithms
 
@@ -63,7 +71,7 @@ and what it made in our runs. Which one to take: [choosing](../choosing.md#an-al
 How families work, step by step: [prices](../theory/prices.md),
 [trust regions](../theory/trust_region.md), [penalties](../theory/penalties.md),
 [budgets in the state](../theory/budgets.md), [values of actions](../theory/actor_critics.md),
-[recorded data](../theory/recorded_data.md).
+[recorded data](../theory/recorded_data.md), [planning](../theory/planning.md).
 
 The on-policy algorithms share these options:
 
@@ -114,8 +122,10 @@ grids are the original's tests. Vision is not there yet. The six [velocity tasks
 Safety-Gymnasium's: `ant_velocity` is `SafetyAntVelocity-v1`.
 
 Every other option of Safety Gym's Engine is `env.OPTION`.
-[`env.rules`](../howto/safety_gymnasium.md) takes Safety-Gymnasium's rules where they differ. How close
-the physics is to the original: [fidelity](../fidelity.md).
+[`env.rules`](../howto/safety_gymnasium.md) takes Safety-Gymnasium's rules where they differ.
+`env.observation=coordinates` shows Goal as positions instead of lidars, 29 numbers in `point_goal1`
+([what for](../concepts.md#planning-with-a-model)). How close the physics is to the original:
+[fidelity](../fidelity.md).
 
 In Python an environment is two pure functions without a batch axis. `jax.vmap(env.step)` steps
 thousands.
@@ -312,11 +322,12 @@ def page(name: str) -> str:
     row = ALGOS[name]
     title, text = prose(row.config.__doc__ or "")
     module = row.config.__module__.rsplit(".", 1)[1]
-    data = " dataset=data.npz" if issubclass(row.config, OfflineConfig) else ""
+    more = " dataset=data.npz" if issubclass(row.config, OfflineConfig) else ""
+    more += PLANNING if issubclass(row.config, ModelBasedConfig) else ""
     return f"""# {title.removesuffix(".")}
 
 ```sh
-python scripts/train.py env=point_goal1 algo={name}{data}
+python scripts/train.py env=point_goal1 algo={name}{more}
 ```
 
 {text}

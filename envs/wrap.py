@@ -6,6 +6,7 @@ A wrapper keeps no state of its own. `State.physics` stays that of the innermost
 whatever draws or inspects it works on a wrapped environment too.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -40,6 +41,11 @@ class Wrapper:
     @property
     def cost_names(self) -> tuple[str, ...]:
         return self.env.cost_names
+
+    @property
+    def observed_cost(self) -> Callable[[jax.Array], jax.Array] | None:
+        """See SafetyGym."""
+        return getattr(self.env, "observed_cost", None)
 
     def reset(self, key: jax.Array) -> State:
         return self.env.reset(key)
@@ -95,6 +101,12 @@ class ActionRepeat(Wrapper):
     def episode_length(self) -> int:
         return self.env.episode_length // self.repeat
 
+    @property
+    def observed_cost(self) -> Callable[[jax.Array], jax.Array] | None:
+        """As if every raw step cost as much as the last one, which alone is observed."""
+        last = super().observed_cost
+        return None if last is None else lambda obs: self.repeat * last(obs)
+
     def step(self, state: State, action: jax.Array) -> State:
         def again(total: State, _: None) -> tuple[State, None]:
             new = self.env.step(total, action)
@@ -127,6 +139,11 @@ class FrameStack(Wrapper):
     @property
     def obs_size(self) -> int:
         return self.frames * self.env.obs_size
+
+    @property
+    def observed_cost(self) -> Callable[[jax.Array], jax.Array] | None:
+        newest = super().observed_cost
+        return None if newest is None else lambda obs: newest(obs[..., : self.env.obs_size])
 
     def reset(self, key: jax.Array) -> State:
         state = self.env.reset(key)

@@ -151,9 +151,14 @@ class Run:
             float [..., action_size]; environments clip it to [-1, 1].
 
         Raises:
-            ConfigError: no such policy, or no checkpoint yet.
+            ConfigError: no such policy, no checkpoint yet, or a policy that plans in the simulator.
         """
-        self._opened.one(index)
+        player = self._opened.one(index).player
+        if player.policy.privileged(player.learned):
+            raise ConfigError(
+                f"{self.folder}: this policy plans in the simulator, so an observation is not enough; "
+                "player(index) takes a state"
+            )
         return self._act(self._opened.learned, index, obs, key)
 
     def player(self, index: int = 0) -> Player:
@@ -199,7 +204,16 @@ class Run:
 
         def act(every: PyTree, index: Any, obs: jax.Array, key: jax.Array | None) -> jax.Array:
             learned = jax.tree.map(lambda x: x[index], every)
-            return algo.policy.act(learned, algo.policy.init(learned), obs, key)[0]
+
+            def one(obs: jax.Array, key: jax.Array | None) -> jax.Array:
+                return algo.policy.act(learned, algo.policy.init(learned), obs, key)[0]
+
+            if obs.ndim == 1:
+                return one(obs, key)
+            rows = obs.reshape(-1, obs.shape[-1])
+            keys = None if key is None else jax.random.split(key, len(rows))
+            actions = jax.vmap(one, in_axes=(0, None if key is None else 0))(rows, keys)
+            return actions.reshape(*obs.shape[:-1], -1)
 
         return jax.jit(act)
 

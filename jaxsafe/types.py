@@ -70,13 +70,13 @@ class Policy(NamedTuple):
     act(learned, carry, obs, key) -> (action [A], carry, extras): one step in one environment, without a
         batch axis. `key` None asks for the mean action. extras is a dict of what a policy reports
         beside its action, as whether a shield overruled it; most report nothing.
-    privileged: `act` takes the environment's `State` for `obs`: the policy looks into the simulator, as
-        a planner with the true dynamics does.
+    privileged(learned) -> bool: whether `act` takes the environment's `State` for `obs`. The policy
+        then looks into the simulator, as a planner with the true dynamics does.
     """
 
     init: Callable[[PyTree], PyTree]
     act: Callable[[PyTree, PyTree, Any, jax.Array | None], tuple[jax.Array, PyTree, dict[str, Any]]]
-    privileged: bool = False
+    privileged: Callable[[PyTree], bool] = lambda learned: False
 
 
 class Shared(NamedTuple):

@@ -72,6 +72,9 @@ class SafetyGymConfig:
     terminate_resample_failure: bool = True  # no room for a new goal ends the episode, else keeps it
     # What is observed
     observation_flatten: bool = True  # one vector, components sorted by name; else a dict
+    # ours: components, those below. coordinates, of Goal: where the goal and the hazards are, in the
+    # robot's frame, instead of lidars and all other components
+    observation: Literal["components", "coordinates"] = "components"
     observe_sensors: bool = True
     observe_goal_dist: bool = False
     observe_goal_comp: bool = False
@@ -249,6 +252,8 @@ def check_config(cfg: SafetyGymConfig) -> None:
         raise ConfigError("env.observe_vision=true: vision is not available yet; use the lidars")
     if cfg.task not in TASKS:
         raise ConfigError(f"env.task={cfg.task!r}{nearest(cfg.task, TASKS)}")
+    if cfg.observation == "coordinates" and cfg.task != "goal":
+        raise ConfigError(f"env.observation=coordinates: expected env.task=goal, not {cfg.task}")
     if cfg.task == "button" and cfg.buttons_num < 1:
         raise ConfigError("env.buttons_num=0: the button task needs at least 1")
     rectangles = [("placements_extents", (cfg.placements_extents,))]

@@ -79,3 +79,9 @@ def costs(arena: Arena, world: World, readings: Readings) -> tuple[jax.Array, ja
     if cfg.constrain_indicator:
         return (parts > 0).astype(jnp.float32), (total > 0).astype(jnp.float32)
     return parts, total
+
+
+def seen_hazards(cfg: SafetyGymConfig, ego: jax.Array) -> jax.Array:
+    """The cost [...] of a step, of hazards that are seen at `ego` [..., n, 2] from the robot (m)."""
+    cost = cfg.hazards_cost * jnp.maximum(cfg.hazards_size - norm(ego), 0).sum(-1)
+    return (cost > 0).astype(jnp.float32) if cfg.constrain_indicator else cost

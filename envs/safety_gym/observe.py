@@ -14,6 +14,8 @@ from jaxsafe.envs.safety_gym import scene as scenes
 from jaxsafe.envs.safety_gym import sensing
 from jaxsafe.envs.safety_gym.arena import Arena, World, norm, rotation_of
 
+COORDINATE_SENSORS = ("velocimeter", "accelerometer", "gyro", "magnetometer")
+HAZARDS_AT = 9  # numbers before the hazards', where coordinates are observed
 JOINT_SENSORS = (  # in the order in which Safety-Gymnasium observes them
     mujoco.mjtSensor.mjSENS_JOINTVEL,
     mujoco.mjtSensor.mjSENS_BALLANGVEL,
@@ -42,6 +44,8 @@ def components(
 ) -> dict[str, jax.Array]:
     """Every observed component by name, in order."""
     cfg = arena.config
+    if cfg.observation == "coordinates":
+        return coordinates(arena, world, readings)
     position, rotation = arena.robot_pose(world)
     goal = arena.goal_position(world)
     parts: dict[str, jax.Array] = {}
@@ -72,7 +76,10 @@ def components(
 
 
 def in_order(arena: Arena, names: Iterable[str]) -> list[str]:
-    """By name; in Safety-Gymnasium sensors, velocities and angles of joints, then kind by kind."""
+    """By name; in Safety-Gymnasium sensors, velocities and angles of joints, then kind by kind.
+    Coordinates are in the order of OmniSafe."""
+    if arena.config.observation == "coordinates":
+        return [*names]
     if arena.config.rules == "safety_gym":
         return sorted(names)
     order = list(arena.config.sensors_obs)
@@ -81,6 +88,34 @@ def in_order(arena: Arena, names: Iterable[str]) -> list[str]:
     for kind in layouts.ORDER[arena.config.rules]:
         order += [f"{kind}_lidar", f"{kind}_compass"]
     return sorted(names, key=order.index)
+
+
+def coordinates(arena: Arena, world: World, readings: Readings) -> dict[str, jax.Array]:
+    """What OmniSafe's planning algorithms observe: 13 numbers, and 2 for each hazard.
+
+    Positions are in m, in the frame of the robot, whose x axis points ahead; the robot's own is in the
+    frame of the world. Source: OmniSafe, `safety_gymnasium_modelbased.py`.
+    """
+    position, rotation = arena.robot_pose(world)
+
+    def ego(targets: jax.Array) -> jax.Array:
+        """[n, 2] of positions [n, 2] on the floor."""
+        offset = jnp.pad(targets - position[:2], ((0, 0), (0, 1)), constant_values=-position[2])
+        return (offset[:, :, None] * rotation[:, :2]).sum(1)
+
+    def sensor(name: str) -> jax.Array:
+        return arena.sensor(readings, name)
+
+    return {
+        "velocimeter": sensor("velocimeter")[:2],
+        "accelerometer": sensor("accelerometer")[:1],
+        "gyro": sensor("gyro")[2:],
+        "magnetometer": sensor("magnetometer"),
+        "goal": ego(arena.goal_position(world)[None, :2])[0],
+        **({"hazards": ego(arena.positions(world, "hazards"))} if arena.config.hazards_num else {}),
+        "heading": rotation[0, :2],
+        "position": position[:2],
+    }
 
 
 def sensor_parts(arena: Arena, readings: Readings) -> dict[str, jax.Array]:

@@ -76,6 +76,10 @@ class SafetyGym:
         seeks_goal = cfg.observe_goal_lidar or cfg.observe_goal_dist or cfg.observe_goal_comp
         if seeks_goal and cfg.task in ("x", "z"):
             raise ConfigError(f"env.observe_goal_*: the task {cfg.task!r} has no goal to observe")
+        if cfg.observation == "coordinates":
+            for name in observe.COORDINATE_SENSORS:
+                if name not in self.arena.sensors:
+                    raise ConfigError(f"env.observation=coordinates: the robot has no sensor {name}")
         self.cost_names = constraints.cost_names(cfg)
 
         def shown(key: jax.Array) -> dict[str, jax.Array]:
@@ -102,6 +106,22 @@ class SafetyGym:
     @property
     def episode_length(self) -> int:
         return self.config.num_steps
+
+    @property
+    def observed_cost(self) -> Callable[[jax.Array], jax.Array] | None:
+        """obs [..., obs_size] -> the cost [...] of a step after which it is observed. None where the
+        observation does not tell."""
+        cfg = self.config
+        told = cfg.observation == "coordinates" and cfg.observation_flatten
+        if not told or self.cost_names not in ((), ("hazards",)):
+            return None
+        count = cfg.hazards_num * cfg.constrain_hazards
+
+        def cost(obs: jax.Array) -> jax.Array:
+            ego = obs[..., observe.HAZARDS_AT : observe.HAZARDS_AT + 2 * count]
+            return constraints.seen_hazards(cfg, ego.reshape(*obs.shape[:-1], count, 2))
+
+        return cost
 
     @property
     def step_seconds(self) -> float:

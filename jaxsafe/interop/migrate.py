@@ -306,7 +306,7 @@ OFFLINE: dict[str, Rule] = OMNISAFE | {  # of its offline algorithms; what diffe
 ONLY_OFFLINE = Rule("", "a key of offline algorithms")
 DEFAULTS_OFFLINE = {"total_updates": 1_000_000, "eval_episodes": 10}  # OmniSafe's
 
-OURS_ALONE = ("rules", "awake", "contact_room")  # options that Engine does not have
+OURS_ALONE = ("rules", "observation", "awake", "contact_room")  # options that Engine does not have
 # Engine's options that ours takes, and does not use yet.
 VISION = ("observe_vision", "vision_size", "vision_render", "vision_render_size")
 

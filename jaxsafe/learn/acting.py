@@ -56,7 +56,7 @@ class Player(NamedTuple):
         Args:
             key: to sample with; None is the mean action.
         """
-        obs = state if self.policy.privileged else state.obs
+        obs = state if self.policy.privileged(self.learned) else state.obs
         action, carry, _ = self.policy.act(self.learned, carry, obs, key)
         return action, carry
 

@@ -52,7 +52,7 @@ def select_rows(mask: jax.Array, new: PyTree, old: PyTree) -> PyTree:
 
 
 def all_finite(tree: PyTree) -> jax.Array:
-    return jnp.all(jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(tree)]))
+    return jnp.all(jnp.array([True, *(jnp.isfinite(x).all() for x in jax.tree.leaves(tree))]))
 
 
 def device_key(key: jax.Array, axis_name: str | None) -> jax.Array:

@@ -6,8 +6,9 @@ from typing import Any, NamedTuple
 import jax
 
 from jaxsafe.learn.acting import Learned
+from jaxsafe.learn.next_step_rollout import Stepping, arrival_record
 from jaxsafe.learn.normalise import network_inputs
-from jaxsafe.learn.replay import Transitions
+from jaxsafe.learn.replay import Record, Transitions
 from jaxsafe.learn.steps import Trainable
 from jaxsafe.types import Metrics, Policy, PyTree
 
@@ -34,26 +35,37 @@ class Learner(NamedTuple):
     """What a method adds to the loop. Observations are normalised before they come here.
 
     init(key, obs_size, action_size, cfg) -> Trainable.
-    act(learned, obs [..., O], key) -> action [..., A], the mean one where key is None. `learned` holds
-        networks, `params`, the treatment's state, `dual`, and `config`.
     step(nets, batch, at, cfg, axis_name) -> (Trainable, metrics), one gradient step. The weights of
         `batch` sum to 1 over a device's share, on average over devices: a mean is
         `pmean((weight * x).sum())`.
+    act(learned, obs [..., O], key) -> action [..., A], the mean one where key is None. `learned` holds
+        networks, `params`, the treatment's state, `dual`, and `config`.
     explore(learned, obs [N, O], key) -> action [N, A], how training acts; None: as `act`.
+    policy: how a method acts that remembers, or that looks into the simulator. Such a method explores
+        as its policy does, and its `act` and `explore` are not used.
+    refit(nets, replay, shared, key, cfg, axis_name) -> (Trainable, metrics), after the rounds of an
+        update; None where there is nothing to refit.
+    record(cfg) -> what makes a row of the replay: (stepping, action [N, A]) -> Record.
     """
 
     init: Callable[[jax.Array, int, int, Any], Trainable]
-    act: Callable[[Learned, jax.Array, jax.Array | None], jax.Array]
     step: Callable[[Trainable, Transitions, GradientStep, Any, str | None], tuple[Trainable, Metrics]]
+    act: Callable[[Learned, jax.Array, jax.Array | None], jax.Array] | None = None
     explore: Callable[[Learned, jax.Array, jax.Array], jax.Array] | None = None
+    policy: Policy | None = None
+    refit: Callable[..., tuple[Trainable, Metrics]] | None = None
+    record: Callable[[Any], Callable[[Stepping, jax.Array], Record]] = lambda cfg: arrival_record
 
 
 def policy_by(learner: Learner) -> Policy:
-    """The policy of a learner: it remembers nothing."""
+    """The policy of a learner: its own, or else one that remembers nothing."""
+    if learner.policy is not None:
+        return learner.policy
 
     def act(
         learned: Learned, carry: PyTree, obs: jax.Array, key: jax.Array | None
     ) -> tuple[jax.Array, PyTree, dict[str, Any]]:
+        assert learner.act is not None
         inputs = network_inputs(learned.normaliser, obs)
         return learner.act(learned, inputs, key), carry, {}
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxsafe.learn.batch import select_rows
 from jaxsafe.learn.replay import Record
 from jaxsafe.learn.rollout import Bad, Episode, RolloutState, bad_of, mended, restart, sums
-from jaxsafe.types import Env, State
+from jaxsafe.types import Env, PyTree, State
 
 
 @flax.struct.dataclass
@@ -68,24 +68,36 @@ def arrival_record(stepping: Stepping, action: jax.Array) -> Record:
     )
 
 
+# (carry [N, ...], State of N, first [N], key) -> action [N, A], carry
+Behaviour = Callable[[PyTree, State, jax.Array, jax.Array], tuple[jax.Array, PyTree]]
+
+
 def collect_records(
-    env: Env, act: Callable[[jax.Array, jax.Array], jax.Array], stepping: Stepping, keys: jax.Array
+    env: Env,
+    behave: Behaviour,
+    stepping: Stepping,
+    keys: jax.Array,
+    describe: Callable[[Stepping, jax.Array], Record] = arrival_record,
 ) -> tuple[Stepping, tuple[Record, StepRecord]]:
     """One step of every environment for each of `keys` [T], or a reset where its episode has ended.
 
     Args:
-        act: (obs [N, O], key) -> action [N, A].
+        behave: (carry [N, ...], State of N, first [N], key) -> action [N, A], carry. It begins its
+            carry anew where `first` holds.
+        describe: what is recorded of where the environments are, and of the actions that they take.
     Returns:
         The environments afterwards, and the records, [T, N, ...].
     """
 
     def step(now: Stepping, key: jax.Array) -> tuple[Stepping, tuple[Record, StepRecord]]:
         act_key, reset_key = jax.random.split(key)
-        record = arrival_record(now, act(now.rollout.state.obs, act_key))
+        action, carry = behave(now.rollout.carry, now.rollout.state, now.first, act_key)
+        record = describe(now, action)
         state = jax.vmap(env.step)(now.rollout.state, record.action)
         rollout = dataclasses.replace(
             now.rollout,
             state=state,
+            carry=carry,
             steps=now.rollout.steps + 1,
             episode=jax.tree.map(jnp.add, now.rollout.episode, sums(state)),
         )

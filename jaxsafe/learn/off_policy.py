@@ -33,7 +33,7 @@ from jaxsafe.config import (
     check_values,
     config,
 )
-from jaxsafe.learn.acting import Learned, learned_of
+from jaxsafe.learn.acting import Learned, learned_of, reset_carry
 from jaxsafe.learn.batch import all_finite, device_key, masked_mean, psum, select
 from jaxsafe.learn.bill import charge, empty_bill, settle
 from jaxsafe.learn.constraints import Names, check_cost_names, metrics_by_constraint, signal
@@ -42,7 +42,6 @@ from jaxsafe.learn.metrics import episode_metrics, world_metrics
 from jaxsafe.learn.next_step_rollout import (
     Stepping,
     StepRecord,
-    arrival_record,
     collect_records,
     started,
 )
@@ -62,28 +61,38 @@ from jaxsafe.learn.returns import LostTime, expected_length, no_lost_time
 from jaxsafe.learn.rollout import check_steps, init_rollout
 from jaxsafe.learn.steps import Trainable, remaining
 from jaxsafe.learn.treatments import Treatment, no_treatment
-from jaxsafe.types import Algorithm, Clocks, Count, Env, Metrics, PyTree, Shared
+from jaxsafe.types import Algorithm, Clocks, Count, Env, Metrics, Policy, PyTree, Shared, State
 
 
 @config
-class OffPolicyConfig:
-    """What the off-policy algorithms share."""
+class ReplayConfig:
+    """What all algorithms with a replay share."""
 
     # Environments side by side, of all devices together. OmniSafe has 1.
     num_envs: Amount = 1024
     horizon: Amount = 16  # Steps of each environment in an update.
-    # Steps of each environment between two rounds of gradient steps.
-    learn_every: Amount = 1
     stagger: bool = True  # Whether the first episodes start at different ages, so that ends spread out.
     # The iteration at which whatever decays reaches 0. inf: the last one of `total_steps`.
     total_iterations: EndOfDecay = float("inf")
     # Transitions kept, rounded to whole updates. As in OmniSafe.
     replay_size: Annotated[int, Bounds(1, 2**31 - 1)] = 1_000_000
+    # Environment steps with random actions and without learning, as in OmniSafe.
+    learning_starts: Annotated[int, Bounds(0, 2**31 - 1)] = 10_000
+    discount: Share = 0.99  # The discount of rewards, as in OmniSafe.
+    cost_discount: Share = 0.99  # The discount of costs, as in OmniSafe.
+    # The undiscounted cost that an episode may have. Unconstrained algorithms only draw it in plots.
+    cost_limit: Weight = 25.0
+
+
+@config
+class OffPolicyConfig(ReplayConfig):
+    """What the off-policy algorithms share."""
+
+    # Steps of each environment between two rounds of gradient steps.
+    learn_every: Amount = 1
     replay_ratio: Amount = 16  # Transitions replayed for each environment step. OmniSafe has 256.
     # Transitions of a gradient step, of all devices together. OmniSafe has 256.
     batch_size: Amount = 1024
-    # Environment steps with random actions and without learning, as in OmniSafe.
-    learning_starts: Annotated[int, Bounds(0, 2**31 - 1)] = 10_000
     n_step: Iterations = 1  # Rewards summed before the critics' value. OmniSafe has 1.
     # Units of the hidden layers of each network, as in OmniSafe.
     hidden: tuple[Units, ...] = (256, 256)
@@ -94,10 +103,6 @@ class OffPolicyConfig:
     layer_norm: bool = True
     # Whether observations are normalised by a running mean and variance. OmniSafe does not.
     obs_normalize: bool = True
-    discount: Share = 0.99  # The discount of rewards, as in OmniSafe.
-    cost_discount: Share = 0.99  # The discount of costs, as in OmniSafe.
-    # The undiscounted cost that an episode may have. Unconstrained algorithms only draw it in plots.
-    cost_limit: Weight = 25.0
     # The share of the critics that their targets take on at each step. OmniSafe has 0.005.
     tau: Share = 0.01
     lr: Rate = 3e-4  # The policy's learning rate, by Adam, as in OmniSafe.
@@ -190,7 +195,8 @@ def off_policy(
     axis_name: str | None = None,
 ) -> Algorithm:
     """The algorithm that `learner` makes of the loop, with a price on cost that `treatment` moves."""
-    explore = learner.explore or learner.act
+    policy = policy_by(learner)
+    explore: Any = learner.explore or learner.act
     priced = treatment is not no_treatment
 
     def init(key: jax.Array, cfg: Any, shared: Shared) -> TrainState:
@@ -201,17 +207,21 @@ def off_policy(
         params_key, stepping_key, key = jax.random.split(key, 3)
         nets = learner.init(params_key, env.obs_size, env.action_size, cfg)
         rollout = init_rollout(env, device_key(stepping_key, axis_name), cfg.num_envs, cfg.stagger)
-        stepping = started(rollout)
+        dual = treatment.init(cfg)
+        normaliser = init_normaliser(env.obs_size) if sizes.normalises else ()
+        carry = policy.init(Learned(cfg, nets.params, dual, normaliser))
+        every = jax.tree.map(lambda x: jnp.broadcast_to(x, (cfg.num_envs, *x.shape)), carry)
+        stepping = started(dataclasses.replace(rollout, carry=every))
         actions = jnp.zeros((cfg.num_envs, env.action_size))
         return TrainState(
             config=cfg,
             params=nets.params,
             opt_state=nets.opt_state,
-            dual=treatment.init(cfg),
+            dual=dual,
             bill=empty_bill(cfg, names) if priced else (),
-            normaliser=init_normaliser(env.obs_size) if cfg.obs_normalize else (),
+            normaliser=normaliser,
             stepping=stepping,
-            replay=empty_ring(arrival_record(stepping, actions), sizes.rows),
+            replay=empty_ring(learner.record(cfg)(stepping, actions), sizes.rows),
             lost_time=no_lost_time(),
             key=key,
         )
@@ -225,7 +235,7 @@ def off_policy(
         ) -> tuple[RoundCarry, RoundReport]:
             number, key = x
             gather_key, learn_key = jax.random.split(key)
-            at = moment(number, shared, sizes, ts.config)
+            at = moment(number, shared, sizes, ts.config, learner.refit is not None)
             now, steps, skipped = gather(ts, now, at, gather_key)
 
             def learn(nets: Trainable) -> tuple[Trainable, Metrics]:
@@ -240,6 +250,9 @@ def off_policy(
         numbers, keys = jnp.arange(sizes.rounds), jax.random.split(rounds_key, sizes.rounds)
         now, rounds = jax.lax.scan(one_round, now, (numbers, keys))
 
+        refit_key = jax.random.fold_in(rounds_key, sizes.rounds)
+        nets, refitted = refit(ts, now, shared, refit_key)
+
         steps = jax.tree.map(lambda x: x.reshape(ts.config.horizon, *x.shape[2:]), rounds.steps)
         taken, limit = steps.real.sum(), env.episode_length
         length, lost_time = expected_length(ts.lost_time, limit, steps, taken, axis_name)
@@ -247,11 +260,12 @@ def off_policy(
         metrics = means_of_gradient_steps(rounds.metrics, rounds.ready) | after.metrics
         metrics |= step_metrics(env, steps, length, treatment.constrained_costs(ts.config), axis_name)
         lost = rounds.metrics["train/nonfinite"].sum() + rounds.skipped.sum() + after.failed
-        metrics["train/nonfinite"] = lost
+        lost += refitted.pop("train/nonfinite", 0)
+        metrics |= refitted | {"train/nonfinite": lost}
         ts = dataclasses.replace(
             ts,
-            params=now.nets.params,
-            opt_state=now.nets.opt_state,
+            params=nets.params,
+            opt_state=nets.opt_state,
             dual=after.dual,
             bill=after.bill,
             normaliser=now.normaliser,
@@ -266,19 +280,29 @@ def off_policy(
         ts: TrainState, now: RoundCarry, at: Moment, key: jax.Array
     ) -> tuple[RoundCarry, StepRecord, jax.Array]:
         """The environment steps of a round, and whether the normaliser had to skip them."""
-        cfg = ts.config
+        cfg, sizes = ts.config, sizes_of(ts.config, axis_name)
         learned = Learned(cfg, now.nets.params, ts.dual, now.normaliser)
 
-        def act(obs: jax.Array, key: jax.Array) -> jax.Array:
+        def behave(
+            carry: PyTree, state: State, first: jax.Array, key: jax.Array
+        ) -> tuple[jax.Array, PyTree]:
             explore_key, random_key = jax.random.split(key)
-            chosen = explore(learned, network_inputs(now.normaliser, obs), explore_key)
-            uniform = jax.random.uniform(random_key, chosen.shape, minval=-1.0, maxval=1.0)
-            return jnp.where(at.warming_up, uniform, chosen)
 
-        keys = jax.random.split(device_key(key, axis_name), cfg.learn_every)
-        stepping, (rows, steps) = collect_records(env, act, now.stepping, keys)
+            def at_random(carry: PyTree) -> tuple[jax.Array, PyTree]:
+                shape = (cfg.num_envs, env.action_size)
+                return jax.random.uniform(random_key, shape, minval=-1.0, maxval=1.0), carry
+
+            def chosen(carry: PyTree) -> tuple[jax.Array, PyTree]:
+                if learner.policy is not None:
+                    return act_in_all(policy, learned, carry, state, first, explore_key)
+                return explore(learned, network_inputs(now.normaliser, state.obs), explore_key), carry
+
+            return jax.lax.cond(at.warming_up, at_random, chosen, carry)
+
+        keys = jax.random.split(device_key(key, axis_name), sizes.every)
+        stepping, (rows, steps) = collect_records(env, behave, now.stepping, keys, learner.record(cfg))
         normaliser, skipped = now.normaliser, jnp.bool_(False)
-        if cfg.obs_normalize:
+        if sizes.normalises:
             merged = merge(normaliser, rows.obs, axis_name)
             finite = all_finite(merged)
             normaliser, skipped = select(finite, merged, normaliser), ~finite
@@ -296,7 +320,7 @@ def off_policy(
             number, key = x
             draw_key, step_key = jax.random.split(device_key(key, axis_name))
             index = draw(draw_key, now.replay, at.after, sizes.batch)
-            found = transitions(now.replay, at.after, index, n_step=cfg.n_step, **discounts)
+            found = transitions(now.replay, at.after, index, n_step=sizes.n_step, **discounts)
             batch, dropped = usable(found, axis_name)
             obs, next_obs = (network_inputs(now.normaliser, x) for x in (batch.obs, batch.next_obs))
             batch = batch._replace(obs=obs, next_obs=next_obs)
@@ -308,6 +332,14 @@ def off_policy(
 
         numbers = at.gradient_steps + jnp.arange(sizes.updates)
         return jax.lax.scan(step, now.nets, (numbers, jax.random.split(key, sizes.updates)))
+
+    def refit(
+        ts: TrainState, now: RoundCarry, shared: Shared, key: jax.Array
+    ) -> tuple[Trainable, Metrics]:
+        """What the learner does after the rounds of an update."""
+        if learner.refit is None:
+            return now.nets, {}
+        return learner.refit(now.nets, now.replay, shared, key, ts.config, axis_name)
 
     def pay(ts: TrainState, steps: StepRecord, length: jax.Array, iteration: Count) -> Priced:
         """The steps of an update are put on the bill, and the price moves if it is due."""
@@ -322,7 +354,18 @@ def off_policy(
         sizes = sizes_of(cfg, None)
         return Clocks(cfg.num_envs * cfg.horizon, sizes.rounds * sizes.updates)
 
-    return Algorithm(init, update, policy_by(learner), learned_of, lambda learned: env, clocks)
+    return Algorithm(init, update, policy, learned_of, lambda learned: env, clocks)
+
+
+def act_in_all(
+    policy: Policy, learned: Learned, carry: PyTree, state: State, first: jax.Array, key: jax.Array
+) -> tuple[jax.Array, PyTree]:
+    """The actions [N, A] of a policy in N environments, and its carries, begun anew at `first` [N]."""
+    carry = reset_carry(policy, learned, carry, first)
+    seen = state if policy.privileged(learned) else state.obs
+    keys = jax.random.split(key, len(first))
+    action, carry, _ = jax.vmap(policy.act, in_axes=(None, 0, 0, 0))(learned, carry, seen, keys)
+    return action, carry
 
 
 def means_of_gradient_steps(metrics: Metrics, ready: jax.Array) -> Metrics:
@@ -360,14 +403,18 @@ def step_metrics(
 
 
 class Sizes(NamedTuple):
-    """What follows from the config: rounds of an update; gradient steps of a round; transitions of a
-    device's share of a batch; rows of the replay; rows of warm-up."""
+    """What follows from the config: rounds of an update; rows of a round; gradient steps of a round;
+    transitions of a device's share of a batch, and steps of each; rows of the replay; rows of warm-up;
+    whether observations are normalised."""
 
     rounds: int
+    every: int
     updates: int
     batch: int
+    n_step: int
     rows: int
     warm_up: int
+    normalises: bool
 
 
 def sizes_of(cfg: Any, axis_name: str | None) -> Sizes:
@@ -380,6 +427,10 @@ def sizes_of(cfg: Any, axis_name: str | None) -> Sizes:
     check_steps(cfg.num_envs, cfg.horizon)
     devices = 1 if axis_name is None else jax.lax.axis_size(axis_name)
     num_envs = cfg.num_envs * devices
+    rows = ring_rows(cfg.replay_size, num_envs, cfg.horizon)
+    warm_up = -(-cfg.learning_starts // num_envs)
+    if not isinstance(cfg, OffPolicyConfig):  # no gradient steps on transitions
+        return Sizes(1, cfg.horizon, 0, 0, 1, rows, warm_up, False)
     if cfg.horizon % cfg.learn_every:
         choices = [n for n in range(1, cfg.horizon + 1) if cfg.horizon % n == 0]
         nearest = min(choices, key=lambda n: abs(n - cfg.learn_every))
@@ -396,7 +447,6 @@ def sizes_of(cfg: Any, axis_name: str | None) -> Sizes:
             f"learn_every={cfg.learn_every} transitions are no whole number of batches of "
             f"{cfg.batch_size}; {fitting(cfg, steps)}"
         )
-    rows = ring_rows(cfg.replay_size, num_envs, cfg.horizon)
     if cfg.batch_size > rows * num_envs or rows <= cfg.n_step:
         raise ConfigError(
             f"replay_size={cfg.replay_size} holds {rows} steps of {num_envs} environments: expected "
@@ -404,22 +454,27 @@ def sizes_of(cfg: Any, axis_name: str | None) -> Sizes:
         )
     return Sizes(
         rounds=cfg.horizon // cfg.learn_every,
+        every=cfg.learn_every,
         updates=cfg.replay_ratio * steps // cfg.batch_size,
         batch=cfg.batch_size // devices,
+        n_step=cfg.n_step,
         rows=rows,
-        warm_up=-(-cfg.learning_starts // num_envs),
+        warm_up=warm_up,
+        normalises=cfg.obs_normalize,
     )
 
 
-def moment(number: jax.Array, shared: Shared, sizes: Sizes, cfg: Any) -> Moment:
-    """The moment of round `number` of an iteration."""
+def moment(number: jax.Array, shared: Shared, sizes: Sizes, cfg: Any, refits: bool) -> Moment:
+    """The moment of round `number` of an iteration. A learner that refits something does so at the end
+    of an iteration, so its warm-up lasts until then."""
     iteration, since = jnp.asarray(shared.iteration), shared.since
-    written = number * cfg.learn_every  # rows of this iteration, before the round
-    filled = (iteration - since) * cfg.horizon + written + cfg.learn_every
+    written = number * sizes.every  # rows of this iteration, before the round
+    filled = (iteration - since) * cfg.horizon + written + sizes.every
+    acted = iteration * cfg.horizon + (0 if refits else written)  # rows of the whole run
     return Moment(
         before=held(sizes.rows, cfg.horizon, written, iteration, since),
-        after=held(sizes.rows, cfg.horizon, written + cfg.learn_every, iteration, since),
-        warming_up=iteration * cfg.horizon + written < sizes.warm_up,  # in rows of the whole run
+        after=held(sizes.rows, cfg.horizon, written + sizes.every, iteration, since),
+        warming_up=acted < sizes.warm_up,
         ready=filled >= jnp.maximum(sizes.warm_up, 2),
         gradient_steps=(iteration * sizes.rounds + number) * sizes.updates,
         remaining=remaining(iteration, cfg),

@@ -234,6 +234,21 @@ def test_a_policy_acts_on_what_its_environment_shows(run):
         run.policy(obs, index=2)
 
 
+@pytest.mark.slow
+def test_a_policy_that_plans_in_the_simulator_acts_on_a_state_alone(tmp_path):
+    plans = {"true_model": True, "learning_starts": 0, "plans": 8, "elites": 3, "plan_steps": 3}
+    run = jaxsafe.train(
+        Corridor(), "cce_pets", run_dir=tmp_path / "run", num_envs=4, total_steps=48, horizon=6,
+        eval_episodes=2, **plans,
+    )  # fmt: skip
+    assert run.metrics["train/nonfinite"].sum() == 0
+    player = run.player()
+    action, plan = player.act(player.begin(), player.task.reset(jax.random.key(0)))
+    assert action.shape == (2,) and plan.shape == (3, 2) and (plan != 0).any()
+    with pytest.raises(jaxsafe.ConfigError, match="this policy plans in the simulator"):
+        run.policy(jnp.zeros(4))
+
+
 def test_evaluation_is_that_of_the_script(run):
     scores = jaxsafe.evaluate(run, episodes=3)
     (expected,) = evaluate(run._opened, 3, 1)

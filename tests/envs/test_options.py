@@ -70,6 +70,7 @@ READ: dict[str, tuple[str, Any]] = {  # option: base, and a value other than the
     "robot_rot": ("plain", 0.5),
     "randomize_layout": ("plain", False),
     "continue_goal": ("amid", False),
+    "observation": ("plain", "coordinates"),
     "observation_flatten": ("plain", False),
     "observe_sensors": ("plain", False),
     **{f"observe_{k}": ("plain", True) for k in ("goal_dist", "goal_comp", "hazards", "vases")},

@@ -304,7 +304,8 @@ def check_meaning(plain: dict[str, Any]) -> None:
         assert plain.get(f"algo.{part}", 0) >= 0, part
     assert plain.get("algo.clip", 1) > 0 and plain.get("algo.temperature", 1) > 0
     assert 0 < plain.get("algo.line_search_shrink", 0.5) < 1
-    assert all(units >= 1 for units in plain["algo.hidden"])
+    for part in ("hidden", "model_hidden", "vae_hidden"):
+        assert all(units >= 1 for units in plain.get(f"algo.{part}", ())), part
     assert plain["num_seeds"] >= 1 and plain["seed"] >= 0 and plain["total_steps"] >= 1
     assert plain["num_envs"] in (None, plain.get("algo.num_envs"))
     for name, value in plain.items():

@@ -1,0 +1,195 @@
+"""PETS, which plans with an ensemble, and its constrained kin: CCE, RCE and CAP."""
+
+from functools import partial
+from typing import Annotated, Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxsafe.config import Amount, Bounds, Iterations, Weight, config
+from jaxsafe.learn.bill import PriceClockConfig
+from jaxsafe.learn.model_based import ModelBasedConfig, model_based
+from jaxsafe.learn.off_policy import ReplayConfig
+from jaxsafe.learn.planning import (
+    Planner,
+    cautious_cost,
+    elites,
+    mean_cost,
+    mean_return,
+    no_cost,
+    worst_cost,
+)
+from jaxsafe.learn.row import Row
+from jaxsafe.learn.treatments import Treatment
+from jaxsafe.types import Count
+
+
+@config
+class PETSConfig(ModelBasedConfig, ReplayConfig):
+    """PETS: plans with an ensemble of probabilistic networks, blind to cost.
+
+        R(a_1 .. a_H) = mean over particles of sum_h r_h,   each model's particles follow that model
+        a* = the mean that CEM finds for the largest R;     acts with a*_1
+        minimise_m  mean[(mu_m(s, a) - y)^2 / sigma_m(s, a)^2 + log sigma_m(s, a)^2],   y = (r, s' - s)
+
+    for each model m of the ensemble, at each refit on all of the replay. Where the cost is learned, y
+    has it, too. Planning sees no end of an episode.
+
+    With `true_model` it plans in the simulator instead, whose random numbers it foresees: the most that
+    planning can do. Nothing is learned then, so set `learning_starts` to 0 (`preset=true_model`).
+
+    Source: Chua et al. (2018), "Deep Reinforcement Learning in a Handful of Trials using Probabilistic
+    Dynamics Models", arXiv:1805.12114; the settings are OmniSafe's.
+    Differs from OmniSafe: the bounds of the variances are learned, weights begin with a truncated
+    normal, and each model is put back to its best, as in the papers. The plan begins anew with each
+    episode, and evaluation has plans of its own. Batches are drawn with replacement. The defaults are
+    for a GPU: many environments, and a fixed number of large steps at each refit.
+    """
+
+    # Environments side by side, of all devices together. OmniSafe has 1.
+    num_envs: Amount = 64
+    horizon: Amount = 10  # Steps of each environment in an update.
+    # Transitions kept, rounded to whole updates. OmniSafe keeps all of a run.
+    replay_size: Annotated[int, Bounds(1, 2**31 - 1)] = 200_000
+    # Environment steps with random actions before the first fit, rounded up to whole updates. OmniSafe
+    # has 10,000 raw steps.
+    learning_starts: Annotated[int, Bounds(0, 2**31 - 1)] = 2_000
+    # The best plans, which make the next mean and variance. As in OmniSafe.
+    elites: Amount = 64
+    # Transitions of a step of each model, of all devices together, drawn with replacement. OmniSafe has
+    # 256.
+    model_batch: Amount = 1024
+    max_epochs: Iterations = 1  # Epochs that end a refit anyway. OmniSafe has no bound.
+    # Steps of an epoch. 0 is as many as one pass over the data has, as in OmniSafe.
+    epoch_steps: Annotated[int, Bounds(0, 2**24)] = 1000
+
+
+@config
+class CCEConfig(PETSConfig):
+    """CCE-PETS: PETS that takes its elites from plans whose expected cost is within the limit.
+
+        C(a_1 .. a_H) = T / H  mean over particles of sum_h c_h,   T the steps of an episode
+        elites: the largest R among plans with C <= cost_limit;
+                if there are fewer of these than elites, the smallest C of all plans
+
+    The rest is as in PETS.
+
+    Source: Wen and Topcu (2018), "Constrained Cross-Entropy Method for Safe Reinforcement Learning".
+    Differs from OmniSafe: there C is the cost of 1000 steps of the planner, whatever an episode has.
+    """
+
+
+@config
+class RCEConfig(PETSConfig):
+    """RCE-PETS: as CCE-PETS, but C has the worst particle at each step.
+
+        C(a_1 .. a_H) = T / H  sum_h max over particles of c_h
+
+    The rest is as in CCE-PETS. Where a step costs 0 or 1 and the limit is below T / H divided by the
+    number of particles, both allow the same plans: those without any cost.
+
+    Source: Liu et al. (2020), "Constrained Model-based Reinforcement Learning with Robust Cross-Entropy
+    Method", arXiv:2010.07968.
+    Differs from OmniSafe: there C is the cost of 1000 steps of the planner, whatever an episode has.
+    """
+
+
+@config
+class CAPConfig(PriceClockConfig, PETSConfig):
+    """CAP-PETS: as CCE-PETS, but cost is raised by the model's uncertainty, at an adaptive price.
+
+        C(a_1 .. a_H) = T / H  mean over particles of sum_h (c_h + kappa max_m |sigma_m(s_h, a_h)|)
+        kappa <- clip(kappa + kappa_lr (J_c - cost_limit), 0, kappa_max),   every `dual_every` steps
+
+    J_c is what an episode has cost since kappa last moved. The vector sigma_m has the standard
+    deviations of all outputs of model m, at that model's own particle. The rest is as in CCE-PETS.
+
+    Source: Ma et al. (2022), "Conservative and Adaptive Penalty for Model-Based Safe Reinforcement
+    Learning", arXiv:2112.07701.
+    Differs from OmniSafe: there a plan gets the uncertainty of other plans, because an array is
+    reshaped in the wrong order. J_c is over 50 episodes there.
+    """
+
+    # Environment steps between two moves of kappa. OmniSafe has 20,000 raw steps.
+    dual_every: Annotated[int, Bounds(1, 2**30)] = 4_000
+    kappa_init: Weight = 0.0  # kappa at first, as in OmniSafe.
+    kappa_lr: Weight = 0.1  # The change of kappa for each unit of violation, as in OmniSafe.
+    kappa_max: Weight = 1.0  # The largest kappa, as in OmniSafe.
+
+
+def move_kappa(kappa: jax.Array, episode_cost: jax.Array, cfg: Any, iteration: Count) -> jax.Array:
+    return jnp.clip(kappa + cfg.kappa_lr * (episode_cost - cfg.cost_limit), 0.0, cfg.kappa_max)
+
+
+caution = Treatment(
+    init=lambda cfg: jnp.asarray(cfg.kappa_init, jnp.float32),
+    update=move_kappa,
+    advantage=lambda kappa, adv_r, adv_c: adv_r - kappa * adv_c,
+    metrics=lambda kappa: {"train/kappa": kappa},
+)
+
+PETS, CCE, RCE, CAP = (
+    Planner(mean_return, cost, elites) for cost in (no_cost, mean_cost, worst_cost, cautious_cost)
+)
+make = partial(model_based, planner=PETS)
+
+# OmniSafe @15603dd, configs/model-based; of navigation with env.wrap.action_repeat=5 and
+# env.observation=coordinates, where 5 raw steps are one step here. An update of 40 steps is ours.
+ALONE: dict[str, Any] = {
+    "num_envs": 1, "horizon": 40, "stagger": False, "model_batch": 256, "max_epochs": 1000,
+    "epoch_steps": 0,
+}  # fmt: skip
+NAVIGATION: dict[str, Any] = ALONE | {"refit_every": 240, "learn_cost": False}
+VELOCITY: dict[str, Any] = ALONE | {
+    "refit_every": 1200, "learning_starts": 10_000, "replay_size": 1_000_000, "plan_steps": 16,
+    "plan_var": 0.1,
+}  # fmt: skip
+TRUE: dict[str, Any] = {"true_model": True, "learning_starts": 0}
+LIMIT: dict[str, Any] = {"cost_limit": 1.0}
+# for a problem of two levers, whose next signs nobody can foresee
+LEVER: dict[str, Any] = {
+    "num_envs": 16, "horizon": 8, "replay_size": 4096, "learning_starts": 256, "refit_every": 256,
+    "plan_steps": 1, "plans": 64, "elites": 8, "particles": 2, "models": 3, "model_hidden": (32, 32),
+    "model_lr": 1e-2, "model_batch": 64, "epoch_steps": 150,
+}  # fmt: skip
+
+
+def published(limit: dict[str, Any], **velocity: Any) -> dict[str, dict[str, Any]]:
+    return {
+        "omnisafe_navigation": NAVIGATION | limit,
+        "omnisafe_velocity": VELOCITY | limit | velocity,
+        "true_model": TRUE,
+    }
+
+
+ROWS = {
+    "pets": Row(
+        PETSConfig,
+        make,
+        "planning with an ensemble of models, no constraint",
+        published({}),
+        holds="nothing",
+        lever=LEVER,
+    ),
+    "cce_pets": Row(
+        CCEConfig,
+        partial(model_based, planner=CCE),
+        "planning among plans of a low expected cost",
+        published(LIMIT),
+        lever=LEVER,
+    ),
+    "rce_pets": Row(
+        RCEConfig,
+        partial(model_based, planner=RCE),
+        "planning among plans of a low cost in the worst case",
+        published(LIMIT),
+        lever=LEVER,
+    ),
+    "cap_pets": Row(
+        CAPConfig,
+        partial(model_based, planner=CAP, treatment=caution),
+        "planning with a cost that the model's uncertainty raises",
+        published(LIMIT, dual_every=20_000),
+        lever=LEVER,
+    ),
+}

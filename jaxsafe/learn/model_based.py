@@ -1,0 +1,74 @@
+"""Planning algorithms as learners of the off-policy loop: a model that is refitted, and a planner.
+
+The loop takes the environment steps and writes the replay. The plan is the policy's carry. At the end
+of an update the model is refitted, if that is due by the loop's clock. A method may learn an actor and
+critics besides, by gradient steps on the same replay.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxsafe.config import config
+from jaxsafe.learn.learner import GradientStep, Learner
+from jaxsafe.learn.models import ModelConfig, init_model, record_by, refit
+from jaxsafe.learn.off_policy import off_policy
+from jaxsafe.learn.planning import PlanConfig, Planner, planning_policy
+from jaxsafe.learn.replay import Transitions
+from jaxsafe.learn.steps import Trainable
+from jaxsafe.learn.treatments import Treatment, no_treatment
+from jaxsafe.types import Algorithm, Env, Metrics
+
+
+@config
+class ModelBasedConfig(PlanConfig, ModelConfig):
+    """What the planning algorithms share, beside what they share with others that have a replay."""
+
+
+def no_learner() -> Learner:
+    """Of a method that learns nothing but the model."""
+
+    def step(nets: Trainable, *_: Any) -> tuple[Trainable, Metrics]:
+        return nets, {}
+
+    return Learner(init=lambda *_: Trainable({}, {}), step=step)
+
+
+def model_based(
+    env: Env,
+    axis_name: str | None = None,
+    *,
+    planner: Planner,
+    treatment: Treatment = no_treatment,
+    beside: Learner | None = None,
+) -> Algorithm:
+    """The algorithm that plans by `planner`.
+
+    Args:
+        planner: by which scores and weights.
+        treatment: what moves with the cost of episodes; the planner has it as `learned.dual`.
+        beside: learns an actor and critics for the planner.
+    """
+    other = beside or no_learner()
+
+    def init(key: jax.Array, obs_size: int, action_size: int, cfg: Any) -> Trainable:
+        scores = jnp.zeros(cfg.plans)
+        planner.weigh(scores, scores, cfg)  # refuses settings that it cannot serve
+        model_key, key = jax.random.split(key)
+        model, state = init_model(model_key, env, cfg)
+        nets = other.init(key, obs_size, action_size, cfg)
+        return Trainable(nets.params | {"model": model}, nets.opt_state | {"model": state})
+
+    def step(
+        nets: Trainable, batch: Transitions, at: GradientStep, cfg: Any, axis_name: str | None
+    ) -> tuple[Trainable, Metrics]:
+        models = [{"model": x["model"]} for x in nets]
+        rest = Trainable(*({k: x for k, x in part.items() if k != "model"} for part in nets))
+        new, metrics = other.step(rest, batch, at, cfg, axis_name)
+        return Trainable(new.params | models[0], new.opt_state | models[1]), metrics
+
+    learner = Learner(
+        init=init, step=step, policy=planning_policy(env, planner), refit=refit, record=record_by
+    )
+    return off_policy(env, learner, treatment, axis_name)

@@ -1,0 +1,209 @@
+"""The ensemble knows the noise of what it is fitted to, and where it does not know."""
+
+import dataclasses
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from compiling import FAST
+from toys import Ticker
+
+from jaxsafe.config import config
+from jaxsafe.learn.models import (
+    Fitted,
+    ModelConfig,
+    ModelRecord,
+    fit,
+    init_model,
+    learnable,
+    record_by,
+    scale_of,
+    transitions_at,
+)
+from jaxsafe.learn.next_step_rollout import collect_records, started
+from jaxsafe.learn.replay import Span
+from jaxsafe.learn.rollout import init_rollout
+from jaxsafe.nn.ensemble import ensemble_loss, init_ensemble, outputs_of, unscaled
+
+ROWS, ENVS = 640, 8
+
+
+@config
+class Config(ModelConfig):
+    models: int = 3
+    model_hidden: tuple[int, ...] = (32, 32)
+    learn_cost: bool = False
+    model_lr: float = 1e-2
+    epoch_steps: int = 200
+
+
+@dataclass(frozen=True)
+class Line:
+    obs_size: int = 1
+    action_size: int = 1
+
+    def observed_cost(self, obs):
+        return jnp.zeros(obs.shape[:-1])
+
+
+LINE: Any = Line()  # as much of an environment as a model needs
+
+
+def ring_of(x, reward, **marks):
+    """A ring of [R, N] whose step from x pays `reward`, which stands in the row that follows."""
+    no = jnp.zeros(x.shape, bool)
+    fields = dict.fromkeys(("first", "terminated", "truncated", "jump"), no) | marks
+    number = jnp.zeros(x.shape)
+    arrived = jnp.roll(reward, 1, axis=0)
+    return ModelRecord(
+        obs=x[..., None], action=number[..., None], reward=arrived, cost=number,
+        costs=number[..., None], **fields,
+    )  # fmt: skip
+
+
+def noise_at(x):
+    return 0.1 + 0.2 * jnp.abs(x)
+
+
+def draw(key, shape):
+    x_key, noise_key = jax.random.split(key)
+    x = jax.random.uniform(x_key, shape, minval=-2.0, maxval=2.0)
+    return x, jnp.sin(x) + noise_at(x) * jax.random.normal(noise_key, shape)
+
+
+@cache
+def fitted():
+    """The ensemble before and after a fit to sin x with noise, and the metrics."""
+    cfg = Config()
+    x, y = draw(jax.random.key(0), (ROWS, ENVS))
+    ring, span = ring_of(x, y), Span(jnp.int32(0), jnp.int32(ROWS))
+
+    def train(key):
+        model, state = init_model(key, LINE, cfg)
+        return model, *fit(model, state, ring, span, key, cfg)
+
+    return jax.jit(train, compiler_options=FAST)(jax.random.key(1))
+
+
+def predicted(model: Fitted, x):
+    """Mean and deviation of the reward by each model, [M, B]."""
+    inputs = jnp.stack([x, jnp.zeros_like(x)], -1)
+    dist = outputs_of(model.ensemble, model.scale, jnp.broadcast_to(inputs, (3, *inputs.shape)))
+    return dist.mean[..., 0], jnp.exp(dist.log_std[..., 0])
+
+
+def test_the_fit_knows_the_noise_everywhere():
+    _, model, _, metrics = fitted()
+    x, y = draw(jax.random.key(2), (20_000,))
+    mean, std = predicted(model, x)
+    assert metrics["train/nonfinite"] == 0 and 7 <= metrics["train/model_epochs"] < 1000
+
+    def nll(mean, std):
+        return np.mean(0.5 * ((y - mean) / std) ** 2 + np.log(std))
+
+    truth = nll(np.sin(x), noise_at(x))
+    for m in range(3):
+        assert nll(mean[m], std[m]) < truth + 0.05
+        covered = np.mean(np.abs(y - mean[m]) < 1.6449 * std[m])
+        assert 0.88 < covered < 0.92
+
+
+def test_models_disagree_where_there_was_no_data():
+    _, model, _, _ = fitted()
+    seen, unseen = draw(jax.random.key(3), (500,))[0], jnp.linspace(4.0, 8.0, 100)
+    inside, outside = (predicted(model, x)[0].std(0).mean() for x in (seen, unseen))
+    assert outside > 5 * inside
+
+
+def test_the_bounds_of_the_variance_move_towards_the_data():
+    before, after, _, _ = fitted()
+    for name in ("low", "high"):
+        old, new = getattr(before.ensemble, name), getattr(after.ensemble, name)
+        assert (old != new).all()
+    assert (after.ensemble.high[:, 0] < before.ensemble.high[:, 0]).all()  # the noise is 0.5 at most
+
+
+def test_the_loss_by_hand():
+    """One model of one linear layer: mu = w x + b, and a log variance in the middle of its range."""
+    ensemble: Any = init_ensemble(jax.random.key(0), 1, 1, (), 1)
+    layer = ensemble.layers[0].replace(weight=jnp.array([[[2.0, 0.0]]]), bias=jnp.array([[0.5, -3.0]]))
+    ensemble = ensemble.replace(layers=(layer,))
+    x, y = jnp.array([[[1.0], [2.0]]]), jnp.array([[[3.0], [4.0]]])
+    high = 0.5 - np.log1p(np.exp(0.5 + 3.0))
+    log_var = -10 + np.log1p(np.exp(high + 10))
+    errors = (0.25 + 0.25) / 2 * np.exp(-log_var) + log_var
+    expected = errors + 0.01 * 10.5 + 0.3 / 2 * 4.0  # one layer: the last, whose share is 1
+    np.testing.assert_allclose(ensemble_loss(ensemble, unscaled(1), x, y, 0.3), expected, rtol=1e-5)
+
+
+def test_weights_begin_small_and_are_cut_off():
+    layer = init_ensemble(jax.random.key(0), 2, 100, (300,), 1).layers[0]
+    std = 1 / (2 * 100**0.5)
+    assert jnp.abs(layer.weight).max() <= 2 * std and jnp.abs(layer.weight).max() > 1.9 * std
+    np.testing.assert_allclose(layer.weight.std(), 0.88 * std, rtol=0.02)  # of N(0, 1) within +-2
+    assert (layer.weight[0] != layer.weight[1]).all()
+
+
+def test_the_model_learns_from_steps_within_an_episode_without_a_jump_and_finite():
+    x = jnp.arange(12.0).reshape(6, 2)
+    no = np.zeros((6, 2), bool)
+    last, jump = no.copy(), no.copy()
+    last[3, 0] = True  # of environment 0; the next row is a reset
+    jump[3, 1] = True  # a new goal appears there
+    reward = jnp.ones((6, 2)).at[0, 1].set(jnp.nan)  # of the step from row 0
+    ring = ring_of(x, reward, truncated=jnp.array(last), jump=jnp.array(jump))
+    span = Span(jnp.int32(1), jnp.int32(6))  # full: row 1 is the oldest, row 0 the newest
+    mask = learnable(ring, span)
+    expected = ~no
+    expected[0] = False  # nothing follows the newest row
+    expected[3, 0] = False
+    expected[2, 1] = False
+    np.testing.assert_array_equal(mask, expected)
+    inputs, targets = transitions_at(ring, jnp.array([2 * 5 + 1, 2 * 1]), Config())
+    np.testing.assert_array_equal(inputs, [[11.0, 0.0], [2.0, 0.0]])
+    np.testing.assert_array_equal(targets[1], [1.0, 2.0])  # reward, and 4 - 2
+    np.testing.assert_array_equal(targets[0, 1], 1.0 - 11.0)  # the ring goes on at row 0
+    scale = scale_of(ring, jnp.asarray(expected), None)
+    kept = x[expected]
+    np.testing.assert_allclose(scale.centre, jnp.array([kept.mean(), 0.0]), rtol=1e-6)
+    np.testing.assert_allclose(scale.spread, jnp.array([kept.std(), 1.0]), rtol=1e-6)
+
+
+def test_a_row_says_whether_what_the_environment_reports_made_it_jump():
+    env, keys = Ticker(episode_length=3), jax.random.split(jax.random.key(1), 8)
+    stepping = started(init_rollout(env, jax.random.key(0), 2, stagger=False))
+
+    def behave(carry, state, first, key):
+        return jnp.zeros((2, 1)), carry
+
+    ticks = record_by(dataclasses.replace(Config(), jump="ticks"))  # it reports a tick of each step
+    run = jax.jit(lambda x: collect_records(env, behave, x, keys, ticks), compiler_options=FAST)
+    rows: Any = run(stepping)[1][0]
+    np.testing.assert_array_equal(rows.jump, ~rows.first)
+    assert rows.first.sum() == 2 * 2
+    assert not record_by(Config())(stepping, jnp.zeros((2, 1))).jump.any()  # and no goal_met
+
+
+def test_a_model_is_put_back_to_its_best():
+    """The last `patience` epochs did not help, so the fit that stops before them is the same."""
+    cfg = dataclasses.replace(Config(), models=1, patience=3, epoch_steps=0)
+    x, y = draw(jax.random.key(0), (64, ENVS))
+    ring, span = ring_of(x, y), Span(jnp.int32(0), jnp.int32(64))
+
+    def train(epochs):
+        model, state = init_model(jax.random.key(1), LINE, cfg)
+        most = dataclasses.replace(cfg, max_epochs=epochs)
+        return fit(model, state, ring, span, jax.random.key(2), most)
+
+    def run(epochs):
+        return jax.jit(train, static_argnums=0, compiler_options=FAST)(epochs)
+
+    model, _, metrics = run(1000)
+    early, _, before = run(int(metrics["train/model_epochs"]) - 3)
+    for a, b in zip(jax.tree.leaves(model), jax.tree.leaves(early), strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert metrics["train/model_error"] == before["train/model_error"]
+    assert metrics["train/model_epochs"] == before["train/model_epochs"] + 3

@@ -1,0 +1,253 @@
+"""The cross-entropy method, its scores and its weights: by hand, and where the best plan is known."""
+
+import dataclasses
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from compiling import FAST
+
+from jaxsafe.algos import ALGOS, loop, pets
+from jaxsafe.learn.acting import Learned
+from jaxsafe.learn.models import Model, Prediction
+from jaxsafe.learn.planning import (
+    Imagined,
+    by_return,
+    by_return_within_limit,
+    cautious_cost,
+    cem,
+    elites,
+    imagine,
+    mean_cost,
+    planning_policy,
+    worst_cost,
+)
+from jaxsafe.types import State
+
+PLAIN: dict[str, Any] = {"plans": 128, "elites": 16, "plan_steps": 4}
+
+
+def learned_by(cfg: Any, dual: Any = (), **params: Any) -> Learned:
+    return Learned(cfg, {"model": ()} | params, dual, ())
+
+
+# ---- the method ----------------------------------------------------------------------------------
+
+
+def test_the_best_plan_of_a_linear_system_with_a_quadratic_cost_is_found_within_1_per_cent():
+    """x <- x + a / 2,  R = -sum x^2 - sum a^2 / 10, whose best plan solves a linear system."""
+    cfg = pets.PETSConfig(plans=512, elites=32, plan_steps=4, cem_iterations=15, plan_var=1.0)
+    x0 = np.array([0.5, -0.3])
+
+    def ret(plans):
+        x = x0 + jnp.cumsum(plans / 2, axis=1)
+        return -(x**2).sum((1, 2)) - (plans**2).sum((1, 2)) / 10
+
+    def score(plans, key):
+        return ret(plans), jnp.zeros(len(plans))
+
+    plan = jax.jit(lambda key: cem(score, elites, jnp.zeros((4, 2)), (), key, cfg))(jax.random.key(0))
+    sums = np.tril(np.ones((4, 4))) / 2
+    best = np.linalg.solve(sums.T @ sums + np.eye(4) / 10, -sums.T @ np.ones((4, 1)) @ x0[None])
+    assert np.abs(best).max() < 1
+    found, most = ret(plan[None])[0], ret(jnp.asarray(best)[None])[0]
+    assert most >= found > most * 1.01  # both are negative
+    np.testing.assert_allclose(plan, best, atol=0.05)
+
+
+@dataclass(frozen=True)
+class Shore:
+    """A walk along a line: x <- x + a / 5, which pays what it goes ahead. Beyond 1/2 a step costs 1."""
+
+    obs_size: int = 1
+    action_size: int = 1
+    episode_length: int = 8
+    cost_names: tuple[str, ...] = ("water",)
+
+    def at(self, x: float) -> State:
+        return self._state(jnp.float32(x), jnp.zeros(()))
+
+    def step(self, state: State, action: jax.Array) -> State:
+        move = jnp.clip(action[0], -1.0, 1.0) / 5
+        return self._state(state.physics + move, move)
+
+    def _state(self, x: jax.Array, reward: jax.Array) -> State:
+        cost = (x > 0.5).astype(jnp.float32)
+        return State(x, x[None], reward, cost, cost[None], jnp.bool_(False), {})
+
+
+SHORE: Any = Shore()  # as much of an environment as planning needs
+
+
+@cache
+def walk(name: str):
+    """From x = 0 and from x = 0.95, planning in the simulator: x [2, 9] and plans [2, 8, H]."""
+    env, row = SHORE, ALGOS[name]
+    planner = {"pets": pets.PETS, "cce_pets": pets.CCE, "rce_pets": pets.RCE, "cap_pets": pets.CAP}
+    policy = planning_policy(env, planner[name])
+    learned = learned_by(row.config(**PLAIN, true_model=True, cost_limit=1.0), dual=jnp.ones(()))
+
+    def play(x):
+        def step(now, key):
+            state, carry = now
+            action, carry, _ = policy.act(learned, carry, state, key)
+            state = env.step(state, action)
+            return (state, carry), (state.physics, carry)
+
+        start = env.at(x), policy.init(learned)
+        return jax.lax.scan(step, start, jax.random.split(jax.random.key(0), 8))[1]
+
+    x, carry = jax.jit(jax.vmap(play), compiler_options=FAST)(jnp.array([0.0, 0.95]))
+    assert policy.privileged(learned) and carry.shape == (2, 8, 4, 1)
+    return np.asarray(x), np.asarray(carry)
+
+
+@pytest.mark.parametrize("name", ["cce_pets", "rce_pets", "cap_pets"])
+def test_constrained_planners_stop_at_the_shore_and_leave_the_water_the_shortest_way(name):
+    x, carry = walk(name)
+    ahead = x[0] + carry[0, :, :-1, 0].sum(-1) / 5  # where the plan ends
+    assert x[0].max() <= 0.5 and ahead.min() > 0.45 and ahead.max() <= 0.5
+    assert (x[1] > 0.5).sum() == 2  # no plan leaves it in fewer steps, and none is allowed
+    assert x[1, 2:].max() <= 0.5
+
+
+def test_a_planner_without_a_constraint_walks_on_and_its_plan_moves_along_with_it():
+    x, carry = walk("pets")
+    assert x[0, -1] > 1.4
+    np.testing.assert_array_equal(carry[:, :, -1], carry[:, :, -2])  # moved on, the last one twice
+
+
+# ---- particles -----------------------------------------------------------------------------------
+
+
+def test_a_particle_keeps_its_model_its_plan_and_its_penalty():
+    """A model whose state remembers who it is: particle p of model m under plan s."""
+    m, p, s, h = 2, 3, 8, 2
+    number = np.arange(m * p * s, dtype=np.float32).reshape(m, p, s)
+    models, particles = jnp.arange(2.0).reshape(2, 1, 1), jnp.arange(3.0).reshape(1, 3, 1)
+
+    def predict(fitted, latent, action, key, cfg):
+        told = 24 * models + 8 * particles + action[..., 0]  # `number`, as plan s is all s
+        zero = jnp.zeros_like(told)
+        return Prediction(latent + told[..., None], told, zero, told**2, zero > 1)
+
+    model = Model(lambda cfg: (m, p), predict, lambda latent: latent)
+    plans = jnp.broadcast_to(jnp.arange(8.0)[:, None, None], (s, h, 1))
+    learned = learned_by(pets.CAPConfig(), dual=jnp.float32(0.5))
+    imagined = imagine(model, learned, jnp.zeros(1), plans, jax.random.key(0))
+    np.testing.assert_array_equal(imagined.reward, np.stack([number] * h))
+    np.testing.assert_array_equal(imagined.obs[..., 0], h * number)
+    cost = cautious_cost(imagined, learned)
+    by_hand = h * 0.5 * (number[1] ** 2).mean(0)  # model 1 has the larger spread, of each particle
+    np.testing.assert_allclose(cost, by_hand, rtol=1e-6)
+    shuffled = np.random.default_rng(0).permutation(s)
+    none_feasible = pets.CAPConfig(elites=3, cost_limit=0.0)
+    weights = elites(jnp.zeros(s), cost[shuffled] + 1.0, none_feasible)
+    np.testing.assert_allclose(weights, np.where(shuffled < 3, 1 / 3, 0), rtol=1e-6)
+
+
+def test_the_mean_and_the_worst_cost_by_hand():
+    of_steps = [[[1.0, 0.0], [0.0, 3.0]], [[2.0, 0.0], [0.0, 0.0]]]  # [H, M, P]
+    cost = jnp.array(of_steps)[..., None]
+    imagined = Imagined(cost, cost, cost, cost, cost > 0)
+    learned = learned_by(pets.CCEConfig())
+    assert mean_cost(imagined, learned)[0] == (1 + 3) / 4 + 2 / 4
+    assert worst_cost(imagined, learned)[0] == 3 + 2
+
+
+# ---- the border of the feasible ------------------------------------------------------------------
+
+RET = jnp.array([5.0, 4.0, 3.0, 2.0, 1.0])
+
+
+def test_a_cost_at_the_limit_is_feasible_and_one_above_it_is_not():
+    cfg = pets.CCEConfig(elites=2, cost_limit=1.0)
+    at = elites(RET, jnp.array([1.0, 2.0, 2.0, 1.0, 2.0]), cfg)
+    np.testing.assert_allclose(at, [0.5, 0, 0, 0.5, 0])
+    above = elites(RET, jnp.array([1 + 1e-6, 2.0, 0.5, 1.0, 2.0]), cfg)
+    np.testing.assert_allclose(above, [0, 0, 0.5, 0.5, 0])
+
+
+def test_one_feasible_plan_less_than_there_are_elites_changes_the_rule():
+    cfg = pets.CCEConfig(elites=3, cost_limit=1.0)
+    enough = elites(RET, jnp.array([3.0, 1.0, 1.0, 0.5, 2.0]), cfg)
+    np.testing.assert_allclose(enough, [0, 1 / 3, 1 / 3, 1 / 3, 0])
+    few = elites(RET, jnp.array([3.0, 2.5, 1.0, 0.5, 2.0]), cfg)  # by cost alone
+    np.testing.assert_allclose(few, [0, 0, 1 / 3, 1 / 3, 1 / 3])
+
+
+def test_a_plan_that_is_not_finite_is_never_among_the_best():
+    cfg = pets.CCEConfig(elites=2, cost_limit=1.0)
+    ret, cost = RET.at[0].set(jnp.nan), jnp.zeros(5).at[1].set(jnp.nan)
+    np.testing.assert_allclose(elites(ret, cost, cfg), [0, 0, 0.5, 0.5, 0])
+    soft = loop.SafeLOOPConfig(elites=2, temperature=1.0, cost_limit=1.0)
+    weights = by_return_within_limit(ret, cost, soft)
+    assert (weights[:2] == 0).all() and jnp.isclose(weights.sum(), 1)
+    nothing = by_return_within_limit(jnp.full(5, jnp.nan), cost, soft)
+    np.testing.assert_allclose(nothing, 0.2)
+
+
+def test_soft_weights_by_hand():
+    cfg = loop.SafeLOOPConfig(elites=2, temperature=2.0, cost_temperature=3.0, cost_limit=1.0)
+    w = np.exp(2.0 * np.array([4.0, 2.0]))
+    enough = by_return_within_limit(RET, jnp.array([1.5, 1.0, 2.0, 0.0, 2.0]), cfg)
+    np.testing.assert_allclose(enough, np.array([0, w[0], 0, w[1], 0]) / w.sum(), rtol=1e-5)
+    cost = np.array([1.5, 2.0, 1.2, 0.9, 1.1])
+    few = by_return_within_limit(RET, jnp.asarray(cost), cfg)
+    np.testing.assert_allclose(few, np.exp(-3 * cost) / np.exp(-3 * cost).sum(), rtol=1e-5)
+
+
+# ---- LOOP ----------------------------------------------------------------------------------------
+
+
+def test_the_plan_is_worth_the_smaller_value_of_what_the_actor_does_at_its_end():
+    """Q_1(s, a) = a and Q_2 = a + 1, and the actor does tanh(-5 s). From s' = s + a the plan should go
+    down, where Q(s', a) of the action before would have it go up."""
+    cfg = loop.LOOPConfig(hidden=(), layer_norm=False, plan_steps=2, discount=0.5, true_model=True)
+    bias = jnp.array([[0.0], [1.0]])
+    weight = jnp.broadcast_to(jnp.array([[0.0], [1.0]]), (2, 2, 1))
+    critics = {"params": {"Dense_0": {"kernel": weight, "bias": bias}}}
+    actor = {"params": {"Dense_0": {"kernel": jnp.array([[-5.0, 0.0]]), "bias": jnp.zeros(2)}}}
+    learned = learned_by(cfg, critic_r=critics, actor=actor)
+    planner = loop.planner(SHORE)
+
+    def ret(s, alive=True):
+        obs = jnp.broadcast_to(s[:, None], (1, 1, len(s), 1))
+        reward = jnp.array([3.0, 4.0]).reshape(2, 1, 1, 1) * jnp.ones((2, 1, 1, len(s)))
+        imagined = Imagined(reward, reward, reward, obs, jnp.full((1, 1, len(s)), alive))
+        return planner.ret(imagined, learned, jax.random.key(0))
+
+    s = jnp.array([-1.0, 0.1, 1.0])
+    np.testing.assert_allclose(ret(s), 3 + 0.5 * 4 + 0.25 * np.tanh(-5 * s), rtol=1e-5)
+    np.testing.assert_allclose(ret(s, alive=False), 3 + 0.5 * 4)  # after an end nothing is left
+    assert jnp.argmax(ret(s)) == 0
+
+
+def test_what_the_actor_does_in_each_model_is_among_the_plans():
+    cfg = loop.LOOPConfig(hidden=(), plan_steps=3, actor_plans=2, particles=4)
+    actor = {"params": {"Dense_0": {"kernel": jnp.zeros((1, 2)), "bias": jnp.array([0.5, -20.0])}}}
+
+    def predict(fitted, latent, action, key, cfg):
+        zero = jnp.zeros(latent.shape[:-1])
+        return Prediction(latent + action, zero, zero, zero, zero > 0)
+
+    model = Model(lambda cfg: (5, cfg.particles), predict, lambda latent: latent)
+    planner = loop.planner(SHORE)
+    (plans,) = planner.propose(model, learned_by(cfg, actor=actor), jnp.zeros(1), jax.random.key(0))
+    assert plans.shape == (5 * 2, 3, 1)
+    np.testing.assert_allclose(plans, np.tanh(0.5), rtol=1e-4)
+
+
+def test_a_narrow_plan_is_not_improved_any_further():
+    cfg = dataclasses.replace(loop.LOOPConfig(plans=16), plan_var=1e-4, var_stop=1e-3)
+    mean = jnp.full((2, 1), 0.3)
+
+    def score(plans, key):
+        return plans.sum((1, 2)), jnp.zeros(16)
+
+    plan = cem(score, by_return, mean, (), jax.random.key(0), cfg)
+    np.testing.assert_array_equal(plan, mean)
