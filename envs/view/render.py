@@ -237,7 +237,7 @@ def render_episode(
     draw = Renderer(env, **renderer)  # first: an episode is not worth simulating if it cannot be drawn
     states = run_episode(player, key, length or env.episode_length)
     steps = len(states.terminated)
-    ends = np.flatnonzero(states.terminated)
+    ends = np.flatnonzero(states.ended)
     last = int(ends[0]) if len(ends) else steps - 1
     seconds = drawable(env).step_seconds * raw_steps(env)
     every = every or max(1, round(1 / (FPS * seconds)))

@@ -93,7 +93,7 @@ def episode(player: Player, key: jax.Array, obs_size: int, sampled: bool) -> Ste
         action = jnp.clip(action, -1.0, 1.0)
         after = env.step(state, action)
         made = (after.obs[:obs_size], action, after.reward, after.cost, after.costs, after.terminated)
-        return (after, carry, alive & ~after.terminated), (*made, alive)
+        return (after, carry, alive & ~after.ended), (*made, alive)
 
     start = env.reset(reset_key)
     begin = start, player.begin(), jnp.bool_(True)

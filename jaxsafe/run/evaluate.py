@@ -32,7 +32,7 @@ def episode(
     cost_discount: jax.Array | float = 1.0,
     sampled: bool = False,
 ) -> Episodes:
-    """One whole episode, pure: rewards and costs count until termination or the limit.
+    """One whole episode, pure: rewards and costs count until the end or the limit.
 
     Actions are the mean ones, or `sampled`; both begin with the same reset. The discounted sums,
     sum_t discount^t r_t and likewise of costs, begin with the first step.
@@ -52,7 +52,7 @@ def episode(
         )
         later = discount**t * reward, cost_discount**t * cost
         sums = summed(reward, cost, costs, jnp.float32(alive), *later)
-        return (state, carry, alive & ~state.terminated), sums
+        return (state, carry, alive & ~state.ended), sums
 
     start = env.reset(reset_key), player.begin(), jnp.bool_(True)
     _, sums = jax.lax.scan(step, start, jnp.arange(env.episode_length))
