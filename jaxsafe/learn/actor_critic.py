@@ -13,7 +13,7 @@ the undiscounted cost of an episode; Q_c, which is discounted, only gives the di
 """
 
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,9 +22,12 @@ import optax
 from jaxsafe.config import Iterations, config
 from jaxsafe.learn.batch import pmean, select
 from jaxsafe.learn.constraints import Names, each, metrics_by_constraint, signal
+from jaxsafe.learn.conventions import Convention
 from jaxsafe.learn.learner import GradientStep, Learner
+from jaxsafe.learn.normalise import CLIP, MIN_STD
 from jaxsafe.learn.off_policy import OffPolicyConfig, PriceClockConfig
 from jaxsafe.learn.replay import Transitions
+from jaxsafe.learn.sequences import averaged, no_moments, standard
 from jaxsafe.learn.steps import Trainable, adam
 from jaxsafe.learn.treatments import Treatment, no_treatment
 from jaxsafe.nn.critics import init_critics, q_values
@@ -43,9 +46,31 @@ class ActorCriticConfig(OffPolicyConfig):
 class CostCriticConfig(PriceClockConfig):
     """For the methods whose actor weighs reward against cost."""
 
+    CONVENTIONS: ClassVar = (
+        Convention({"cost_reduce": "one"}, "there is one critic of cost", "there are two"),
+        Convention(
+            {"cost_action": "mean"},
+            "targets of cost take the policy's mean action, without noise",
+            "targets of cost take the same next action as those of reward",
+        ),
+        Convention(
+            {"cost_centre": True},
+            "`cost_normalize` takes the mean from costs, so that a step without cost pays",
+            "`cost_normalize` only scales costs",
+        ),
+    )
+
     # How the values of two cost critics become one. max is cautious: it takes estimates that are too
     # high. one: a single critic, as in OmniSafe.
     cost_reduce: Literal["mean", "max", "one"] = "mean"
+    # The next action in the targets of cost. next: that of reward's. mean: the policy's mean action, as
+    # in OmniSafe.
+    cost_action: Literal["next", "mean"] = "next"
+    # Whether the critics see costs in standard deviations of those replayed so far. OmniSafe's do on
+    # velocity tasks.
+    cost_normalize: bool = False
+    # Whether `cost_normalize` also takes the mean from costs. OmniSafe's does.
+    cost_centre: bool = False
 
 
 class Proposal(NamedTuple):
@@ -101,7 +126,11 @@ def actor_critic(env: Env, actor: Actor, treatment: Treatment) -> Learner:
             )
         optimisers = actor.optimisers(cfg, 1.0) | dict.fromkeys(critics, adam(cfg.critic_lr, cfg))
         trained = own | critics
-        opt_state = {name: optimisers[name].init(params) for name, params in trained.items()}
+        opt_state: dict[str, Any] = {
+            name: optimisers[name].init(params) for name, params in trained.items()
+        }
+        if constrained and cfg.cost_normalize:
+            opt_state["cost_scale"] = no_moments(max(len(names(cfg)), 1))
         targets = critics | {name: own[name] for name in actor.followed}
         return Trainable(trained | {"targets": targets}, opt_state)
 
@@ -121,11 +150,17 @@ def actor_critic(env: Env, actor: Actor, treatment: Treatment) -> Learner:
         next_q = q_values(targets["critic_r"], batch.next_obs, next_action, cfg).min(0)
         y_r = batch.reward + cfg.discount**batch.steps * jnp.where(goes_on, next_q + bonus, 0.0)
         critics = {"critic_r": params["critic_r"]}
-        y_c = jnp.zeros(())
+        y_c, scale = jnp.zeros(()), ()
         if constrained:
             critics["critic_c"] = params["critic_c"]
+            if cfg.cost_action == "mean":
+                next_action = actor.act(params, batch.next_obs, None, cfg)
             next_c = reduced_costs(targets["critic_c"], batch.next_obs, next_action, names(cfg), cfg)
             charged = signal(env, batch, names(cfg))
+            if cfg.cost_normalize:
+                costs = charged.reshape(*batch.reward.shape, -1)
+                scale = averaged(nets.opt_state["cost_scale"], costs, batch.weight, axis_name, memory=1)
+                charged = standard(scale, costs, cfg.cost_centre, MIN_STD, CLIP).reshape(charged.shape)
             ahead = (cfg.cost_discount**batch.steps * goes_on).reshape(-1, *(1,) * (charged.ndim - 1))
             y_c = charged + ahead * next_c
 
@@ -182,7 +217,8 @@ def actor_critic(env: Env, actor: Actor, treatment: Treatment) -> Learner:
         )
         metrics = pmean(metrics | policy_metrics, axis_name)
         metrics = metrics_by_constraint(metrics, names(cfg))
-        return Trainable(new | critics, states | critic_states), metrics
+        scales = {"cost_scale": scale} if constrained and cfg.cost_normalize else {}
+        return Trainable(new | critics, states | critic_states | scales), metrics
 
     return Learner(init=init, act=actor.act, step=step, explore=actor.explore)
 

@@ -7,7 +7,6 @@ import jax
 
 from jaxsafe.learn.acting import Learned
 from jaxsafe.learn.normalise import network_inputs
-from jaxsafe.learn.replay import Transitions
 from jaxsafe.learn.steps import Trainable
 from jaxsafe.types import Metrics, Policy, PyTree
 
@@ -35,16 +34,19 @@ class Learner(NamedTuple):
 
     init(key, obs_size, action_size, cfg) -> Trainable.
     act(params, obs [..., O], key, cfg) -> action [..., A], the mean one where key is None.
-    step(nets, batch, at, cfg, axis_name) -> (Trainable, metrics), one gradient step. The weights of
-        `batch` sum to 1 over a device's share, on average over devices: a mean is
-        `pmean((weight * x).sum())`.
+    step(nets, batch, at, cfg, axis_name) -> (Trainable, metrics), one gradient step on Transitions or
+        on what `replayed` gives. The weights of `batch` sum to 1 over a device's share, on average over
+        devices: a mean is `pmean((weight * x).sum())`.
     explore(params, obs [N, O], key, cfg) -> action [N, A], how training acts; None: as `act`.
+    replayed(key, ring, span, normaliser, rows, cfg, axis_name) -> (batch, number dropped), what
+        a gradient step takes of a replay, from so many rows. None: Transitions.
     """
 
     init: Callable[[jax.Array, int, int, Any], Trainable]
     act: Callable[[PyTree, jax.Array, jax.Array | None, Any], jax.Array]
-    step: Callable[[Trainable, Transitions, GradientStep, Any, str | None], tuple[Trainable, Metrics]]
+    step: Callable[[Trainable, Any, GradientStep, Any, str | None], tuple[Trainable, Metrics]]
     explore: Callable[[PyTree, jax.Array, jax.Array, Any], jax.Array] | None = None
+    replayed: Callable[..., tuple[Any, jax.Array]] | None = None
 
 
 def policy_by(learner: Learner) -> Policy:

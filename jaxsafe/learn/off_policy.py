@@ -49,6 +49,8 @@ from jaxsafe.learn.next_step_rollout import Stepping, arrival_record, collect_re
 from jaxsafe.learn.normalise import init_normaliser, merge, network_inputs
 from jaxsafe.learn.replay import (
     Record,
+    Span,
+    Transitions,
     draw,
     empty_ring,
     held,
@@ -171,6 +173,7 @@ def off_policy(
 ) -> Algorithm:
     """The algorithm that `learner` makes of the loop, with a price on cost that `treatment` moves."""
     explore = learner.explore or learner.act
+    replayed = learner.replayed or drawn_transitions
     priced = treatment is not no_treatment
 
     def init(key: jax.Array, cfg: Any, shared: Shared) -> TrainState:
@@ -212,12 +215,8 @@ def off_policy(
             def step(nets: Trainable, x: tuple[jax.Array, jax.Array]) -> tuple[Trainable, Metrics]:
                 count, key = x
                 draw_key, step_key = jax.random.split(device_key(key, axis_name))
-                index = draw(draw_key, replay, span, sizes.batch)
-                discounts = {"discount": cfg.discount, "cost_discount": cfg.cost_discount}
-                found = transitions(replay, span, index, n_step=cfg.n_step, **discounts)
-                batch, dropped = usable(found, axis_name)
-                obs, next_obs = (network_inputs(normaliser, x) for x in (batch.obs, batch.next_obs))
-                batch = batch._replace(obs=obs, next_obs=next_obs)
+                source = replay, span, normaliser, sizes.batch
+                batch, dropped = replayed(draw_key, *source, cfg, axis_name)
                 at = GradientStep(count, remaining(iteration, cfg), step_key, ts.dual)
                 new, metrics = learner.step(nets, batch, at, cfg, axis_name)
                 finite = psum(~jnp.isfinite(optax.tree.norm(new)), axis_name) == 0
@@ -312,6 +311,24 @@ def off_policy(
     return Algorithm(init, update, policy_by(learner), learned_of, lambda learned: env, clocks)
 
 
+def drawn_transitions(
+    key: jax.Array,
+    ring: Record,
+    span: Span,
+    normaliser: PyTree,
+    count: int,
+    cfg: Any,
+    axis_name: str | None,
+) -> tuple[Transitions, jax.Array]:
+    """`count` transitions with normalised observations, and how many of them are not finite."""
+    index = draw(key, ring, span, count)
+    discounts = {"discount": cfg.discount, "cost_discount": cfg.cost_discount}
+    found = transitions(ring, span, index, n_step=cfg.n_step, **discounts)
+    batch, dropped = usable(found, axis_name)
+    obs, next_obs = (network_inputs(normaliser, x) for x in (batch.obs, batch.next_obs))
+    return batch._replace(obs=obs, next_obs=next_obs), dropped
+
+
 # ---- the price on cost -------------------------------------------------------------------------
 
 
@@ -383,7 +400,9 @@ def sizes_of(cfg: Any, axis_name: str | None) -> Sizes:
     if cfg.batch_size % devices:
         raise ConfigError(f"batch_size={cfg.batch_size} does not split over {devices} devices")
     steps = num_envs * cfg.learn_every  # environment steps of a round
-    if cfg.replay_ratio * steps % cfg.batch_size:
+    replayed = cfg.replay_ratio * steps
+    updates = round(replayed / cfg.batch_size)
+    if not math.isclose(updates * cfg.batch_size, replayed):
         raise ConfigError(
             f"replay_ratio={cfg.replay_ratio}: {cfg.replay_ratio} x num_envs={num_envs} x "
             f"learn_every={cfg.learn_every} transitions are no whole number of batches of "
@@ -397,7 +416,7 @@ def sizes_of(cfg: Any, axis_name: str | None) -> Sizes:
         )
     return Sizes(
         rounds=cfg.horizon // cfg.learn_every,
-        updates=cfg.replay_ratio * steps // cfg.batch_size,
+        updates=updates,
         batch=cfg.batch_size // devices,
         rows=rows,
         warm_up=-(-cfg.learning_starts // num_envs),
@@ -411,7 +430,7 @@ def fitting(cfg: Any, steps: int) -> str:
         found = sorted(choices, key=lambda n: abs(n - getattr(cfg, name)))[:1]
         return [f"{name}={n}" for n in found]
 
-    replayed, batch = cfg.replay_ratio * steps, cfg.batch_size
+    replayed, batch = round(cfg.replay_ratio * steps), cfg.batch_size
     unit = batch // math.gcd(batch, steps)
     small = [n for n in range(1, math.isqrt(replayed) + 1) if replayed % n == 0]
     rounds = [n for n in range(1, cfg.horizon + 1) if cfg.horizon % n == 0]
