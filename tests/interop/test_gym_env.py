@@ -55,7 +55,7 @@ def test_point_goal1_is_made_by_its_id_and_passes_the_checker_with_its_pictures(
 def test_every_environment_of_the_suite_has_an_id():
     ids = {key for key in gymnasium.registry if key.startswith("jaxsafe/")}
     theirs = {alias.removeprefix("Safexp-") for alias in envs.ALIASES}
-    assert ids == {f"jaxsafe/{name}" for name in {*envs.ALIASES.values(), *theirs}}
+    assert ids == {f"jaxsafe/{name}" for name in {*envs.ENVS, *theirs}}
     assert {"jaxsafe/point_goal1", "jaxsafe/PointGoal1-v0"} <= ids
     kwargs = [gymnasium.spec(f"jaxsafe/{name}").kwargs for name in ("point_goal1", "PointGoal1-v0")]
     assert kwargs == [{"env": "point_goal1"}] * 2
