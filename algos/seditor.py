@@ -10,7 +10,6 @@ import optax
 from jaxsafe.config import (
     Amount,
     Bounds,
-    Cap,
     ConfigError,
     Iterations,
     Norm,
@@ -94,7 +93,8 @@ class SEditorConfig(LagrangianConfig, PriceClockConfig, OffPolicyConfig):
     # How the values of two cost critics become one. max is cautious, as in the authors' code.
     cost_reduce: Literal["mean", "max", "one"] = "max"
     lam_init: Positive = 1.0  # The price on cost at the start, as in the authors' code.
-    lam_max: Cap = float("inf")  # The highest price. The authors have no bound.
+    # The highest price. The authors have no bound.
+    lam_max: Annotated[float, Bounds(1e-6, 1e6, inf="no bound")] = float("inf")
     dual_lr: Rate = (
         0.01  # Adam's step of l, whatever the size of the violation, as in the authors' code.
     )
@@ -411,10 +411,11 @@ PAPER: dict[str, Any] = {
 PARALLEL: dict[str, Any] = PAPER | {"num_envs": 1024, "stagger": True}
 # for a problem of two levers
 LEVER: dict[str, Any] = {
-    "num_envs": 32, "horizon": 8, "learn_every": 2, "batch_size": 256, "replay_size": 20_000,
-    "learning_starts": 256, "hidden": (32,), "discount": 0.9, "cost_discount": 0.9, "lr": 3e-3,
-    "critic_lr": 3e-3, "n_step": 3, "alpha_init": 0.1, "alpha_lr": 3e-3, "min_prob": 0.2,
-    "editor_min_prob": 0.2, "dual_every": 256, "dual_lr": 0.02,
+    "num_envs": 32, "horizon": 8, "learn_every": 2, "batch_size": 64, "replay_ratio": 2,
+    "replay_size": 20_000, "learning_starts": 256, "n_step": 3, "hidden": (32,), "discount": 0.5,
+    "cost_discount": 0.5, "lr": 1e-2, "critic_lr": 1e-2, "tau": 0.05, "alpha_init": 0.1,
+    "alpha_lr": 3e-3, "min_prob": 0.2, "editor_min_prob": 0.2, "lam_init": 0.3, "dual_lr": 0.05,
+    "dual_every": 256,
 }  # fmt: skip
 
 ROWS = {
