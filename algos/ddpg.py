@@ -8,13 +8,11 @@ import jax.numpy as jnp
 
 from jaxsafe.algos import sac, td3
 from jaxsafe.config import config
-from jaxsafe.learn.actor_critic import CostCriticConfig, actor_critic
+from jaxsafe.learn.actor_critic import ControllerConfig, MultiplierConfig, actor_critic
 from jaxsafe.learn.conventions import Convention
 from jaxsafe.learn.off_policy import off_policy
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.treatments import (
-    LagrangianConfig,
-    PIDConfig,
     Treatment,
     lagrangian,
     no_treatment,
@@ -55,32 +53,33 @@ class DDPGConfig(td3.DeterministicConfig):
 
 
 @config
-class DDPGLagConfig(LagrangianConfig, CostCriticConfig, DDPGConfig):
+class DDPGLagConfig(MultiplierConfig, DDPGConfig):
     """DDPG-Lagrangian: DDPG whose policy pays for cost at an adaptive price.
 
         y_c = c + cost_discount (1 - terminated) reduce_j Q'_cj(s', mu'(s'))
         minimise_Q    E[sum_j (Q_cj(s, a) - y_c)^2], and the loss of Q as in DDPG
-        maximise_mu   E[(Q(s, mu(s)) - lam Q_c(s, mu(s))) / (1 + lam)]
+        maximise_mu   E[(Q(s, mu(s)) / unit - lam Q_c(s, mu(s))) / (1 + lam)]
         minimise_lam  -lam (J_c - cost_limit),  lam >= 0,  by Adam, once every `dual_every` steps
 
-    J_c is what an episode has cost since lam last moved. The rest is as in DDPG.
+    J_c is what an episode has cost since lam last moved. unit is the standard deviation of what it
+    divides over the batch, or 1 with `price_unit=reward`. The rest is as in DDPG.
 
     Source: Ray, Achiam and Amodei (2019), "Benchmarking Safe Exploration in Deep Reinforcement
     Learning", for the multiplier.
     Differs from OmniSafe: there lam moves at every gradient step, so that its speed depends on
-    `replay_ratio`. There is one critic of cost, whose target takes mu(s').
+    `replay_ratio`. There is one critic of cost, whose target takes mu(s'), and unit is 1.
     """
 
 
 @config
-class DDPGPIDConfig(PIDConfig, CostCriticConfig, DDPGConfig):
+class DDPGPIDConfig(ControllerConfig, DDPGConfig):
     """DDPG-PID: DDPG whose price on cost is the output of a PID controller.
 
-        maximise_mu  E[(Q(s, mu(s)) - lam Q_c(s, mu(s))) / (1 + lam)]
+        maximise_mu  E[(Q(s, mu(s)) / unit - lam Q_c(s, mu(s))) / (1 + lam)]
         lam <- (K_p P + I + K_d D)+,   I <- (I + K_i (J_c - cost_limit))+
 
     once every `dual_every` steps. P is the smoothed J_c - cost_limit. D is what the smoothed J_c rose
-    over `pid_delay` moves, and 0 if it fell. The critics are those of DDPG-Lagrangian.
+    over `pid_delay` moves, and 0 if it fell. unit and the critics are those of DDPG-Lagrangian.
 
     Source: Stooke, Achiam and Abbeel (2020), "Responsive Safety in Reinforcement Learning by PID
     Lagrangian Methods", arXiv:2007.03964, algorithm 2, for the controller.

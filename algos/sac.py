@@ -11,7 +11,8 @@ from jaxsafe.config import Bounds, Rate, config
 from jaxsafe.learn.actor_critic import (
     Actor,
     ActorCriticConfig,
-    CostCriticConfig,
+    ControllerConfig,
+    MultiplierConfig,
     Proposal,
     actor_critic,
 )
@@ -19,8 +20,6 @@ from jaxsafe.learn.off_policy import off_policy
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.steps import adam
 from jaxsafe.learn.treatments import (
-    LagrangianConfig,
-    PIDConfig,
     Treatment,
     lagrangian,
     no_treatment,
@@ -49,42 +48,45 @@ class SACConfig(ActorCriticConfig):
     targets follow faster, the critics have layer norm, and observations are normalised.
     """
 
-    # The temperature at first, as in the authors' code.
-    alpha_init: Annotated[float, Bounds(1e-10, 1e6)] = 1.0
-    # The learning rate of log alpha, by Adam, as in the authors' code. With 0, alpha stays as it is.
-    alpha_lr: Rate = 3e-4
+    # The temperature at first, low because rewards of Safety Gym are some hundredths. The authors' code
+    # has 1.
+    alpha_init: Annotated[float, Bounds(1e-10, 1e6)] = 0.01
+    # The learning rate of log alpha, by Adam. The authors' code has 3e-4. With 0, alpha stays as it is.
+    alpha_lr: Rate = 1e-3
     # The entropy that alpha aims at, in nats for each dimension of the action, as in the paper.
     target_entropy: Annotated[float, Bounds(-100, 100)] = -1.0
 
 
 @config
-class SACLagConfig(LagrangianConfig, CostCriticConfig, SACConfig):
+class SACLagConfig(MultiplierConfig, SACConfig):
     """SAC-Lagrangian: SAC whose policy pays for cost at an adaptive price.
 
         y_c = c + cost_discount (1 - terminated) reduce_j Q'_cj(s', a'),   a' ~ pi(s'), as for y
         minimise_Q    E[sum_j (Q_cj(s, a) - y_c)^2], and the loss of Q as in SAC
-        maximise_pi   E[(min_i Q_i(s, a) - alpha log pi(a | s) - lam Q_c(s, a)) / (1 + lam)]
+        maximise_pi   E[((min_i Q_i(s, a) - alpha log pi(a | s)) / unit - lam Q_c(s, a)) / (1 + lam)]
         minimise_lam  -lam (J_c - cost_limit),  lam >= 0,  by Adam, once every `dual_every` steps
 
-    J_c is what an episode has cost since lam last moved. The rest is as in SAC.
+    J_c is what an episode has cost since lam last moved. unit is the standard deviation of what it
+    divides over the batch, or 1 with `price_unit=reward`. The rest is as in SAC.
 
     Source: Ray, Achiam and Amodei (2019), "Benchmarking Safe Exploration in Deep Reinforcement
     Learning", for the multiplier; Ha et al. (2020), "Learning to Walk in the Real World with Minimal
     Human Effort", arXiv:2002.08550, for SAC with one.
     Differs from OmniSafe: there lam moves at every gradient step, so that its speed depends on
-    `replay_ratio`. There is one critic of cost, and its target takes the policy's mean action.
+    `replay_ratio`. There is one critic of cost, whose target takes the policy's mean
+    action, and unit is 1.
     """
 
 
 @config
-class SACPIDConfig(PIDConfig, CostCriticConfig, SACConfig):
+class SACPIDConfig(ControllerConfig, SACConfig):
     """SAC-PID: SAC whose price on cost is the output of a PID controller.
 
-        maximise_pi  E[(min_i Q_i(s, a) - alpha log pi(a | s) - lam Q_c(s, a)) / (1 + lam)]
+        maximise_pi  E[((min_i Q_i(s, a) - alpha log pi(a | s)) / unit - lam Q_c(s, a)) / (1 + lam)]
         lam <- (K_p P + I + K_d D)+,   I <- (I + K_i (J_c - cost_limit))+
 
     once every `dual_every` steps. P is the smoothed J_c - cost_limit. D is what the smoothed J_c rose
-    over `pid_delay` moves, and 0 if it fell. The critics are those of SAC-Lagrangian.
+    over `pid_delay` moves, and 0 if it fell. unit and the critics are those of SAC-Lagrangian.
 
     Source: Stooke, Achiam and Abbeel (2020), "Responsive Safety in Reinforcement Learning by PID
     Lagrangian Methods", arXiv:2007.03964, algorithm 2, for the controller.
@@ -160,11 +162,14 @@ NAVIGATION: dict[str, Any] = OMNISAFE | {"alpha_init": 1e-5, "lr": 5e-6, "critic
 # the published replay ratio with 64 environments: 4 gradient steps for each of their steps
 PARALLEL: dict[str, Any] = {"num_envs": 64, "replay_ratio": 256, "batch_size": 4096, "tau": 0.005}
 # A price that OmniSafe moves at every step by 1e-5 moves by 0.2 in 20,000 steps; likewise the others.
-LAG: dict[str, Any] = {"dual_starts": 200_000, "dual_lr": 0.2, "cost_normalize": True}
-LAG_NAVIGATION: dict[str, Any] = {"dual_starts": 200_000, "dual_lr": 0.01, "lam_init": 0.0}
+LAG: dict[str, Any] = {
+    "dual_starts": 200_000, "dual_lr": 0.2, "cost_reduce": "one", "price_unit": "reward",
+    "cost_normalize": True,
+}  # fmt: skip
+LAG_NAVIGATION: dict[str, Any] = LAG | {"dual_lr": 0.01, "lam_init": 0.0, "cost_normalize": False}
 PID: dict[str, Any] = {
     "dual_starts": 200_000, "pid_kp": 1e-6, "pid_ki": 2e-3, "pid_kd": 1e-7, "lr": 1e-4,
-    "cost_normalize": True,
+    "cost_reduce": "one", "price_unit": "reward", "cost_normalize": True,
 }  # fmt: skip
 PID_NAVIGATION: dict[str, Any] = PID | {
     "pid_kp": 5e-7, "pid_ki": 2e-4, "pid_kd": 1e-8, "lr": 5e-6, "cost_normalize": False,

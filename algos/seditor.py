@@ -71,14 +71,15 @@ class SEditorConfig(LagrangianConfig, PriceClockConfig, OffPolicyConfig):
 
     Source: Yu, Xu and Zhang (2022), "Towards Safe Reinforcement Learning with a Safety Editor Policy",
     arXiv:2201.12427; networks, returns and schedules are from the authors' code.
-    Differs from it: the defaults are for a thousand environments. Observations are normalised, critics
-    have layer norm, and targets follow faster. `preset=published` has the authors' settings.
+    Differs from it: the defaults are for a thousand environments. Batches are smaller, observations are
+    normalised, and critics have layer norm. `preset=published` has the authors' settings.
     """
 
     # Rows replayed for each environment step. The authors have 51.2.
     replay_ratio: Amount | Annotated[float, Bounds(1e-6, 1e6)] = 16
-    # Rows of a gradient step, of all devices together: 1,024 sequences of 8, as the authors have.
-    batch_size: Amount = 8192
+    # Rows of a gradient step, of all devices together: 256 sequences of 8. The authors have 1,024. With
+    # 16 rows replayed for each environment step, there are about as many gradient steps as theirs.
+    batch_size: Amount = 2048
     # Steps of a replayed sequence. It has a row more: 8, as the authors have.
     n_step: Iterations = 7
     # How far TD(lambda) returns reach: 0 is one step. The authors have 0.95.
@@ -100,8 +101,8 @@ class SEditorConfig(LagrangianConfig, PriceClockConfig, OffPolicyConfig):
     )
     # Environment steps between two moves of the price. The authors have 160.
     dual_every: Annotated[int, Bounds(1, 2**30)] = 1000
-    # The share of the critics that their targets take on at each step. The authors have 0.005.
-    tau: Share = 0.02
+    # The share of the critics that their targets take on at each step, as in the authors' code.
+    tau: Share = 0.005
     alpha_init: Positive = 1.0  # Both temperatures at first, as in the authors' code.
     alpha_lr: Rate = 3e-4  # The learning rate of log alpha, by Adam, as in the authors' code.
     # The proposals' target entropy is that of a uniform density this high, in each dimension, as in
@@ -400,10 +401,10 @@ PAPER: dict[str, Any] = {
     "learn_every": 5,
     "stagger": False,
     "replay_ratio": 51.2,
+    "batch_size": 8192,
     "replay_size": 1_600_000,
     "layer_norm": False,
     "obs_normalize": False,
-    "tau": 0.005,
     "max_grad_norm": float("inf"),
     "dual_every": 160,
 }

@@ -16,7 +16,8 @@ from jaxsafe.config import Bounds, Iterations, config
 from jaxsafe.learn.actor_critic import (
     Actor,
     ActorCriticConfig,
-    CostCriticConfig,
+    ControllerConfig,
+    MultiplierConfig,
     Proposal,
     actor_critic,
 )
@@ -24,8 +25,6 @@ from jaxsafe.learn.off_policy import off_policy
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.steps import adam
 from jaxsafe.learn.treatments import (
-    LagrangianConfig,
-    PIDConfig,
     Treatment,
     lagrangian,
     no_treatment,
@@ -75,32 +74,34 @@ class TD3Config(DeterministicConfig):
 
 
 @config
-class TD3LagConfig(LagrangianConfig, CostCriticConfig, TD3Config):
+class TD3LagConfig(MultiplierConfig, TD3Config):
     """TD3-Lagrangian: TD3 whose policy pays for cost at an adaptive price.
 
         y_c = c + cost_discount (1 - terminated) reduce_j Q'_cj(s', a'),   a' as for y
         minimise_Q    E[sum_j (Q_cj(s, a) - y_c)^2], and the loss of Q as in TD3
-        maximise_mu   E[(Q_1(s, mu(s)) - lam Q_c(s, mu(s))) / (1 + lam)]
+        maximise_mu   E[(Q_1(s, mu(s)) / unit - lam Q_c(s, mu(s))) / (1 + lam)]
         minimise_lam  -lam (J_c - cost_limit),  lam >= 0,  by Adam, once every `dual_every` steps
 
-    J_c is what an episode has cost since lam last moved. The rest is as in TD3.
+    J_c is what an episode has cost since lam last moved. unit is the standard deviation of what it
+    divides over the batch, or 1 with `price_unit=reward`. The rest is as in TD3.
 
     Source: Ray, Achiam and Amodei (2019), "Benchmarking Safe Exploration in Deep Reinforcement
     Learning", for the multiplier.
     Differs from OmniSafe: there lam moves at every gradient step, so that its speed depends on
-    `replay_ratio`. There is one critic of cost, whose target takes mu(s') without noise.
+    `replay_ratio`. There is one critic of cost, whose target takes mu(s') without noise,
+    and unit is 1.
     """
 
 
 @config
-class TD3PIDConfig(PIDConfig, CostCriticConfig, TD3Config):
+class TD3PIDConfig(ControllerConfig, TD3Config):
     """TD3-PID: TD3 whose price on cost is the output of a PID controller.
 
-        maximise_mu  E[(Q_1(s, mu(s)) - lam Q_c(s, mu(s))) / (1 + lam)]
+        maximise_mu  E[(Q_1(s, mu(s)) / unit - lam Q_c(s, mu(s))) / (1 + lam)]
         lam <- (K_p P + I + K_d D)+,   I <- (I + K_i (J_c - cost_limit))+
 
     once every `dual_every` steps. P is the smoothed J_c - cost_limit. D is what the smoothed J_c rose
-    over `pid_delay` moves, and 0 if it fell. The critics are those of TD3-Lagrangian.
+    over `pid_delay` moves, and 0 if it fell. unit and the critics are those of TD3-Lagrangian.
 
     Source: Stooke, Achiam and Abbeel (2020), "Responsive Safety in Reinforcement Learning by PID
     Lagrangian Methods", arXiv:2007.03964, algorithm 2, for the controller.

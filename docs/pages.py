@@ -182,9 +182,8 @@ What differs:
 With random actions Ant's velocity is 0.001 m/s away from that of the last stage in the median, and 0.1
 m/s at most. There is no option for the last stage.
 
-Five tasks take Runge and Kutta's fourth order, HalfCheetah Euler's integrator. Engine `warp` runs the
-five on MuJoCo Warp's kernels with our solver, and one line says so. Engine `jax` takes longest to
-compile for Humanoid, of which 128 pairs of geoms can meet.
+Five tasks take Runge and Kutta's fourth order, HalfCheetah Euler's integrator. Engine `jax` takes
+longest to compile for Humanoid, of which 128 pairs of geoms can meet.
 """
 COSTS = {
     "hazards": "inside a hazard (blue disc)",

@@ -26,7 +26,7 @@ from jaxsafe.envs.registry import IMPLIED
 from jaxsafe.envs.safety_gym import suite
 from jaxsafe.envs.safety_gym.config import config_from_plain as read_config
 from jaxsafe.envs.safety_gym.config import defaults
-from jaxsafe.learn.off_policy import OffPolicyConfig
+from jaxsafe.learn.off_policy import OffPolicyConfig, PriceClockConfig
 from jaxsafe.learn.offline import OfflineConfig
 from jaxsafe.learn.row import Row
 from jaxsafe.run.settings import OFFLINE_UPDATES, TrainConfig, algo_options, as_text
@@ -351,7 +351,7 @@ def temperature(on: Any, facts: Facts) -> dict[str, Any]:
 
 
 HORIZON = 50  # steps of an update of the preset
-DUAL_EVERY = 20_000  # the default of `algo.dual_every`
+DUAL_EVERY = PriceClockConfig.dual_every
 SIZES = "num_envs algo.batch_size algo.replay_size algo.replay_ratio"
 ROUNDS = "algo.learn_every algo.horizon algo.replay_ratio"
 OFF_POLICY: dict[str, Rule] = OMNISAFE | {  # of its off-policy algorithms; what differs

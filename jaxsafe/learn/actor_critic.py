@@ -3,13 +3,14 @@
     y_r = r + discount^n (1 - terminated) (min_i Q'_i(s', a') + bonus'),    a' the method's next action
     y_c = c + cost_discount^n (1 - terminated) reduce_j Q'_cj(s', a')
     minimise_Q   E[sum_i (Q_i(s, a) - y_r)^2 + sum_j (Q_cj(s, a) - y_c)^2]
-    maximise_pi  E[(Q_r - lam Q_c) / (1 + lam)],   Q_r = pick_i Q_i(s, a) + bonus,
-                                                   Q_c = reduce_j Q_cj(s, a),   a from pi(s)
+    maximise_pi  E[(Q_r / unit - lam Q_c) / (1 + lam)],   Q_r = pick_i Q_i(s, a) + bonus,
+                                                          Q_c = reduce_j Q_cj(s, a),   a from pi(s)
     Q' <- Q' + tau (Q - Q')
 
 The methods differ in a', in what is picked and in the bonus, which is an entropy or 0: see `Actor`. How
-Q_r and Q_c are mixed is the treatment's: (Q_r - lam Q_c) / (1 + lam) is a Lagrangian's. A limit is on
-the undiscounted cost of an episode; Q_c, which is discounted, only gives the direction.
+Q_r and Q_c are mixed is the treatment's: (Q_r / unit - lam Q_c) / (1 + lam) is a Lagrangian's. The unit
+is the standard deviation of Q_r over the batch, or 1: see `price_unit`. A limit is on the undiscounted
+cost of an episode; Q_c, which is discounted, only gives the direction.
 """
 
 from collections.abc import Callable
@@ -19,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from jaxsafe.config import Iterations, config
+from jaxsafe.config import Iterations, Rate, Weight, config
 from jaxsafe.learn.batch import pmean, select
 from jaxsafe.learn.constraints import Names, each, metrics_by_constraint, signal
 from jaxsafe.learn.conventions import Convention
@@ -29,7 +30,7 @@ from jaxsafe.learn.off_policy import OffPolicyConfig, PriceClockConfig
 from jaxsafe.learn.replay import Transitions
 from jaxsafe.learn.sequences import averaged, no_moments, standard
 from jaxsafe.learn.steps import Trainable, adam
-from jaxsafe.learn.treatments import Treatment, no_treatment
+from jaxsafe.learn.treatments import LagrangianConfig, PIDConfig, Treatment, no_treatment
 from jaxsafe.nn.critics import init_critics, q_values
 from jaxsafe.types import Env, Metrics, PyTree
 
@@ -49,6 +50,11 @@ class CostCriticConfig(PriceClockConfig):
     CONVENTIONS: ClassVar = (
         Convention({"cost_reduce": "one"}, "there is one critic of cost", "there are two"),
         Convention(
+            {"price_unit": "reward"},
+            "a price of 1 weighs one unit of cost as one of reward",
+            "it weighs one unit of cost as a standard deviation of Q_r",
+        ),
+        Convention(
             {"cost_action": "mean"},
             "targets of cost take the policy's mean action, without noise",
             "targets of cost take the same next action as those of reward",
@@ -60,9 +66,14 @@ class CostCriticConfig(PriceClockConfig):
         ),
     )
 
-    # How the values of two cost critics become one. max is cautious: it takes estimates that are too
-    # high. one: a single critic, as in OmniSafe.
-    cost_reduce: Literal["mean", "max", "one"] = "mean"
+    # How the values of two cost critics become one. max is cautious: its estimates are too high. With
+    # mean the policy finds actions whose cost is estimated too low, below 0 even, and on point_goal1 it
+    # then stops learning. one: a single critic, as in OmniSafe.
+    cost_reduce: Literal["mean", "max", "one"] = "max"
+    # What a price of 1 on one unit of cost weighs as much as. deviation: the standard deviation of Q_r
+    # over the batch, so that one step of the price suits rewards of any size. reward: one unit of
+    # reward, as in OmniSafe.
+    price_unit: Literal["deviation", "reward"] = "deviation"
     # The next action in the targets of cost. next: that of reward's. mean: the policy's mean action, as
     # in OmniSafe.
     cost_action: Literal["next", "mean"] = "next"
@@ -71,6 +82,25 @@ class CostCriticConfig(PriceClockConfig):
     cost_normalize: bool = False
     # Whether `cost_normalize` also takes the mean from costs. OmniSafe's does.
     cost_centre: bool = False
+
+
+@config
+class MultiplierConfig(LagrangianConfig, CostCriticConfig):
+    """For `lagrangian`."""
+
+    # Adam's step of the price, whatever the size of the violation. A policy answers a price only after
+    # some hundred thousand steps: on point_goal1 a step of 0.03 ends in policies that stand still.
+    dual_lr: Rate = 0.01
+
+
+@config
+class ControllerConfig(PIDConfig, CostCriticConfig):
+    """For `pid`."""
+
+    pid_kp: Weight = 0.004  # Price for each unit of the smoothed violation.
+    # Price that each unit of violation adds a move. 25 units add as much as the multiplier's step.
+    pid_ki: Weight = 4e-4
+    pid_kd: Weight = 0.004  # Price for each unit that the smoothed cost rose.
 
 
 class Proposal(NamedTuple):
@@ -189,6 +219,14 @@ def actor_critic(env: Env, actor: Actor, treatment: Treatment) -> Learner:
         adam_c = adam(cfg.critic_lr * share, cfg)
         critics, critic_states = moved(critics, grads, dict.fromkeys(critics, adam_c))
 
+        def unit(worth: jax.Array) -> jax.Array:
+            """What a price of 1 on one unit of cost is worth, float []."""
+            if cfg.price_unit == "reward":
+                return jnp.ones(())
+            centre = pmean(mean(worth), axis_name)
+            variance = pmean(mean((worth - centre) ** 2), axis_name)
+            return jax.lax.stop_gradient(jnp.sqrt(variance + 1e-12))
+
         # policy
         def policy_loss(own: dict[str, PyTree]) -> tuple[jax.Array, Metrics]:
             proposal = actor.propose(own, batch.obs, key, cfg)
@@ -196,7 +234,7 @@ def actor_critic(env: Env, actor: Actor, treatment: Treatment) -> Learner:
             worth = q_r + proposal.bonus
             if constrained:
                 q_c = reduced_costs(critics["critic_c"], batch.obs, proposal.action, names(cfg), cfg)
-                worth = treatment.advantage(at.dual, worth, q_c)
+                worth = treatment.advantage(at.dual, worth / unit(worth), q_c)
             loss = -mean(worth)
             metrics = {"train/actor_loss": loss, **jax.tree.map(mean, proposal.metrics)}
             return loss + mean(proposal.extra), metrics

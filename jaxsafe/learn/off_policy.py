@@ -18,7 +18,6 @@ from typing import Annotated, Any, Literal, NamedTuple
 import flax.struct
 import jax
 import jax.numpy as jnp
-import optax
 
 from jaxsafe.config import (
     Amount,
@@ -82,7 +81,7 @@ class OffPolicyConfig:
     replay_size: Annotated[int, Bounds(1, 2**31 - 1)] = 1_000_000
     replay_ratio: Amount = 16  # Transitions replayed for each environment step. OmniSafe has 256.
     # Transitions of a gradient step, of all devices together. OmniSafe has 256.
-    batch_size: Amount = 4096
+    batch_size: Amount = 1024
     # Environment steps with random actions and without learning, as in OmniSafe.
     learning_starts: Annotated[int, Bounds(0, 2**31 - 1)] = 10_000
     n_step: Iterations = 1  # Rewards summed before the critics' value. OmniSafe has 1.
@@ -100,7 +99,7 @@ class OffPolicyConfig:
     # The undiscounted cost that an episode may have. Unconstrained algorithms only draw it in plots.
     cost_limit: Weight = 25.0
     # The share of the critics that their targets take on at each step. OmniSafe has 0.005.
-    tau: Share = 0.05
+    tau: Share = 0.01
     lr: Rate = 3e-4  # The policy's learning rate, by Adam, as in OmniSafe.
     critic_lr: Rate = 3e-4  # The critics' learning rate, by Adam, as in OmniSafe.
     # Whether both learning rates fall linearly to 0 at `total_iterations`. OmniSafe keeps them.
@@ -219,7 +218,7 @@ def off_policy(
                 batch, dropped = replayed(draw_key, *source, cfg, axis_name)
                 at = GradientStep(count, remaining(iteration, cfg), step_key, ts.dual)
                 new, metrics = learner.step(nets, batch, at, cfg, axis_name)
-                finite = psum(~jnp.isfinite(optax.tree.norm(new)), axis_name) == 0
+                finite = psum(~all_finite(new), axis_name) == 0
                 lost = {"train/nonfinite": dropped + ~finite}
                 return select(finite, new, nets), jax.tree.map(jnp.float32, metrics | lost)
 

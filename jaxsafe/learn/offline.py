@@ -276,7 +276,7 @@ def offline(
             first_obs = first_obs_at(data, first_key, cfg, ts.normaliser)
             at = GradientStep(count, remaining(iteration, cfg), step_key, now.dual, first_obs)
             nets, metrics = learner.step(now.nets, batch, at, cfg, None)
-            finite = jnp.isfinite(optax.tree.norm(nets))
+            finite = all_finite(nets)
             dual = now.dual
             if priced:
                 moved = treatment.update(dual, metrics["train/cost_estimate"], cfg, iteration)

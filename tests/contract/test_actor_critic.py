@@ -45,6 +45,7 @@ class ByHand:
     alpha: float
     lam: float | None
     reduce: str
+    price_unit: str
     omnisafe: bool = False
     discount: float = 0.9
     cost_discount: float = 0.8
@@ -93,14 +94,23 @@ class ByHand:
         y = cost + self.cost_discount**b.steps * (1 - b.terminated) * v
         return (b.weight * (self.q(critics, b.obs, b.action) - y) ** 2).sum()
 
-    def actor_loss(self, actor, critic_r, critic_c):
-        obs = self.batch.obs
-        action, bonus = self.pi(actor, obs, self.noise[1])
-        q = self.q(critic_r, obs, action)
-        worth = (q.min(0) if self.method == "sac" else q[0]) + bonus
+    def q_r(self, actor, critic_r):
+        action, bonus = self.pi(actor, self.batch.obs, self.noise[1])
+        q = self.q(critic_r, self.batch.obs, action)
+        return (q.min(0) if self.method == "sac" else q[0]) + bonus
+
+    def unit(self, actor, critic_r):
+        """The standard deviation of Q_r, or 1. It has no gradient."""
+        weight, q_r = self.batch.weight, self.q_r(actor, critic_r)
+        deviation = np.sqrt((weight * (q_r - (weight * q_r).sum()) ** 2).sum())
+        return deviation if self.price_unit == "deviation" else 1.0
+
+    def actor_loss(self, actor, critic_r, critic_c, unit):
+        worth = self.q_r(actor, critic_r)
         if self.lam is not None:
-            q_c = self.reduced(self.q(critic_c, obs, action))
-            worth = (worth - self.lam * q_c) / (1 + self.lam)
+            action, _ = self.pi(actor, self.batch.obs, self.noise[1])
+            q_c = self.reduced(self.q(critic_c, self.batch.obs, action))
+            worth = (worth / unit - self.lam * q_c) / (1 + self.lam)
         return -(self.batch.weight * worth).sum()
 
 
@@ -160,21 +170,25 @@ def drawn_batch() -> Transitions:
 
 
 @pytest.mark.parametrize(
-    "method, lam, reduce, omnisafe",
-    [("sac", None, "", False), ("sac", 0.7, "mean", False), ("td3", None, "", False),
-     ("td3", 1.5, "max", False), ("ddpg", None, "", False), ("ddpg", 0.3, "one", False),
-     ("sac", 0.7, "one", True), ("ddpg", 0.3, "one", True)],
+    "method, lam, reduce, price_unit, omnisafe",
+    [("sac", None, "", "", False), ("sac", 0.7, "mean", "deviation", False),
+     ("td3", None, "", "", False), ("td3", 1.5, "max", "deviation", False),
+     ("ddpg", None, "", "", False), ("ddpg", 0.3, "one", "reward", False),
+     ("sac", 0.7, "one", "reward", True), ("ddpg", 0.3, "one", "reward", True)],
 )  # fmt: skip
-def test_two_gradient_steps_are_those_of_the_paper_or_of_omnisafe(method, lam, reduce, omnisafe):
+def test_two_gradient_steps_are_those_of_the_paper_or_of_omnisafe(
+    method, lam, reduce, price_unit, omnisafe
+):
     row = method if lam is None else f"{method}_lag"
     settings: dict[str, Any] = {"hidden": (), "layer_norm": False, "lr": 0.01, "critic_lr": 0.02,
                                 "tau": 0.1, "discount": 0.9, "cost_discount": 0.8,
                                 "policy_delay": 1}  # fmt: skip
     settings |= {"alpha_init": 0.3, "alpha_lr": 0.03} if method == "sac" else {}
-    settings |= {"cost_reduce": reduce} if reduce else {}
+    settings |= {"cost_reduce": reduce, "price_unit": price_unit} if reduce else {}
     if omnisafe:
-        settings |= compat.overrides("omnisafe", ALGOS[row].config) | {"cost_normalize": True}
-        assert settings["cost_reduce"] == reduce
+        conventions = compat.overrides("omnisafe", ALGOS[row].config)
+        assert conventions.items() >= {"cost_reduce": reduce, "price_unit": price_unit}.items()
+        settings |= conventions | {"cost_normalize": True}
     cfg = jax.tree.map(jnp.float32, ALGOS[row].config(**settings))
     learner = actor_critic(Lever(), ACTORS[method](2), no_treatment if lam is None else lagrangian)
     nets = jax.jit(lambda key: learner.init(key, 3, 2, cfg))(jax.random.key(0))
@@ -193,7 +207,8 @@ def test_two_gradient_steps_are_those_of_the_paper_or_of_omnisafe(method, lam, r
     for count in (1, 2):
         key = jax.random.key(count)
         noise = [np.float64(jax.random.normal(k, (5, 2))) for k in jax.random.split(key)]
-        p = ByHand(method, dict(hand), batch, noise, np.exp(log_alpha["a"]), lam, reduce, omnisafe)
+        given = dict(hand), batch, noise, np.exp(log_alpha["a"])
+        p = ByHand(method, *given, lam, reduce, price_unit, omnisafe)
         critic_loss = p.error_r(hand["critic_r"])
         grads = {"critic_r": numerical(p.error_r, hand["critic_r"])}
         if lam is not None:
@@ -202,7 +217,8 @@ def test_two_gradient_steps_are_those_of_the_paper_or_of_omnisafe(method, lam, r
         for name, gradient in grads.items():
             hand[name] = adams[name].step(hand[name], gradient)
         critics = hand["critic_r"], hand.get("critic_c")
-        gradient = numerical(lambda a, p=p, c=critics: p.actor_loss(a, *c), hand["actor"])
+        unit = p.unit(hand["actor"], critics[0])
+        gradient = numerical(lambda a, p=p, c=critics, u=unit: p.actor_loss(a, *c, u), hand["actor"])
         log_prob = p.pi(hand["actor"], batch.obs, noise[1])[1] / -p.alpha
         hand["actor"] = adams["actor"].step(hand["actor"], gradient)
         if method == "sac":  # H = -1 for each of two actions

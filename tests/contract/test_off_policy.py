@@ -416,3 +416,19 @@ def test_one_seed_over_two_devices_learns_alike_and_two_seeds_are_the_lone_ones(
     assert out.stdout.splitlines() == [
         f"{n} {what} ok" for n in QUICK for what in ("one seed", "two seeds")
     ]
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_learning_goes_on_after_any_number_of_gradient_steps(name):
+    """The optimisers count them in 32 bits, whose square has no room from 46,341 on."""
+    ts = start(name)
+    opt_state = jax.tree.map(lambda x: x + 10**6 if x.dtype == jnp.int32 else x, ts.opt_state)
+    assert any(x.dtype == jnp.int32 for x in jax.tree.leaves(opt_state))
+    ts = dataclasses.replace(ts, opt_state=opt_state)
+    _, update = build(name)
+    for iteration in range(3):
+        before = copy(ts.params)
+        ts, metrics = update(ts, at(iteration))
+    assert metrics["train/nonfinite"] == 0
+    moved = jax.tree.map(lambda a, b: bool((a != b).any()), before, ts.params)
+    assert all(jax.tree.leaves(moved))

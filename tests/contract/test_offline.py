@@ -126,6 +126,17 @@ def test_the_data_set_is_one_of_the_environment(name):
             algo.clocks(ALGOS[name].config(**{wrong: 0}))
 
 
+def test_learning_goes_on_after_any_number_of_gradient_steps():
+    """The optimisers count them in 32 bits, whose square has no room from 46,341 on."""
+    algo, ts = start("bc_safe")
+    late = jax.tree.map(lambda x: x + 10**6 if x.dtype == jnp.int32 else x, ts.opt_state)
+    ts = ts.replace(opt_state=late)
+    after, metrics = jax.jit(algo.update, compiler_options=FAST)(ts, shared())
+    assert metrics["train/nonfinite"] == 0
+    pairs = zip(jax.tree.leaves(ts.params), jax.tree.leaves(after.params), strict=True)
+    assert all((a != b).any() for a, b in pairs)
+
+
 @pytest.mark.parametrize("name", COMPILED)
 def test_observations_are_normalised_by_the_data(name):
     _, ts = start(name)

@@ -160,7 +160,7 @@ def test_a_model_that_our_kernels_are_not_for_runs_on_mujoco_warps_and_one_line_
         physics, _ = step(physics, jnp.ones(1))
     said = [line for line in capfd.readouterr().err.splitlines() if "engine warp" in line]
     assert said == [
-        "engine warp: MuJoCo Warp's own kernels run this model (an integrator other than Euler)"
+        "engine warp: MuJoCo Warp's own kernels run this model (an integrator other than Euler and RK4)"
     ]
     model = mujoco.MjModel.from_xml_string(xml)
     data = mujoco.MjData(model)

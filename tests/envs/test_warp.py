@@ -14,6 +14,7 @@ from tasks import task
 from jaxsafe import envs
 from jaxsafe.config import ConfigError
 from jaxsafe.envs.safety_gym import scene, sleeping, suite
+from jaxsafe.envs.velocity.config import ROBOTS
 
 
 def errors(name: str, steps: int = 4, **options) -> dict[str, float]:
@@ -227,18 +228,24 @@ def test_the_dynamics_are_mujocos(name, lanes):
             getattr(ours, k).assign(getattr(theirs, k).numpy().copy())
         ours.efc.Ma.assign(theirs.efc.Ma.numpy().copy())
         euler(m, theirs)
-        dynamics.advance(m, ours)
+        dynamics.advance(m, ours, *ours.dynamics.stages)
         for k in ("qpos", "qvel", "qacc_warmstart", "time"):
             a, b = getattr(ours, k).numpy(), getattr(theirs, k).numpy()
             assert np.abs(a - b).max() < 2e-6 * np.abs(b).max(), k
 
 
 def test_the_dynamics_are_for_every_task():
+    from mujoco.mjx.third_party import mujoco_warp
+
     from jaxsafe.envs.engines.warp import dynamics
 
     for name in (f"{robot}_{kind}2" for robot in suite.ROBOTS for kind in ("goal", "button", "push")):
         model, m, ours, _ = simulated(name, 1)
         assert dynamics.adopt(model, m, ours), name
+    for robot in ROBOTS:
+        model = envs.make(f"{robot}_velocity", engine="warp").model
+        m, d = mujoco_warp.put_model(model), mujoco_warp.make_data(model)
+        assert not dynamics.uncovered(model, m, d), robot
 
 
 ARM = """
@@ -311,11 +318,35 @@ def test_the_dynamics_go_where_c_goes(where, what):
     np.testing.assert_allclose(d.sensordata.numpy()[1], c.sensordata, atol=2e-3)
 
 
+LOOSE = (
+    '<body pos="3 0 1"><freejoint/><geom type="ellipsoid" size=".1 .2 .3" pos=".1 0 0"/>'
+    '<body pos=".5 0 0"><joint type="ball" damping=".1"/><geom type="box" size=".2 .1 .05"/></body>'
+    "</body>"
+)
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "RK4"])
+def test_integrators_and_fluids_go_where_c_goes(integrator):
+    """In a wind that turns boxes, with free, ball and hinge joints and a damper."""
+    fluid = f'integrator="{integrator}" density="30" viscosity="0.5" wind="3 1 .5"'
+    xml = ARM.replace('timestep="0.01"', f'timestep="0.01" {fluid}')
+    xml = xml.replace("</worldbody>", f"{LOOSE}</worldbody>").replace("<actuator/>", "")
+    adopted, d, c = beside_c(xml)
+    assert adopted
+    still = beside_c(xml.replace('density="30" viscosity="0.5"', ""))[2]
+    assert np.abs(still.qvel - c.qvel).max() > 0.2
+    np.testing.assert_allclose(d.qpos.numpy()[1], c.qpos, atol=1e-5)
+    np.testing.assert_allclose(d.qvel.numpy()[1], c.qvel, atol=1e-4)
+
+
 @pytest.mark.parametrize(
     "change",
     [
         ('timestep="0.01"', 'timestep="0.01" integrator="implicitfast"'),
-        ('timestep="0.01"', 'timestep="0.01" density="1000"'),
+        (
+            'timestep="0.01"/>',
+            'timestep="0.01" density="9"/><default><geom fluidshape="ellipsoid"/></default>',
+        ),
         ('<body name="upper"', '<body name="upper" gravcomp="1"'),
         ('<joint name="b" axis="0 1 0"/>', '<joint name="b" type="ball" stiffness="1"/>'),
         ("<actuator/>", '<actuator><muscle joint="a" lengthrange="0 1"/></actuator>'),

@@ -1,7 +1,7 @@
 // All that a state says before contacts: poses, inertia, velocities, forces without constraints. The
-// body of a function in dynamics.py; BODIES, JOINTS, DOFS, ACTUATORS, LANES, WORLDS (of a block)
-// and SHARED are constants there, p, for_sensors, block and thread its arguments. LANES threads share a
-// world.
+// body of a function in dynamics.py; BODIES, JOINTS, DOFS, ACTUATORS, FLUID, LANES, WORLDS (of a
+// block) and SHARED are constants there, p, for_sensors, block and thread its arguments. LANES threads
+// share a world.
 
 #if defined(__CUDA_ARCH__)
 __shared__ float memory[WORLDS][SHARED];
@@ -241,6 +241,37 @@ for (int a = lane; a < ACTUATORS; a += LANES) {
 }
 sync();
 
+// what a fluid does to a body whose box of the same inertia moves through it
+auto drag = [&](int b, const Motion& rate) {
+    const float mass = p.body_mass.data[b];
+    if (mass < 1e-15f) return Motion{};
+    const Quat q = times(quat(turn + 4 * b), quat((float*)p.body_iquat.data + 4 * b));
+    const Quat back{q.w, -q.x, -q.y, -q.z};
+    const wp::vec3 arm = centre(b) - vec(at(p.subtree_com) + 3 * p.body_rootid.data[b]);
+    const wp::vec3 through = rate.move + wp::cross(rate.turn, arm) - vec((float*)p.wind.data);
+    const wp::vec3 spin = rotate(rate.turn, back), speed = rotate(through, back);
+    const float* own = (float*)p.body_inertia.data + 3 * b;
+    const float density = p.density.data[0], viscosity = p.viscosity.data[0];
+    float side[3], fourth[3], mean = 0.0f;
+    for (int k = 0; k < 3; ++k) {
+        const float others = own[(k + 1) % 3] + own[(k + 2) % 3] - own[k];
+        side[k] = wp::sqrt(wp::max(1e-15f, others) / mass * 6.0f);
+        fourth[k] = side[k] * side[k] * side[k] * side[k];
+        mean += side[k] / 3.0f;
+    }
+    constexpr float PI = 3.14159265358979f;
+    float torque[3], force[3];
+    for (int k = 0; k < 3; ++k) {
+        const int i = (k + 1) % 3, j = (k + 2) % 3;
+        torque[k] = -PI * mean * mean * mean * viscosity * spin[k]
+            - density * side[k] * (fourth[i] + fourth[j]) * wp::abs(spin[k]) * spin[k] / 64.0f;
+        force[k] = -3.0f * PI * mean * viscosity * speed[k]
+            - 0.5f * density * side[i] * side[j] * wp::abs(speed[k]) * speed[k];
+    }
+    const wp::vec3 push = rotate(vec(force), q);
+    return Motion{rotate(vec(torque), q) + wp::cross(arm, push), push};
+};
+
 // what motion as it is takes: Newton and Euler's equations of each body
 for (int b = 1 + lane; b < BODIES; b += LANES) {
     const Motion rate = velocity(p.body_deepest.data[b]);
@@ -251,6 +282,7 @@ for (int b = 1 + lane; b < BODIES; b += LANES) {
     Motion force = momentum(inert + 10 * b, acceleration);
     force.turn += wp::cross(rate.turn, along.turn) + wp::cross(rate.move, along.move);
     force.move += wp::cross(rate.turn, along.move);
+    if (FLUID) add(force, -1.0f, drag(b, rate));
     put_motion(load + 6 * b, force);
     put_motion(at(p.cvel) + 6 * b, rate);
     if (for_sensors)

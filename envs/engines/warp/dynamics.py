@@ -1,4 +1,4 @@
-"""A physics step of engine `warp` in a dozen kernels, dynamics and Euler's step in one each.
+"""A physics step of engine `warp` in a dozen kernels: one for the dynamics, one to integrate.
 
 MuJoCo Warp takes some 50 kernels of a few microseconds each to get from positions and velocities to the
 forces without constraints, for robots of 4 to 30 bodies. Here that is one kernel, in which 8, 16 or 32
@@ -8,9 +8,9 @@ too. The solver is `solver.py`.
 
 Of `Data` only what later kernels and this project read is written: no `qacc_smooth`, no parts of
 `qfrc_smooth`, no inertial frames, cameras, lights or energy. A pass whose sensors read more is MuJoCo
-Warp's. Forces are those of gravity, springs, dampers and actuators: `xfrc_applied` and `qfrc_applied`
-count nothing. The rates of axes in equalities are those of the state, as in MuJoCo; MuJoCo Warp's are
-of the state before.
+Warp's. Forces are those of gravity, springs, dampers, actuators and fluids: `xfrc_applied` and
+`qfrc_applied` count nothing. A fluid sees a body as the box of its inertia, never as ellipsoids. The
+rates of axes in equalities are those of the state, as in MuJoCo; MuJoCo Warp's are of the state before.
 
 Source: MuJoCo's documentation, Computation; Featherstone (2008), Rigid Body Dynamics Algorithms.
 """
@@ -34,6 +34,7 @@ from mujoco.mjx.third_party.mujoco_warp._src import collision_driver, sensor, sm
 from jaxsafe.envs.engines.warp import pillars, solver
 from jaxsafe.envs.engines.warp.solver import THREADS, threads
 
+EULER, RK4 = types.IntegratorType.EULER, types.IntegratorType.RK4
 SHARED_MEMORY = 47 * 1024  # bytes of a block; Warp takes one more KiB
 vec10 = types.vec10
 HERE = Path(__file__)
@@ -114,6 +115,9 @@ class System:
     actuator_forcerange: wp.array2d[wp.vec2]
     gravity: wp.array[wp.vec3]
     timestep: wp.array[float]
+    density: wp.array[float]
+    viscosity: wp.array[float]
+    wind: wp.array[wp.vec3]
     # the worlds
     qpos: wp.array2d[float]
     qvel: wp.array2d[float]
@@ -138,6 +142,11 @@ class System:
     Ma: wp.array2d[float]
     qacc_warmstart: wp.array2d[float]
     time: wp.array[float]
+    # ours, of Runge and Kutta's step: where it began, and the means of its stages so far
+    start_qpos: wp.array2d[float]
+    start_qvel: wp.array2d[float]
+    mean_qvel: wp.array2d[float]
+    mean_qacc: wp.array2d[float]
     nefc: wp.array[int]
     nacon: wp.array[int]
     ncollision: wp.array[int]
@@ -153,11 +162,12 @@ def shared_size(bodies: int, joints: int, dofs: int, actuators: int) -> int:
 
 @functools.cache
 def dynamics_kernel(
-    bodies: int, joints: int, dofs: int, actuators: int, lanes: int, worlds: int
+    bodies: int, joints: int, dofs: int, actuators: int, fluid: bool, lanes: int, worlds: int
 ) -> Any:
     sizes = (
         f"BODIES = {bodies}, JOINTS = {joints}, DOFS = {dofs}, ACTUATORS = {actuators}, "
-        f"LANES = {lanes}, WORLDS = {worlds}, SHARED = {shared_size(bodies, joints, dofs, actuators)}"
+        f"FLUID = {int(fluid)}, LANES = {lanes}, WORLDS = {worlds}, "
+        f"SHARED = {shared_size(bodies, joints, dofs, actuators)}"
     )
 
     @wp.func_native(f"constexpr int {sizes};\n{ENUMS}{DYNAMICS}")
@@ -172,8 +182,8 @@ def dynamics_kernel(
 
 
 @functools.cache
-def advance_kernel(nv: int, damped: bool, lanes: int) -> Any:
-    sizes = f"NV = {nv}, DAMPED = {int(damped)}, LANES = {lanes}"
+def advance_kernel(nv: int, damped: bool, stage: int, lanes: int) -> Any:
+    sizes = f"NV = {nv}, DAMPED = {int(damped)}, STAGE = {stage}, LANES = {lanes}"
 
     @wp.func_native(f"constexpr int {sizes};\n{ENUMS}{LANES}{ADVANCE}")
     def advance(p: System, world: int, lane: int): ...
@@ -192,7 +202,9 @@ class Plan:
 
     system: Any
     sizes: tuple[int, int, int, int]  # bodies, joints, degrees of freedom, actuators
-    damped: bool
+    fluid: bool
+    damped: bool  # whether a step takes the forces of dampers at its end
+    stages: tuple[int, ...]  # of the integrator, as advance.cu counts them
     readable: bool  # whether its sensors, and the fields asked for, need nothing else
     pillars: pillars.Pillars | None
 
@@ -229,8 +241,8 @@ def sizes_of(model: mujoco.MjModel) -> tuple[int, int, int, int]:
 
 
 def uncovered(model: mujoco.MjModel, m: Any, d: Any) -> list[str]:
-    """What the kernels are not for, in a few words each: they are for Euler's integrator, motors on
-    joints and sites, linear springs and dampers, and what the solver is for."""
+    """What the kernels are not for, in a few words each: they are for the integrators Euler and RK4,
+    motors on joints and sites, linear springs and dampers, and what the solver is for."""
     turns = np.isin(model.jnt_type, (types.JointType.FREE, types.JointType.BALL))
     at = model.actuator_trnid[:, 0]
     on_joint = model.actuator_trntype <= types.TrnType.JOINTINPARENT  # the same for hinges and slides
@@ -240,16 +252,17 @@ def uncovered(model: mujoco.MjModel, m: Any, d: Any) -> list[str]:
     thrusters = on_site & (bias == types.BiasType.NONE)
     linear = (motors | thrusters).all() and (model.actuator_gaintype == types.GainType.FIXED).all()
     shared = 4 * shared_size(*sizes_of(model)) * (THREADS // lanes_of(sizes_of(model)))
-    batched = [getattr(m, name) for name in System.vars if hasattr(m, name)] + [m.opt.gravity]
-    batched = [x for x in batched if x.ndim == 2 or x is m.opt.gravity]
+    batched = [getattr(m, name) for name in System.vars if hasattr(m, name)]
+    batched = [x for x in batched if x.ndim == 2]
+    batched += [m.opt.gravity, m.opt.density, m.opt.viscosity, m.opt.wind]
     stiff = m.jnt_stiffness.numpy()[0, turns].any()
     found = {
-        "an integrator other than Euler": m.opt.integrator != types.IntegratorType.EULER,
+        "an integrator other than Euler and RK4": m.opt.integrator not in (EULER, RK4),
         "disabled features": m.opt.disableflags & ~int(types.DisableBit.SENSOR),
         "enabled features": m.opt.enableflags,
         "no collisions": not m.opt.run_collision_detection,
         "sensors of forces between bodies": m.opt.run_rne_postconstraint,
-        "a fluid": m.has_fluid,
+        "ellipsoids in a fluid": m.has_fluid and (model.geom_fluid[:, 0] > 0).any(),
         "tendons": model.ntendon,
         "actuators with a state or a delay": model.na or m.nhistory or m.nactuator != model.nu,
         "actuators that are no motors on joints or sites": not linear,
@@ -292,10 +305,16 @@ def adopt(
     p.levels = int(extra["body_level"].max()) + 1
     p.begin, p.column, p.place = m.M_mulm_rowadr, m.M_mulm_col, m.M_mulm_madr
     p.rows, p.contacts = d.njmax, d.naconmax
+    four = m.opt.integrator == RK4
+    for name in ("start_qpos", "start_qvel", "mean_qvel", "mean_qacc"):
+        shape = (d.nworld, model.nq if name == "start_qpos" else model.nv)
+        setattr(p, name, wp.zeros(shape if four else (0, 0), dtype=float, device=d.qacc.device))
     d.dynamics = Plan(
         system=p,
         sizes=sizes_of(model),
-        damped=bool(m.dof_damping.numpy().any()),
+        fluid=m.has_fluid,
+        damped=not four and bool(m.dof_damping.numpy().any()),
+        stages=(0, 1, 2, 3) if four else (-1,),
         readable=bool(np.isin(model.sensor_type, READABLE).all()) and UNWRITTEN.isdisjoint(fields),
         pillars=pillars.adopt(model, m, d, upright),
     )
@@ -320,7 +339,7 @@ def forward(m: Any, d: Any) -> None:
     lanes = min(threads(d), lanes_of(plan.sizes))
     worlds = threads(d) // lanes  # of a block
     wp.launch_tiled(
-        dynamics_kernel(*plan.sizes, lanes, worlds),
+        dynamics_kernel(*plan.sizes, plan.fluid, lanes, worlds),
         dim=-(-d.nworld // worlds),
         inputs=[plan.system, sensors],
         block_dim=threads(d),
@@ -345,15 +364,16 @@ def step(m: Any, d: Any) -> None:
     if getattr(d, "dynamics", None) is None:
         mujoco_warp.step(m, d)
         return
-    forward(m, d)
-    advance(m, d)
+    for stage in d.dynamics.stages:
+        forward(m, d)
+        advance(m, d, stage)
 
 
-def advance(m: Any, d: Any) -> None:
-    """Euler's step, from the accelerations of `forward`."""
+def advance(m: Any, d: Any, stage: int) -> None:
+    """A stage of the integrator, from the accelerations of `forward`: see advance.cu."""
     plan = d.dynamics
     wp.launch_tiled(
-        advance_kernel(m.nv, plan.damped, threads(d)),
+        advance_kernel(m.nv, plan.damped, stage, threads(d)),
         dim=d.nworld,
         inputs=[plan.system],
         block_dim=threads(d),
