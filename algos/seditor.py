@@ -40,7 +40,7 @@ from jaxsafe.learn.sequences import (
     standard,
 )
 from jaxsafe.learn.steps import Trainable, adam
-from jaxsafe.learn.treatments import LagrangianConfig, Treatment, initial_price, mixed
+from jaxsafe.learn.treatments import LagrangianConfig, Treatment, initial_price, lagrangian
 from jaxsafe.nn.beta import beta_mode, beta_policy, beta_sample, init_beta
 from jaxsafe.nn.critics import init_critics, q_values
 from jaxsafe.types import Algorithm, Count, Env, Metrics, PyTree
@@ -158,7 +158,7 @@ def soft_ascent(
 soft_lagrangian = Treatment(
     init=init_soft_multiplier,
     update=soft_ascent,
-    advantage=mixed,
+    advantage=lagrangian.advantage,
     metrics=lambda dual: {"train/lam": dual.lam},
     constrained_costs=constrained_costs,
 )
@@ -264,7 +264,9 @@ def editor_gain(
         case "reward":
             worth = q_r
     names = constrained_costs(cfg)
-    worth = mixed(dual, worth, reduced_costs(params["critic_c"], obs, found.action, names, cfg))
+    worth = soft_lagrangian.advantage(
+        dual, worth, reduced_costs(params["critic_c"], obs, found.action, names, cfg)
+    )
     return worth - jnp.exp(params["log_alpha_editor"]) * found.log_prob_change, found, lost
 
 

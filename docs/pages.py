@@ -107,7 +107,7 @@ A name is a robot and a task: `point_goal1`, `car_push2`, `doggo_button1`. Safet
 grids are the original's tests. Vision is not there yet. The six [velocity tasks](velocity.md) are
 Safety-Gymnasium's: `ant_velocity` is `SafetyAntVelocity-v1`. So are
 [`point_circle1`, `point_run0`](../howto/safety_gymnasium.md) and their like. `seditor_point_goal1` and
-its like are [SEditor's tasks](seditor.md).
+its like are [SEditor's tasks](../howto/seditor.md).
 
 Every other option of Safety Gym's Engine is `env.OPTION`.
 [`env.rules`](../howto/safety_gymnasium.md) takes Safety-Gymnasium's rules where they differ. How close
