@@ -263,10 +263,8 @@ def editor_gain(
             worth = -jnp.square(found.action - found.proposal).mean(-1)
         case "reward":
             worth = q_r
-    names = constrained_costs(cfg)
-    worth = soft_lagrangian.advantage(
-        dual, worth, reduced_costs(params["critic_c"], obs, found.action, names, cfg)
-    )
+    q_c = reduced_costs(params["critic_c"], obs, found.action, constrained_costs(cfg), cfg)
+    worth = soft_lagrangian.advantage(dual, worth, q_c)
     return worth - jnp.exp(params["log_alpha_editor"]) * found.log_prob_change, found, lost
 
 
@@ -374,7 +372,8 @@ def seditor_learner(env: Env) -> Learner:
         rules = optimisers(cfg, at.remaining if cfg.lr_decay else 1.0)
         trained = {name: params[name] for name in rules}
         grads, metrics = jax.grad(loss, has_aux=True)(trained)
-        new, states = {}, {"moments": moments}
+        new: dict[str, Any] = {}
+        states: dict[str, Any] = {"moments": moments}
         for name, gradient in pmean(grads, axis_name).items():
             change, states[name] = rules[name].update(gradient, nets.opt_state[name])
             new[name] = optax.apply_updates(trained[name], change)

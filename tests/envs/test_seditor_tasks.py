@@ -1,6 +1,7 @@
 """SEditor's tasks: sizes, rays against MuJoCo's own, layouts, ends and costs."""
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,12 +20,13 @@ from jaxsafe.envs.safety_gym.task import in_parts
 from jaxsafe.envs.view.render import Stage
 from jaxsafe.envs.wrap import innermost
 
+native: Any = mujoco  # its functions are not known to type checkers
 NAMES = sorted(suite.seditor())
 
 
 @functools.cache
 def fork(name: str) -> Task:
-    env = innermost(envs.make(name, engine="c"))
+    env: Any = innermost(envs.make(name, engine="c"))
     return Task(env, *in_parts(env, compiler_options=FAST))
 
 
@@ -70,17 +72,17 @@ def oracle(env, world):
     stage = Stage(env)
     stage.move(world)
     spec, cfg = stage.scene.spec, env.config
-    cylinder = mujoco.mjtGeom.mjGEOM_CYLINDER
+    cylinder = native.mjtGeom.mjGEOM_CYLINDER
     discs = [("goal", cfg.goal_size, env.goal_position(world)[:2])]
     discs += [("hazard", cfg.hazards_size, xy) for xy in env.positions(world, "hazards")]
     for kind, radius, (x, y) in discs:
         size, place = (radius, 0.2, 0), (float(x), float(y), 0.2)
         spec.worldbody.add_geom(type=cylinder, size=size, pos=place, group=GROUP[kind], contype=0)
     model = spec.compile()
-    data = mujoco.MjData(model)
+    data = native.MjData(model)
     data.qpos[:], data.qvel[:] = stage.data.qpos, stage.data.qvel
     data.mocap_pos[:], data.mocap_quat[:] = stage.data.mocap_pos, stage.data.mocap_quat
-    mujoco.mj_forward(model, data)
+    native.mj_forward(model, data)
     return model, data
 
 
@@ -93,7 +95,7 @@ def rays(model, data, kind):
     for angle in 2 * np.pi * np.arange(64) / 64:
         ray = robot.xmat.reshape(3, 3) @ np.array([np.cos(angle), np.sin(angle), 0.0])
         found = np.array([-1], np.int32)
-        distance = mujoco.mj_ray(model, data, origin, ray, group, 1, robot.id, found)
+        distance = native.mj_ray(model, data, origin, ray, group, 1, robot.id, found)
         readings.append(np.exp(-distance) if distance >= 0 else 0.0)
     return np.array(readings)
 

@@ -183,9 +183,10 @@ def test_the_editor_brings_unsafe_proposals_to_the_bound_as_the_price_grows(monk
         def step(carry, key):
             own, state = carry
             change, state = rule.update(jax.grad(loss)(own, key), state)
-            return (optax.apply_updates(own, change), state), None
+            moved: Any = optax.apply_updates(own, change)
+            return (moved, state), None
 
-        own = {name: params[name] for name in ("proposer", "editor")}
+        own: Any = {name: params[name] for name in ("proposer", "editor")}
         keys = jax.random.split(jax.random.key(0), 250)
         (own, _), _ = jax.lax.scan(step, (own, rule.init(own)), keys)
         many = jnp.zeros((1000, 1))
