@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsafe.config import Bounds, ConfigError, Units, Weight, config
+from jaxsafe.learn.acting import Learned
 from jaxsafe.learn.conventions import Convention
 from jaxsafe.learn.learner import GradientStep, Learner
 from jaxsafe.learn.offline import (
@@ -16,14 +17,13 @@ from jaxsafe.learn.offline import (
     Draw,
     OfflineConfig,
     anywhere,
-    descended,
+    decaying_adam,
     need_episodes,
     offline,
-    step_size,
 )
 from jaxsafe.learn.replay import Transitions
 from jaxsafe.learn.row import Row
-from jaxsafe.learn.steps import Trainable, adam
+from jaxsafe.learn.steps import Trainable, adam, descend_each
 from jaxsafe.nn.networks import coarse_mlp
 from jaxsafe.nn.vae import decode, draw_latent, init_vae, vae_losses
 from jaxsafe.types import Algorithm, Env, Metrics, PyTree
@@ -108,8 +108,8 @@ def learner(action_size: int) -> Learner:
         out: Any = coarse_mlp(cfg, action_size).apply(actor, obs)
         return jnp.tanh(out)
 
-    def act(params: PyTree, obs: jax.Array, key: jax.Array | None, cfg: Any) -> jax.Array:
-        return mu(params["actor"], obs, cfg)
+    def act(learned: Learned, obs: jax.Array, key: jax.Array | None) -> jax.Array:
+        return mu(learned.params["actor"], obs, learned.config)
 
     def step(
         nets: Trainable, batch: Transitions, at: GradientStep, cfg: Any, axis_name: str | None
@@ -118,8 +118,7 @@ def learner(action_size: int) -> Learner:
             error = ((mu(params["actor"], batch.obs, cfg) - batch.action) ** 2).sum(-1).mean()
             return error, {"train/actor_loss": error}
 
-        new, states, metrics = descended(loss, *nets, step_size(cfg.lr, at, cfg), cfg)
-        return Trainable(new, states), metrics
+        return descend_each(loss, nets, {"actor": decaying_adam(cfg.lr, at, cfg)})
 
     return Learner(init=init, act=act, step=step)
 
@@ -164,10 +163,10 @@ def vae_loss(vae: PyTree, batch: Transitions, key: jax.Array, cfg: Any) -> tuple
 
 
 def autoencoder(action_size: int) -> Learner:
-    def act(params: PyTree, obs: jax.Array, key: jax.Array | None, cfg: Any) -> jax.Array:
-        shape = (*obs.shape[:-1], 2 * action_size)
+    def act(learned: Learned, obs: jax.Array, key: jax.Array | None) -> jax.Array:
+        shape, cfg = (*obs.shape[:-1], 2 * action_size), learned.config
         z = jnp.zeros(shape) if key is None else draw_latent(key, shape, cfg)
-        return jnp.clip(decode(params["vae"], obs, z, cfg), -1.0, 1.0)
+        return jnp.clip(decode(learned.params["vae"], obs, z, cfg), -1.0, 1.0)
 
     def step(
         nets: Trainable, batch: Transitions, at: GradientStep, cfg: Any, axis_name: str | None
@@ -175,8 +174,7 @@ def autoencoder(action_size: int) -> Learner:
         def loss(params: dict[str, PyTree]) -> tuple[jax.Array, Metrics]:
             return vae_loss(params["vae"], batch, at.key, cfg)
 
-        new, states, metrics = descended(loss, *nets, step_size(cfg.lr, at, cfg), cfg)
-        return Trainable(new, states), metrics
+        return descend_each(loss, nets, {"vae": decaying_adam(cfg.lr, at, cfg)})
 
     return Learner(init=init_autoencoder, act=act, step=step)
 

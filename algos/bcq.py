@@ -1,32 +1,39 @@
 """Batch-constrained Q-learning, and with a multiplier on cost."""
 
 from functools import partial
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import optax
 
 from jaxsafe.algos import bc
 from jaxsafe.config import Amount, Share, config
-from jaxsafe.learn.actor_critic import cost_values, init_cost_critics, reduced_costs
+from jaxsafe.learn.acting import Learned
 from jaxsafe.learn.constraints import each
 from jaxsafe.learn.conventions import Convention
+from jaxsafe.learn.critics import (
+    Values,
+    critic_loss,
+    critics_among,
+    expected_cost,
+    init_all_critics,
+    targets_of,
+    while_it_lasts,
+)
 from jaxsafe.learn.learner import GradientStep, Learner
 from jaxsafe.learn.offline import (
     OfflineCostConfig,
     OfflineTargetConfig,
     constrained,
-    descended,
+    decaying_adam,
     episode_cost,
     offline,
-    step_size,
 )
 from jaxsafe.learn.replay import Transitions
 from jaxsafe.learn.row import Row
-from jaxsafe.learn.steps import Trainable, adam
+from jaxsafe.learn.steps import Trainable, adam, descend_each, follow
 from jaxsafe.learn.treatments import Treatment, lagrangian, no_treatment
-from jaxsafe.nn.critics import init_critics, q_values
+from jaxsafe.nn.critics import q_values
 from jaxsafe.nn.networks import coarse_mlp
 from jaxsafe.nn.vae import decode, draw_latent, init_vae
 from jaxsafe.types import Algorithm, Env, Metrics, PyTree
@@ -104,129 +111,112 @@ class BCQLagConfig(OfflineCostConfig, BCQConfig):
     cost_target: Literal["chosen", "max"] = "chosen"
 
 
+class Candidates(NamedTuple):
+    """Several actions for each observation: obs [..., count, O] and action [..., count, A]."""
+
+    obs: jax.Array
+    action: jax.Array
+
+
+def soft(q: jax.Array, cfg: Any) -> jax.Array:
+    """S, of the values of two critics."""
+    return cfg.caution * q.min(0) + (1 - cfg.caution) * q.max(0)
+
+
 def learner(env: Env, treatment: Treatment = no_treatment) -> Learner:
-    priced = treatment is not no_treatment
     names = treatment.constrained_costs
     size = env.action_size
+
+    def init(key: jax.Array, obs_size: int, action_size: int, cfg: Any) -> Trainable:
+        vae_key, actor_key, critic_key = jax.random.split(key, 3)
+        trained = {
+            "actor": coarse_mlp(cfg, size).init(actor_key, jnp.zeros(obs_size + action_size)),
+            **init_all_critics(critic_key, (obs_size, action_size), 2, treatment, cfg),
+        }
+        params = trained | {"vae": init_vae(vae_key, obs_size, action_size, cfg)}
+        opt_state = {name: adam(cfg.lr, cfg).init(x) for name, x in params.items()}
+        return Trainable(params | {"targets": trained}, opt_state)
 
     def xi(actor: PyTree, obs: jax.Array, action: jax.Array, cfg: Any) -> jax.Array:
         """`action` [..., A] with its perturbation."""
         out: Any = coarse_mlp(cfg, size).apply(actor, jnp.concatenate([obs, action], -1))
         return jnp.clip(action + cfg.perturbation * jnp.tanh(out), -1.0, 1.0)
 
-    def drawn(vae: PyTree, actor: PyTree, obs: jax.Array, key: jax.Array, count: int, cfg: Any):
-        """`count` observations and actions for each of `obs` [..., O]: [..., count, O] and [..., A]."""
+    def likely(vae: PyTree, obs: jax.Array, key: jax.Array, cfg: Any) -> jax.Array:
+        """An action like those of the data for each of `obs` [..., O]."""
+        return decode(vae, obs, draw_latent(key, (*obs.shape[:-1], 2 * size), cfg), cfg)
+
+    def candidates(params: PyTree, obs: jax.Array, key: jax.Array, count: int, cfg: Any) -> Candidates:
+        """`count` of them, by the networks `vae` and `actor` among `params`."""
         obs = jnp.broadcast_to(obs[..., None, :], (*obs.shape[:-1], count, obs.shape[-1]))
-        z = draw_latent(key, (*obs.shape[:-1], 2 * size), cfg)
-        return obs, xi(actor, obs, decode(vae, obs, z, cfg), cfg)
+        return Candidates(obs, xi(params["actor"], obs, likely(params["vae"], obs, key, cfg), cfg))
 
-    def soft(q: jax.Array, cfg: Any) -> jax.Array:
-        return cfg.caution * q.min(0) + (1 - cfg.caution) * q.max(0)
-
-    def worth(
-        params: PyTree, q_r: jax.Array, obs: jax.Array, action: jax.Array, dual: PyTree, cfg: Any
-    ):
-        """What is climbed: q_r, or what is left of it after the price of cost."""
-        if not priced:
-            return q_r
-        return treatment.advantage(
-            dual, q_r, reduced_costs(params["critic_c"], obs, action, names(cfg), cfg)
-        )
-
-    def init(key: jax.Array, obs_size: int, action_size: int, cfg: Any) -> Trainable:
-        vae_key, actor_key, critic_key = jax.random.split(key, 3)
-        params = {
-            "vae": init_vae(vae_key, obs_size, action_size, cfg),
-            "actor": coarse_mlp(cfg, size).init(actor_key, jnp.zeros(obs_size + action_size)),
-            "critic_r": init_critics(critic_key, obs_size, action_size, 2, cfg),
-        }
-        if priced:
-            cost_key = jax.random.fold_in(critic_key, 1)
-            params["critic_c"] = init_cost_critics(cost_key, obs_size, action_size, names(cfg), cfg)
-        opt_state = {name: adam(cfg.lr, cfg).init(x) for name, x in params.items()}
-        targets = {name: x for name, x in params.items() if name != "vae"}
-        return Trainable(params | {"targets": targets}, opt_state)
-
-    def act(params: PyTree, obs: jax.Array, key: jax.Array | None, cfg: Any) -> jax.Array:
+    def act(learned: Learned, obs: jax.Array, key: jax.Array | None) -> jax.Array:
+        params, cfg = learned.params, learned.config
         key = jax.random.key(0) if key is None else key  # the same latents at every step
-        many, action = drawn(params["vae"], params["actor"], obs, key, cfg.act_candidates, cfg)
-        q_r = q_values(params["critic_r"], many, action, cfg)[0]
-        best = jnp.argmax(worth(params, q_r, many, action, params.get("dual"), cfg), -1)
-        return jnp.take_along_axis(action, best[..., None, None], -2)[..., 0, :]
+        choice = candidates(params, obs, key, cfg.act_candidates, cfg)
+        q_r = q_values(params["critic_r"], *choice, cfg)[0]
+        q_c = expected_cost(params, *choice, names(cfg), cfg)
+        best = jnp.argmax(treatment.advantage(learned.dual, q_r, q_c), -1)
+        return jnp.take_along_axis(choice.action, best[..., None, None], -2)[..., 0, :]
 
-    def targets_at(params: PyTree, batch: Transitions, dual: PyTree, key: jax.Array, cfg: Any):
-        """y [B], y_c [B] or [B, K], and Q'_c(s', a') of the chosen action."""
+    def next_values(
+        params: PyTree, batch: Transitions, dual: PyTree, key: jax.Array, cfg: Any
+    ) -> tuple[Values, jax.Array]:
+        """S' and Q'_c as the targets take them, and Q'_c of the chosen action."""
         targets = params["targets"]
-        many, action = drawn(params["vae"], targets["actor"], batch.next_obs, key, cfg.candidates, cfg)
-        goes_on = (~batch.terminated).astype(jnp.float32)
-        s = soft(q_values(targets["critic_r"], many, action, cfg), cfg)  # [B, candidates]
-        if not priced:
-            y_r = batch.reward + cfg.discount * goes_on * s.max(-1)
-            return y_r, jnp.zeros(()), jnp.zeros(())
-        best = jnp.argmax(worth(targets, s, many, action, dual, cfg), -1)[:, None]
-        q_c = reduced_costs(targets["critic_c"], many, action, names(cfg), cfg)
-        several = each(lambda x: goes_on * x, names(cfg))
-        next_c = each(lambda x: jnp.take_along_axis(x, best, 1)[:, 0], names(cfg))(q_c)
-        next_r = jnp.take_along_axis(s, best, 1)[:, 0]
-        target_c = next_c
-        if cfg.cost_target == "max":
-            next_r, target_c = s.max(1), q_c.max(1)
-        y_r = batch.reward + cfg.discount * goes_on * next_r
-        y_c = constrained(batch, names(cfg)) + cfg.cost_discount * several(target_c)
-        return y_r, y_c, several(next_c)
+        choice = candidates(targets | {"vae": params["vae"]}, batch.next_obs, key, cfg.candidates, cfg)
+        s = soft(q_values(targets["critic_r"], *choice, cfg), cfg)  # [B, candidates]
+        q_c = expected_cost(targets, *choice, names(cfg), cfg)
+        best = jnp.argmax(treatment.advantage(dual, s, q_c), -1)[:, None]
+
+        def chosen(x: jax.Array) -> jax.Array:
+            return jnp.take_along_axis(x, best, 1)[:, 0]
+
+        next_c = each(chosen, names(cfg))(q_c)
+        if treatment is not no_treatment and cfg.cost_target == "max":
+            return Values(s.max(1), q_c.max(1)), next_c
+        return Values(chosen(s), next_c), next_c
 
     def step(
         nets: Trainable, batch: Transitions, at: GradientStep, cfg: Any, axis_name: str | None
     ) -> tuple[Trainable, Metrics]:
-        params, states = nets.params, nets.opt_state
         vae_key, next_key, key = jax.random.split(at.key, 3)
-
-        def only(*which: str) -> dict[str, PyTree]:
-            return {name: params[name] for name in which}
+        policy_adam = decaying_adam(cfg.lr, at, cfg)
 
         # autoencoder
         def imitation(net: dict[str, PyTree]) -> tuple[jax.Array, Metrics]:
             return bc.vae_loss(net["vae"], batch, vae_key, cfg)
 
-        lr, critic_lr = step_size(cfg.lr, at, cfg), step_size(cfg.critic_lr, at, cfg)
-        new, new_states, metrics = descended(imitation, only("vae"), states, lr, cfg)
+        nets, metrics = descend_each(imitation, nets, {"vae": policy_adam})
 
         # critics
-        y_r, y_c, next_c = targets_at(params | new, batch, at.dual, next_key, cfg)
+        after, next_c = next_values(nets.params, batch, at.dual, next_key, cfg)
+        y = targets_of(batch, constrained(batch, names(cfg)), after, names(cfg), cfg)
 
         def errors(critics: dict[str, PyTree]) -> tuple[jax.Array, Metrics]:
-            q = q_values(critics["critic_r"], batch.obs, batch.action, cfg)
-            loss = ((q - y_r) ** 2).sum(0).mean()
-            metrics = {"train/critic_loss": loss, "train/q": q.mean()}
-            if priced:
-                q_c = cost_values(critics["critic_c"], batch.obs, batch.action, names(cfg), cfg)
-                loss_c = ((q_c - y_c) ** 2).sum(0).mean(0)
-                metrics |= {"train/critic_loss_c": loss_c, "train/q_c": q_c.mean((0, 1))}
-                loss += loss_c.sum()
-            return loss, metrics
+            return critic_loss(critics, batch, y, names(cfg), cfg)
 
-        critics = only("critic_r", "critic_c") if priced else only("critic_r")
-        moved, moved_states, found = descended(errors, critics, states, critic_lr, cfg)
-        new, new_states, metrics = new | moved, new_states | moved_states, metrics | found
+        adams = dict.fromkeys(critics_among(nets.params), decaying_adam(cfg.critic_lr, at, cfg))
+        nets, found = descend_each(errors, nets, adams)
+        metrics |= found
 
         # perturbation
-        z = draw_latent(key, (*batch.action.shape[:-1], 2 * size), cfg)
-        likely = decode(new["vae"], batch.obs, z, cfg)
+        params, unperturbed = nets.params, likely(nets.params["vae"], batch.obs, key, cfg)
 
         def loss(net: dict[str, PyTree]) -> tuple[jax.Array, Metrics]:
-            action = xi(net["actor"], batch.obs, likely, cfg)
-            q_1 = q_values(new["critic_r"], batch.obs, action, cfg)[0]
-            gain = worth(new, q_1, batch.obs, action, at.dual, cfg).mean()
+            action = xi(net["actor"], batch.obs, unperturbed, cfg)
+            q_1 = q_values(params["critic_r"], batch.obs, action, cfg)[0]
+            q_c = expected_cost(params, batch.obs, action, names(cfg), cfg)
+            gain = treatment.advantage(at.dual, q_1, q_c).mean()
             return -gain, {"train/actor_loss": -gain}
 
-        moved, moved_states, found = descended(loss, only("actor"), states, lr, cfg)
-        new, new_states, metrics = new | moved, new_states | moved_states, metrics | found
-
-        aims = {name: new[name] for name in params["targets"]}
-        new["targets"] = optax.incremental_update(aims, params["targets"], cfg.tau)
-        if priced:
-            metrics["train/cost_estimate"] = episode_cost(next_c.mean(0), cfg, env)
-        return Trainable(new, new_states), metrics
+        nets, found = descend_each(loss, nets, {"actor": policy_adam})
+        metrics |= found
+        if treatment is not no_treatment:
+            paid = batch.mean(while_it_lasts(batch, next_c))
+            metrics["train/cost_estimate"] = episode_cost(paid, cfg, env)
+        return follow(nets, cfg.tau), metrics
 
     return Learner(init=init, act=act, step=step)
 

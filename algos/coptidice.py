@@ -7,21 +7,22 @@ import jax.numpy as jnp
 
 from jaxsafe.algos import bc
 from jaxsafe.config import Bounds, Rate, Real, Weight, config
+from jaxsafe.learn.acting import Learned
 from jaxsafe.learn.constraints import each
+from jaxsafe.learn.critics import while_it_lasts
 from jaxsafe.learn.learner import GradientStep, Learner
 from jaxsafe.learn.offline import (
     DataSet,
     OfflinePriceConfig,
     OfflineValueConfig,
     constrained,
-    descended,
+    decaying_adam,
     need_episodes,
     offline,
-    step_size,
 )
 from jaxsafe.learn.replay import Transitions
 from jaxsafe.learn.row import Row
-from jaxsafe.learn.steps import Trainable, adam
+from jaxsafe.learn.steps import Trainable, adam, descend_each
 from jaxsafe.learn.treatments import lagrangian
 from jaxsafe.nn.bounded import bounded_action, bounded_policy, init_bounded
 from jaxsafe.nn.gaussian import log_prob
@@ -111,21 +112,20 @@ def learner(env: Env) -> Learner:
         }
         return Trainable(params, {name: adam(cfg.lr, cfg).init(x) for name, x in params.items()})
 
-    def act(params: PyTree, obs: jax.Array, key: jax.Array | None, cfg: Any) -> jax.Array:
-        return bounded_action(bounded_policy(params["actor"], obs, cfg), key)
+    def act(learned: Learned, obs: jax.Array, key: jax.Array | None) -> jax.Array:
+        return bounded_action(bounded_policy(learned.params["actor"], obs, learned.config), key)
 
     def step(
         nets: Trainable, batch: Transitions, at: GradientStep, cfg: Any, axis_name: str | None
     ) -> tuple[Trainable, Metrics]:
-        params, states = nets.params, nets.opt_state
-        goes_on, several = (~batch.terminated).astype(jnp.float32), names(cfg)
+        params, several = nets.params, names(cfg)
         cost = constrained(batch, several)
         price = jnp.dot(cost, at.dual.lam, precision=jax.lax.Precision.HIGHEST)
 
         def surprise(nu: PyTree) -> jax.Array:
             """e, float [B]."""
             here, ahead = nu_of(nu, batch.obs, cfg), nu_of(nu, batch.next_obs, cfg)
-            return batch.reward - price + cfg.discount * goes_on * ahead - here
+            return batch.reward - price + cfg.discount * while_it_lasts(batch, ahead) - here
 
         def nu_loss(net: dict[str, PyTree]) -> tuple[jax.Array, Metrics]:
             e = surprise(net["nu"])
@@ -144,8 +144,8 @@ def learner(env: Env) -> Learner:
             def visits(x: jax.Array) -> jax.Array:
                 return each(lambda x: w * x, several)(x)
 
-            ahead = each(lambda x: goes_on * x, several)(ahead)
-            ell = (1 - cfg.discount) * begin + visits(cost + cfg.discount * ahead - here)
+            ahead = cfg.discount * while_it_lasts(batch, ahead)
+            ell = (1 - cfg.discount) * begin + visits(cost + ahead - here)
             ell_now = jax.lax.stop_gradient(ell)
             weight, divergence = each(worst_case, several)(ell_now, params["tau"])
             bound = (weight * visits(cost)).mean(0)
@@ -157,25 +157,24 @@ def learner(env: Env) -> Learner:
             }
             return loss.sum(), metrics
 
-        def tau_loss(net: dict[str, PyTree]) -> tuple[jax.Array, Metrics]:
-            loss = net["tau"] * (cfg.cost_divergence - found["train/cost_divergence"])
-            return loss.sum(), {"train/tau": net["tau"]}
-
         def policy_loss(net: dict[str, PyTree]) -> tuple[jax.Array, Metrics]:
             log_pi = log_prob(bounded_policy(net["actor"], batch.obs, cfg), batch.action)
             loss = -(w * log_pi).mean()
             return loss, {"train/actor_loss": loss}
 
-        rates = {"nu": cfg.critic_lr, "chi": cfg.critic_lr, "actor": cfg.lr}
-        losses = {"nu": nu_loss, "chi": chi_loss, "actor": policy_loss}
-        new, new_states, found = {}, {}, {}
-        for name, loss in losses.items():
-            lr, own = step_size(rates[name], at, cfg), {name: params[name]}
-            moved, state, metrics = descended(loss, own, states, lr, cfg)
-            new, new_states, found = new | moved, new_states | state, found | metrics
-        moved, state, metrics = descended(tau_loss, {"tau": params["tau"]}, states, cfg.tau_lr, cfg)
-        moved["tau"] = jnp.maximum(moved["tau"], TAU_MIN)
-        return Trainable(new | moved, new_states | state), found | metrics
+        critic_adam = decaying_adam(cfg.critic_lr, at, cfg)
+        nets, of_nu = descend_each(nu_loss, nets, {"nu": critic_adam})
+        nets, of_chi = descend_each(chi_loss, nets, {"chi": critic_adam})
+        nets, of_policy = descend_each(policy_loss, nets, {"actor": decaying_adam(cfg.lr, at, cfg)})
+
+        def tau_loss(net: dict[str, PyTree]) -> tuple[jax.Array, Metrics]:
+            loss = net["tau"] * (cfg.cost_divergence - of_chi["train/cost_divergence"])
+            return loss.sum(), {"train/tau": net["tau"]}
+
+        nets, of_tau = descend_each(tau_loss, nets, {"tau": adam(cfg.tau_lr, cfg)})
+        tau = jnp.maximum(nets.params["tau"], TAU_MIN)
+        nets = nets._replace(params=nets.params | {"tau": tau})
+        return nets, of_nu | of_chi | of_policy | of_tau
 
     return Learner(init=init, act=act, step=step)
 

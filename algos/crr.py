@@ -5,28 +5,34 @@ from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
-import optax
 
 from jaxsafe.algos import bc
 from jaxsafe.config import Amount, Bounds, Cap, Real, config
-from jaxsafe.learn.actor_critic import cost_values, init_cost_critics, reduced_costs
-from jaxsafe.learn.constraints import each
+from jaxsafe.learn.acting import Learned
+from jaxsafe.learn.critics import (
+    Values,
+    critic_loss,
+    critics_among,
+    expected_cost,
+    init_all_critics,
+    targets_of,
+    while_it_lasts,
+)
 from jaxsafe.learn.learner import GradientStep, Learner
 from jaxsafe.learn.offline import (
     OfflineCostConfig,
     OfflineTargetConfig,
     constrained,
-    descended,
+    decaying_adam,
     episode_cost,
     offline,
-    step_size,
 )
 from jaxsafe.learn.replay import Transitions
 from jaxsafe.learn.row import Row
-from jaxsafe.learn.steps import Trainable, adam
+from jaxsafe.learn.steps import Trainable, adam, descend_each, follow
 from jaxsafe.learn.treatments import Treatment, lagrangian, no_treatment
 from jaxsafe.nn.bounded import bounded_action, bounded_policy, init_bounded
-from jaxsafe.nn.critics import init_critics, q_values
+from jaxsafe.nn.critics import q_values
 from jaxsafe.nn.gaussian import log_prob
 from jaxsafe.types import Algorithm, Env, Metrics, PyTree
 
@@ -77,84 +83,69 @@ class CCRRConfig(OfflineCostConfig, CRRConfig):
 
 
 def learner(env: Env, treatment: Treatment = no_treatment) -> Learner:
-    priced = treatment is not no_treatment
     names = treatment.constrained_costs
 
     def init(key: jax.Array, obs_size: int, action_size: int, cfg: Any) -> Trainable:
         actor_key, critic_key = jax.random.split(key)
         params = {
             "actor": init_bounded(actor_key, obs_size, action_size, cfg),
-            "critic_r": init_critics(critic_key, obs_size, action_size, 2, cfg),
+            **init_all_critics(critic_key, (obs_size, action_size), 2, treatment, cfg),
         }
-        if priced:
-            cost_key = jax.random.fold_in(critic_key, 1)
-            params["critic_c"] = init_cost_critics(cost_key, obs_size, action_size, names(cfg), cfg)
         opt_state = {name: adam(cfg.lr, cfg).init(x) for name, x in params.items()}
         return Trainable(params | {"targets": params}, opt_state)
 
-    def act(params: PyTree, obs: jax.Array, key: jax.Array | None, cfg: Any) -> jax.Array:
-        return bounded_action(bounded_policy(params["actor"], obs, cfg), key)
+    def act(learned: Learned, obs: jax.Array, key: jax.Array | None) -> jax.Array:
+        return bounded_action(bounded_policy(learned.params["actor"], obs, learned.config), key)
+
+    def next_values(targets: PyTree, batch: Transitions, key: jax.Array, cfg: Any) -> Values:
+        """Q'(s', a') and Q'_c(s', a')."""
+        action = bounded_action(bounded_policy(targets["actor"], batch.next_obs, cfg), key)
+        q_r = q_values(targets["critic_r"], batch.next_obs, action, cfg).min(0)
+        return Values(q_r, expected_cost(targets, batch.next_obs, action, names(cfg), cfg))
+
+    def advantages(params: PyTree, batch: Transitions, key: jax.Array, cfg: Any) -> Values:
+        """By how much the data's actions are better than the policy's, A_r and A_c."""
+        dist = bounded_policy(params["actor"], batch.obs, cfg)
+        keys = jax.random.split(key, cfg.actions)
+        drawn = jax.vmap(lambda key: bounded_action(dist, key))(keys)  # [actions, B, A]
+
+        def of_actions(action: jax.Array) -> Values:
+            q_r = q_values(params["critic_r"], batch.obs, action, cfg).min(0)
+            return Values(q_r, expected_cost(params, batch.obs, action, names(cfg), cfg))
+
+        here, there = of_actions(batch.action), jax.vmap(of_actions)(drawn)
+        return jax.tree.map(lambda x, y: x - y.mean(0), here, there)
 
     def step(
         nets: Trainable, batch: Transitions, at: GradientStep, cfg: Any, axis_name: str | None
     ) -> tuple[Trainable, Metrics]:
-        params, targets, states = nets.params, nets.params["targets"], nets.opt_state
         next_key, key = jax.random.split(at.key)
-        goes_on = (~batch.terminated).astype(jnp.float32)
 
         # critics
-        next_action = bounded_action(bounded_policy(targets["actor"], batch.next_obs, cfg), next_key)
-        next_q = q_values(targets["critic_r"], batch.next_obs, next_action, cfg).min(0)
-        y_r = batch.reward + cfg.discount * goes_on * next_q
-        critics = {"critic_r": params["critic_r"]}
-        y_c = next_c = jnp.zeros(())
-        if priced:
-            critics["critic_c"] = params["critic_c"]
-            q_c = reduced_costs(targets["critic_c"], batch.next_obs, next_action, names(cfg), cfg)
-            next_c = each(lambda x: goes_on * x, names(cfg))(q_c)
-            y_c = constrained(batch, names(cfg)) + cfg.cost_discount * next_c
+        after = next_values(nets.params["targets"], batch, next_key, cfg)
+        y = targets_of(batch, constrained(batch, names(cfg)), after, names(cfg), cfg)
 
         def errors(critics: dict[str, PyTree]) -> tuple[jax.Array, Metrics]:
-            q = q_values(critics["critic_r"], batch.obs, batch.action, cfg)
-            loss = ((q - y_r) ** 2).sum(0).mean()
-            metrics = {"train/critic_loss": loss, "train/q": q.mean()}
-            if priced:
-                q_c = cost_values(critics["critic_c"], batch.obs, batch.action, names(cfg), cfg)
-                loss_c = ((q_c - y_c) ** 2).sum(0).mean(0)
-                metrics |= {"train/critic_loss_c": loss_c, "train/q_c": q_c.mean((0, 1))}
-                loss += loss_c.sum()
-            return loss, metrics
+            return critic_loss(critics, batch, y, names(cfg), cfg)
 
-        critic_lr = step_size(cfg.critic_lr, at, cfg)
-        new, new_states, metrics = descended(errors, critics, states, critic_lr, cfg)
+        adams = dict.fromkeys(critics_among(nets.params), decaying_adam(cfg.critic_lr, at, cfg))
+        nets, metrics = descend_each(errors, nets, adams)
 
         # policy
-        dist = bounded_policy(params["actor"], batch.obs, cfg)
-        keys = jax.random.split(key, cfg.actions)
-        own = jax.vmap(lambda key: bounded_action(dist, key))(keys)  # [actions, B, A]
-
-        def better(value: Any) -> jax.Array:
-            """By how much the data's action is, of value(action) -> [B] or [B, K]."""
-            return value(batch.action) - jax.vmap(value)(own).mean(0)
-
-        advantage = better(lambda a: q_values(new["critic_r"], batch.obs, a, cfg).min(0))
-        if priced:
-            adv_c = better(lambda a: reduced_costs(new["critic_c"], batch.obs, a, names(cfg), cfg))
-            advantage = treatment.advantage(at.dual, advantage, adv_c)
-        weight = jnp.minimum(jnp.exp(advantage / cfg.temperature), cfg.weight_max)
+        better = treatment.advantage(at.dual, *advantages(nets.params, batch, key, cfg))
+        weight = jnp.minimum(jnp.exp(better / cfg.temperature), cfg.weight_max)
 
         def loss(net: dict[str, PyTree]) -> tuple[jax.Array, Metrics]:
             log_pi = log_prob(bounded_policy(net["actor"], batch.obs, cfg), batch.action)
             loss = -(weight * log_pi).mean()
             return loss, {"train/actor_loss": loss, "train/weight": weight.mean()}
 
-        lr = step_size(cfg.lr, at, cfg)
-        actor, actor_states, found = descended(loss, {"actor": params["actor"]}, states, lr, cfg)
-        new, metrics = new | actor, metrics | found
-        if priced:
-            metrics["train/cost_estimate"] = episode_cost(next_c.mean(0), cfg, env)
-        followed = optax.incremental_update(new, targets, cfg.tau)
-        return Trainable(new | {"targets": followed}, new_states | actor_states), metrics
+        nets, found = descend_each(loss, nets, {"actor": decaying_adam(cfg.lr, at, cfg)})
+        metrics |= found
+        if treatment is not no_treatment:
+            paid = batch.mean(while_it_lasts(batch, after.cost))
+            metrics["train/cost_estimate"] = episode_cost(paid, cfg, env)
+        return follow(nets, cfg.tau), metrics
 
     return Learner(init=init, act=act, step=step)
 

@@ -19,8 +19,9 @@ from jaxsafe.config import (
     Weight,
     config,
 )
-from jaxsafe.learn.actor_critic import cost_values, init_cost_critics, reduced_costs
+from jaxsafe.learn.acting import Learned
 from jaxsafe.learn.batch import pmean
+from jaxsafe.learn.bill import PriceClockConfig
 from jaxsafe.learn.constraints import (
     constrained_costs,
     each,
@@ -28,8 +29,9 @@ from jaxsafe.learn.constraints import (
     metrics_by_constraint,
     signal,
 )
+from jaxsafe.learn.critics import cost_values, init_cost_critics, reduced_costs
 from jaxsafe.learn.learner import GradientStep, Learner
-from jaxsafe.learn.off_policy import OffPolicyConfig, PriceClockConfig, off_policy
+from jaxsafe.learn.off_policy import OffPolicyConfig, off_policy
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.sequences import (
     SequenceBatch,
@@ -39,7 +41,7 @@ from jaxsafe.learn.sequences import (
     no_moments,
     standard,
 )
-from jaxsafe.learn.steps import Trainable, adam
+from jaxsafe.learn.steps import Trainable, adam, descend_each, follow
 from jaxsafe.learn.treatments import LagrangianConfig, Treatment, initial_price, lagrangian
 from jaxsafe.nn.beta import beta_mode, beta_policy, beta_sample, init_beta
 from jaxsafe.nn.critics import init_critics, q_values
@@ -194,8 +196,9 @@ def edited(proposer: PyTree, editor: PyTree, obs: jax.Array, key: jax.Array, cfg
     return Edited(proposal, edit(proposal, change, cfg), log_prob, log_prob_change)
 
 
-def act(params: dict[str, PyTree], obs: jax.Array, key: jax.Array | None, cfg: Any) -> jax.Array:
+def act(learned: Learned, obs: jax.Array, key: jax.Array | None) -> jax.Array:
     """A draw, or the edited mode of the proposals where `key` is None."""
+    params, cfg = learned.params, learned.config
     if key is not None:
         return edited(params["proposer"], params["editor"], obs, key, cfg).action
     proposal = beta_mode(beta_policy(params["proposer"], obs, cfg))
@@ -370,17 +373,9 @@ def seditor_learner(env: Env) -> Learner:
             return total, jax.lax.stop_gradient(metrics)
 
         rules = optimisers(cfg, at.remaining if cfg.lr_decay else 1.0)
-        trained = {name: params[name] for name in rules}
-        grads, metrics = jax.grad(loss, has_aux=True)(trained)
-        new: dict[str, Any] = {}
-        states: dict[str, Any] = {"moments": moments}
-        for name, gradient in pmean(grads, axis_name).items():
-            change, states[name] = rules[name].update(gradient, nets.opt_state[name])
-            new[name] = optax.apply_updates(trained[name], change)
-        critics = {name: new[name] for name in targets}
-        followed = optax.incremental_update(critics, targets, cfg.tau)
-        metrics = metrics_by_constraint(pmean(metrics, axis_name), names)
-        return Trainable(new | {"targets": followed}, states), metrics
+        nets, metrics = descend_each(loss, nets, rules, axis_name)
+        nets = nets._replace(opt_state=nets.opt_state | {"moments": moments})
+        return follow(nets, cfg.tau), metrics_by_constraint(metrics, names)
 
     return Learner(
         init=init,

@@ -19,7 +19,8 @@ SECTIONS: list[tuple[str, list[str]]] = [
     ("Start", ["start.md", "choosing.md", "concepts.md"]),
     ("How to", ["howto/"]),
     ("Environments", ["environments/"]),
-    ("Algorithms", ["algorithms/", "theory/"]),
+    ("Algorithms", ["algorithms/"]),
+    ("Derivations", ["theory/"]),
     ("Results", ["results/", "benchmark.md", "performance.md", "fidelity.md"]),
     ("Reference", ["reference/", "developing.md"]),
 ]
@@ -35,14 +36,15 @@ def listed(docs: Path) -> list[Any]:
         pages: list[Any] = []
         for name in names:
             found = [*(docs / name).rglob("*.md")] if name.endswith("/") else [docs / name]
-            found.sort(key=lambda path: (path != docs / name / "README.md", heading(path)))
-            pages += [{heading(path).partition(":")[0]: str(path.relative_to(docs))} for path in found]
+            found.sort(key=lambda path: (path != docs / name / "README.md", in_menu(path)))
+            pages += [{in_menu(path): str(path.relative_to(docs))} for path in found]
         nav.append({title: pages})
     return nav
 
 
-def heading(page: Path) -> str:
-    return page.read_text().partition("\n")[0].lstrip("# ")
+def in_menu(page: Path) -> str:
+    """Its heading up to a colon."""
+    return page.read_text().partition("\n")[0].lstrip("# ").partition(":")[0]
 
 
 def relinked(text: str, page: str) -> str:

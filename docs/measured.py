@@ -178,6 +178,27 @@ def algorithm_speeds() -> str:
     return "\n".join(lines)
 
 
+def training_speeds() -> str:
+    """Environment steps a second of PPO-Lagrangian's training on one H200, ours and CRAX's."""
+    rows = benchmark_rows("benchmark_h200.jsonl")
+    whole = {"env": "point_goal1", "algo": "ppo_lag", "solver": SWEEP, "devices": 1}
+    ours = [r for r in rows if r.get("warmup") and all(r.get(k) == v for k, v in whole.items())]
+    ours = [r for r in ours if "xla_flags" not in r]
+    theirs = [r for r in rows if r.get("peer") == "crax" and r["algo"]]
+    found = [
+        (r["env_steps_per_s"], "jaxsafe", *shape)
+        for shape, r in latest(ours, "num_seeds", "num_envs", "horizon").items()
+    ]
+    found += [
+        (r["env_steps_per_s"], f"CRAX {r['crax-bench']}, its defaults", 1, size, "")
+        for (size,), r in latest(theirs, "num_envs").items()
+    ]
+    lines = ["| | seeds | environments of a seed | horizon | steps/s |", "|---|---:|---:|---:|---:|"]
+    for rate, name, seeds, size, horizon in sorted(found, reverse=True):
+        lines.append(f"| {name} | {seeds} | {size:,} | {horizon} | {round(rate, -4):,.0f} |")
+    return "\n".join(lines)
+
+
 def throughput(path: Path) -> None:
     """Environment steps a second, random actions, against the number of environments; on the GPU those
     of settled environments."""
@@ -269,7 +290,7 @@ def attempts() -> str:
             algo = run.config["algo.name"]
             options = "".join(f", `{k}={run.config[f'algo.{k}']:g}`" for k in names[algo])
             shape = f"{run.config['algo.num_envs']} x {run.config['algo.horizon']}"
-            ret, cost = (cell(stats.estimate(run.values[k]), ".2f") for k in ("return", "cost"))
+            ret, cost = (cell(stats.of_measure(k, run.values[k]), ".2f") for k in ("return", "cost"))
             lines.append(f"| `{algo}`{options} | {shape} | {len(run.seeds)} | {ret} | {cost} |")
     return "\n".join(lines)
 
@@ -279,7 +300,7 @@ def devices() -> str:
     lines = ["| GPUs | environments of a seed | estimated return | estimated cost | seconds |"]
     lines.append("|---:|---:|---:|---:|---:|")
     for run in read([RESULTS / "devices"]):
-        found = (stats.estimate(run.values[f"{k} estimate"]) for k in ("return", "cost"))
+        found = (stats.of_measure(k, run.values[f"{k} estimate"]) for k in ("return", "cost"))
         shape = f"{run.config['devices']} | {run.config['algo.num_envs']:,}"
         seconds = 60 * run.values["minutes"].max()
         lines.append(f"| {shape} | {' | '.join(cell(x, '.1f') for x in found)} | {seconds:.1f} |")
@@ -312,9 +333,13 @@ def pages() -> dict[Path, str]:
         },
         RESULTS / "first_attempts" / "README.md": {"attempts": attempts()},
         RESULTS / "devices" / "README.md": {"devices": devices()},
-        HERE.parent / "README.md": {"held": held(groups, final)},
+        HERE.parent / "README.md": {"held": held(groups, final), "training": training_speeds()},
         HERE / "benchmark.md": {"speeds": algorithm_speeds()},
-        HERE / "performance.md": {"throughput": throughput_table(), "engine jax": engine_jax()},
+        HERE / "performance.md": {
+            "throughput": throughput_table(),
+            "training": training_speeds(),
+            "engine jax": engine_jax(),
+        },
     }
     found = {path.parent / "README.md": studies.page(studies.read(path.parent))[0] for path in STUDIES}
     for path, parts in written.items():

@@ -6,18 +6,15 @@ docs/environments/NAME.md: objects, observations and costs are the environment's
 original is the tables of docs/fidelity.md. A test holds the pages to the code.
 """
 
-import ast
 import dataclasses
 import functools
 import importlib
 import inspect
-import io
 import math
 import re
 import sys
-import textwrap
-import tokenize
 import typing
+from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -26,12 +23,14 @@ from jaxsafe.envs import make
 from jaxsafe.envs.safety_gym import suite
 from jaxsafe.envs.velocity import config as velocity_config
 from jaxsafe.envs.velocity import suite as velocities
+from jaxsafe.learn.off_policy import OffPolicyConfig
 from jaxsafe.learn.offline import OfflineConfig
+from jaxsafe.learn.on_policy import OnPolicyConfig
 from jaxsafe.report import stats, studies
 from jaxsafe.report import tables as report
 from jaxsafe.report.published import read_published
 from jaxsafe.report.read import SettingRun, read
-from jaxsafe.run import compat
+from jaxsafe.run import compat, help
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
@@ -49,7 +48,13 @@ FAMILIES = {  # the pages of docs/theory
     "trust_region": ("cpo", "pcpo"),
     "penalties": ("ipo", "p3o", "focops"),
     "budgets": ("ppo_saute", "trpo_saute", "ppo_simmer_pid", "trpo_simmer_pid"),
+    "actor_critics": tuple(
+        f"{name}{more}" for name in ("ddpg", "td3", "sac") for more in ("", "_lag", "_pid")
+    ),
+    "recorded_data": ("bcq", "bcq_lag", "crr", "ccrr", "coptidice"),
 }
+LOOPS = {OnPolicyConfig: "on-policy", OffPolicyConfig: "off-policy", OfflineConfig: "offline"}
+ABSENT = object()  # where there is no default
 ALGORITHMS = """# Algorithms
 
 Each page has the equations, the sources, every setting with its origin, the departures from the paper,
@@ -57,7 +62,8 @@ and what it made in our runs. Which one to take: [choosing](../choosing.md#an-al
 
 How families work, step by step: [prices](../theory/prices.md),
 [trust regions](../theory/trust_region.md), [penalties](../theory/penalties.md),
-[budgets in the state](../theory/budgets.md).
+[budgets in the state](../theory/budgets.md), [values of actions](../theory/actor_critics.md),
+[recorded data](../theory/recorded_data.md).
 
 The on-policy algorithms share these options:
 
@@ -137,7 +143,9 @@ Run along x as fast as the threshold allows. A robot is paid for its speed and f
 pays for control. A step costs 1 if the robot is faster than the threshold. The tasks are
 Safety-Gymnasium's `Safe Velocity`, on Gymnasium's environments of version 4.
 
-    python scripts/train.py env=hopper_velocity algo=ppo_lag
+```sh
+python scripts/train.py env=hopper_velocity algo=ppo_lag
+```
 
 {pictures}
 
@@ -207,23 +215,6 @@ def prose(docstring: str) -> tuple[str, str]:
     return title, "\n\n".join(blocks)
 
 
-def comments_of(cls: type) -> dict[str, str]:
-    """Field -> its comment: the lines of comment above the field and the one after its default."""
-    text = textwrap.dedent(inspect.getsource(cls))
-    tokens = [*tokenize.generate_tokens(io.StringIO(text).readline)]
-    notes = {t.start[0]: t.string.lstrip("# ") for t in tokens if t.type == tokenize.COMMENT}
-    alone = {line for line in notes if text.splitlines()[line - 1].startswith("    #")}
-    (tree,) = ast.parse(text).body
-    found = {}
-    for field in (node for node in ast.walk(tree) if isinstance(node, ast.AnnAssign)):
-        first = field.lineno
-        while first - 1 in alone:
-            first -= 1
-        lines = range(first, (field.end_lineno or field.lineno) + 1)
-        found[ast.unparse(field.target)] = " ".join(notes[line] for line in lines if line in notes)
-    return found
-
-
 def values(kind: Any) -> str:
     """The bounds of a number, wherever it stands in the type; the words of a choice."""
     if typing.get_origin(kind) is typing.Literal:
@@ -235,18 +226,34 @@ def values(kind: Any) -> str:
     return next(filter(None, map(values, typing.get_args(kind))), "")
 
 
-def settings(config: type, head: str = "algo") -> str:
+def settings(config: type, head: str = "algo", without: Collection[str] = ()) -> str:
     """A row a field: its default, the values it takes, and the comment in the class that defines it."""
-    comments: dict[str, str] = {}
-    for cls in reversed(config.__mro__[:-1]):
-        comments |= {name: note or comments.get(name, "") for name, note in comments_of(cls).items()}
+    comments = help.comments(config)
     rows = ["| setting | default | values | |", "|---|---|---|---|"]
     hints = typing.get_type_hints(config, include_extras=True)
     for field in dataclasses.fields(config):
+        if field.name in without:
+            continue
         note = comments[field.name].replace("|", "\\|")
         default = "" if field.default is dataclasses.MISSING else f"`{field.default}`"
         rows.append(f"| `{head}.{field.name}` | {default} | {values(hints[field.name])} | {note} |")
     return "\n".join(rows)
+
+
+def folded_settings(config: type) -> str:
+    """The settings that make this algorithm, then, folded, those that it has as all of its loop do."""
+    loop, kind = next((loop, kind) for loop, kind in LOOPS.items() if issubclass(config, loop))
+    usual = {field.name: field.default for field in dataclasses.fields(loop)}
+    fields = {field.name: field.default for field in dataclasses.fields(config)}
+    shared = [name for name, default in fields.items() if usual.get(name, ABSENT) == default]
+    specific = [name for name in fields if name not in shared]
+    folded = f"""<details markdown>
+<summary>{len(shared)} settings that all {kind} algorithms share</summary>
+
+{settings(config, without=specific)}
+
+</details>"""
+    return "\n\n".join([settings(config, without=shared)] * bool(specific) + [folded])
 
 
 def published(row: Row) -> str:
@@ -281,7 +288,7 @@ def measured(name: str) -> str:
     for run in trained():
         if run.config["algo.name"] != name:
             continue
-        ret, cost = (report.cell(stats.estimate(run.values[k]), ".2f") for k in ("return", "cost"))
+        ret, cost = (report.cell(stats.of_measure(k, run.values[k]), ".2f") for k in ("return", "cost"))
         rules, compat = run.config["env.rules"], run.config["compat"]
         how = f"`{run.env}`, preset {run.config['preset']}, {len(run.seeds)} seeds"
         how += f", `compat={compat}`" if compat != "none" else ""
@@ -310,22 +317,24 @@ def page(name: str) -> str:
     data = " dataset=data.npz" if issubclass(row.config, OfflineConfig) else ""
     return f"""# {title.removesuffix(".")}
 
-    python scripts/train.py env=point_goal1 algo={name}{data}
+```sh
+python scripts/train.py env=point_goal1 algo={name}{data}
+```
 
 {text}
 
 The letters: [what they mean on all pages](README.md#letters). The code:
 [algos/{module}.py](../../algos/{module}.py).{derivation(name)}
 
-## Settings
-
-{settings(row.config)}
-
-{published(row)}
-
 ## Results
 
 {measured(name)}
+
+## Settings
+
+{folded_settings(row.config)}
+
+{published(row)}
 """.replace("\n\n\n", "\n\n")
 
 
@@ -400,7 +409,9 @@ def task_page(task: str) -> str:
 
 {TASKS[kind]}
 
-    python scripts/train.py env=point_{task} algo=ppo_lag
+```sh
+python scripts/train.py env=point_{task} algo=ppo_lag
+```
 
 {pictures if drawn else ""}
 

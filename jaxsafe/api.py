@@ -8,7 +8,6 @@ They are the scripts' own functions, so a run folder is the same whoever trained
 loads this module when one of its names is first used.
 """
 
-import dataclasses
 import functools
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,13 +15,9 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jaxsafe import algos, envs
-from jaxsafe.algos import Row
-from jaxsafe.config import ConfigError, EpisodeCount, Index, Seed, convert, flat, nearest
-from jaxsafe.envs import SafetyGym, SafetyGymConfig, Velocity, VelocityConfig
-from jaxsafe.envs.check import check_env
-from jaxsafe.envs.engines import default_engine
-from jaxsafe.envs.wrap import Wrapper, innermost, wrap_config_of
+from jaxsafe import envs
+from jaxsafe.config import ConfigError, EpisodeCount, Index, Seed, convert, flat
+from jaxsafe.envs import SafetyGymConfig, VelocityConfig
 from jaxsafe.learn.acting import Player
 from jaxsafe.report import evaluation, film, sweep_summary
 from jaxsafe.report.evaluation import Scores
@@ -30,31 +25,23 @@ from jaxsafe.report.finish import finish
 from jaxsafe.report.group import Group
 from jaxsafe.run import distributed, files, run_folder, session
 from jaxsafe.run import sweep as sweeps
+from jaxsafe.run.choice import asked_for, chosen, full_names
 from jaxsafe.run.devices import use_compilation_cache
 from jaxsafe.run.loggers import Callback
+from jaxsafe.run.plain import to_plain
 from jaxsafe.run.policies import ROBOT, RunPolicies, open_run
 from jaxsafe.run.progress import Reporter
 from jaxsafe.run.session import Session
 from jaxsafe.run.settings import (
-    DEFAULT,
-    EnvEntry,
-    Extras,
-    TrainConfig,
-    find_env,
     load,
     nested,
     settings_from_config,
     settings_from_options,
-    to_plain,
     yours,
 )
 from jaxsafe.types import Env, PyTree
 
 __all__ = ["ConfigError", "Run", "SweepResult", "evaluate", "make", "render", "sweep", "train"]
-
-RUN_OPTIONS = [f.name for f in dataclasses.fields(TrainConfig)]
-PLAIN = (bool, int, float, str, list, tuple, dict, type(None))
-BY_OPTIONS = (dict, VelocityConfig)  # entries whose name and options say it all
 
 
 def make(env: str | SafetyGymConfig | VelocityConfig, **options: Any) -> Any:
@@ -392,144 +379,3 @@ def render(
     index, seed = convert(index, Index, "index"), convert(seed, Seed, "seed")
     film.film([run._opened.one(index)], out, seed)
     return out
-
-
-# ---- what the caller chose --------------------------------------------------------------------
-
-
-class Chosen(NamedTuple):
-    """An environment and an algorithm, as the arguments of `train` name them."""
-
-    given: dict[str, Any]  # the options that choose them, as 'env' and 'env.hazards_num'
-    extras: Extras  # the caller's objects
-    objects: dict[str, str]  # 'env', 'algo': what the caller's objects are called
-
-    def say_whose(self, report: Reporter) -> None:
-        if self.objects:
-            report.line(
-                f"only this program knows {' and '.join(self.objects.values())}: the run continues and "
-                "opens from Python with the same object, not from the command line"
-            )
-
-
-def chosen(env: Any, algo: Any) -> Chosen:
-    env_given, own_envs = choose_env(env)
-    algo_given, own_algos = choose_algo(algo)
-    objects = {"env": ", ".join(own_envs), "algo": ", ".join(own_algos)}
-    objects = {kind: names for kind, names in objects.items() if names}
-    return Chosen(env_given | algo_given, Extras(own_envs, own_algos), objects)
-
-
-def choose_env(env: Any) -> tuple[dict[str, Any], dict[str, EnvEntry]]:
-    """The options that choose `env`, and its entry if it is the caller's."""
-    if env is None:
-        return {}, {}
-    if isinstance(env, str):
-        load("env", env)
-        return {"env": env}, {}
-    if isinstance(env, list | tuple):
-        if not env or not all(isinstance(e, str) for e in env):
-            raise ConfigError("env: expected names in a list; an object of yours stands alone")
-        for name in env:
-            load("env", name)
-        return {"env": list(env)}, {}
-    inner = innermost(env)
-    gym = isinstance(inner, SafetyGym | Velocity)
-    fields = to_plain(plain_fields(env))
-    if gym and isinstance(envs.ENVS.get(inner.name), BY_OPTIONS) and (wrap := wrap_config_of(env)):
-        defaults = flat(find_env(inner.name)[1].defaults)
-        fields = to_plain(plain_fields(inner)) | {"wrap": to_plain(dataclasses.asdict(wrap))}
-        fields["engine"] = "auto" if inner.engine == default_engine() else inner.engine
-        options = {f"env.{k}": v for k, v in flat(fields).items() if v != defaults[k]}
-        return {"env": inner.name} | options, {}
-    name = inner.name if gym else type(env).__name__
-    env = check_env(env, name)
-
-    def made(**options: Any) -> Env:
-        if options:
-            raise ConfigError(
-                f"{', '.join(f'env.{k}={v}' for k, v in options.items())}: this {name} has another "
-                "value; set it where you make the environment"
-            )
-        return env
-
-    drawn = {} if gym else {"video": False}  # there is a picture of our own alone
-    return {"env": name, **drawn}, {name: EnvEntry(fields, made, made)}
-
-
-def plain_fields(env: Any) -> dict[str, Any]:
-    """What config.yaml keeps of an environment: the plain fields of a dataclass."""
-    fields = env.config if isinstance(env, SafetyGym | Velocity) else env
-    if not dataclasses.is_dataclass(fields):
-        return {}
-    values = {f.name: getattr(fields, f.name) for f in dataclasses.fields(fields)}
-    plain = {name: value for name, value in values.items() if isinstance(value, PLAIN)}
-    return plain | ({"inner": plain_fields(env.env)} if isinstance(env, Wrapper) else {})
-
-
-def choose_algo(algo: Any) -> tuple[dict[str, Any], dict[str, Row]]:
-    """As `choose_env`, for one algorithm or a list."""
-    if algo is None:
-        return {}, {}
-    several = type(algo) in (list, tuple)  # a Row is a tuple too
-    names, own = [], {}
-    for one in algo if several else [algo]:
-        if isinstance(one, str):
-            load("algo", one)
-            names.append(one)
-            continue
-        kind: Any = getattr(one, "config", None)
-        make_algo: Any = getattr(one, "make", None)
-        if not (isinstance(kind, type) and dataclasses.is_dataclass(kind) and make_algo):
-            raise ConfigError(
-                f"algo: expected a name or an object with a config class and make, not {one!r}"
-            )
-        name = kind.__name__.removesuffix("Config")
-        own[name] = Row(kind, make_algo)
-        names.append(name)
-    return {"algo": names if several else names[0]}, own
-
-
-def full_names(choice: Chosen, options: dict[str, Any], *more: str) -> dict[str, Any]:
-    """Options by their full names: 'total_steps' stays, 'cost_limit' is 'algo.cost_limit'.
-
-    Raises:
-        ConfigError: no run and no algorithm has such an option.
-    """
-    rows = {**algos.ALGOS, **choice.extras.algos}.values()
-    fields = {f.name for row in rows for f in dataclasses.fields(row.config)}
-
-    def full(name: str) -> str:
-        head = name.partition(".")[0]
-        if head in DEFAULT or name in (*RUN_OPTIONS, *more):
-            return name
-        if head not in fields:
-            raise ConfigError(f"unknown option {name}{nearest(name, [*RUN_OPTIONS, *more, *fields])}")
-        return f"algo.{name}"
-
-    return {full(name): value for name, value in options.items()}
-
-
-def asked_for(choice: Chosen, options: dict[str, Any]) -> tuple[dict[str, Any], dict[str, list[Any]]]:
-    """What to sweep, as `run.sweep.plan` takes it: a list holds the values of an option.
-
-    Raises:
-        ConfigError: a list is empty, or there is no such option.
-    """
-    given, several = {}, {}
-    for name, value in {**choice.given, **full_names(choice, flat(options), "max_parallel")}.items():
-        values = as_list(value)
-        if not isinstance(values, list):
-            given[name] = value
-        elif values:
-            several[name] = [to_plain(v, name) for v in values]
-        else:
-            raise ConfigError(f"{name.removeprefix('algo.')}=[]: expected values to sweep")
-    return to_plain(nested(given)), several
-
-
-def as_list(value: Any) -> Any:
-    """What holds several values, as a list of them."""
-    if isinstance(value, np.ndarray | jax.Array):
-        return value.tolist()
-    return list(value) if isinstance(value, range) else value

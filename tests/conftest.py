@@ -6,7 +6,7 @@ import jax
 import pytest
 
 from jaxsafe import algos, envs
-from jaxsafe.envs.view import render
+from jaxsafe.envs.view import backend
 from jaxsafe.run.devices import use_compilation_cache
 
 use_compilation_cache()  # what a first run of the tests compiles, the next one reads
@@ -42,7 +42,9 @@ def forgotten_code() -> Iterator[None]:
             registry.clear()
             registry.update(before)
     for name in {*sys.modules} - modules:
-        if str(getattr(sys.modules[name], "__file__", None)).startswith(tempfile.gettempdir()):
+        file = str(getattr(sys.modules[name], "__file__", None))
+        # a virtual environment may lie there, too
+        if file.startswith(tempfile.gettempdir()) and "site-packages" not in file:
             del sys.modules[name]
     sys.path[:] = path
 
@@ -51,6 +53,6 @@ def forgotten_code() -> Iterator[None]:
 def display() -> None:
     """What draws pictures, where the machine has it."""
     try:
-        render.find_backend()
-    except render.NoDisplay as error:
+        backend.find_backend()
+    except backend.NoDisplay as error:
         pytest.skip(str(error))

@@ -17,7 +17,9 @@ from jaxsafe import envs
 from jaxsafe.envs.safety_gym.suite import ROBOTS, TASKS
 from jaxsafe.envs.velocity import suite as velocities
 from jaxsafe.envs.view import render
+from jaxsafe.learn.acting import Player
 from jaxsafe.run.policies import open_run
+from jaxsafe.types import Policy, PyTree
 
 HERE = Path(__file__).parent
 SCENES = {  # name: seed, steps into the episode, where the camera looks (m), its distance (m)
@@ -43,10 +45,12 @@ def draw(name: str) -> None:
     seed, steps, lookat, distance = SCENES[name]
     env = envs.make(name, engine="c")
 
-    def policy(obs: jax.Array, key: jax.Array) -> jax.Array:
-        return jax.random.uniform(key, (env.action_size,), minval=-1.0)
+    def act(learned: PyTree, carry: jax.Array, obs: jax.Array, key: None):
+        carry, action_key = jax.random.split(carry)
+        return jax.random.uniform(action_key, (env.action_size,), minval=-1.0), carry, {}
 
-    states = render.run_episode(env, policy, jax.random.key(seed), steps)
+    player = Player(Policy(lambda learned: jax.random.key(seed), act), (), env)
+    states = render.run_episode(player, jax.random.key(seed), steps)
     view = camera(lookat, distance)
     frame = render.Renderer(env, 640, 400, view).frame(jax.tree.map(lambda x: x[-1], states))
     imageio.imwrite(HERE / f"{name}.png", frame)

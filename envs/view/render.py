@@ -1,17 +1,6 @@
-"""Frames and films of an episode, drawn by MuJoCo off screen.
+"""Frames and films of an episode, drawn by MuJoCo off screen."""
 
-Bodies come from the model. In Safety Gym's tasks goals, hazards, circles and lidars are arrays in the
-physics, so they are drawn as loose geoms over each frame, with the shapes and colours of the original:
-its Engine's `render`, `render_lidar`, `render_compass`, `render_area` and `render_sphere`.
-"""
-
-import atexit
-import functools
-import importlib
 import os
-import platform
-import subprocess
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -24,147 +13,16 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from jaxsafe.config import ConfigError, nearest
-from jaxsafe.envs import engines
-from jaxsafe.envs.safety_gym import scene as scenes
-from jaxsafe.envs.safety_gym.arena import World
-from jaxsafe.envs.safety_gym.config import SafetyGymConfig
 from jaxsafe.envs.safety_gym.task import SafetyGym
 from jaxsafe.envs.velocity.task import Velocity
-from jaxsafe.envs.velocity.task import World as VelocityWorld
-from jaxsafe.envs.wrap import innermost, raw_steps
-from jaxsafe.learn.acting import Player
-from jaxsafe.types import PyTree, State
+from jaxsafe.envs.view.backend import gl_context
+from jaxsafe.envs.view.stage import drawable, stage_of
+from jaxsafe.envs.wrap import raw_steps
+from jaxsafe.learn.acting import Player, Playing
+from jaxsafe.types import State
 
 FPS = 30
-BACKENDS = {"Linux": ("egl", "osmesa", "glfw"), "Darwin": ("cgl", "glfw")}
-# Rows of the halo, from the lowest up.
-SEEN = ("box", "goal", "buttons", "circle", "walls", "hazards", "pillars", "gremlins", "vases")
-RED = (1, 0, 0, 1)
-BESIDE = (np.cos(np.deg2rad(32)), np.sin(np.deg2rad(32)), 0, 0)  # along y, 26 degrees downwards
 CAPTION, GAP = 24, 4  # height of the line over a labelled frame, width between two panels, pixels
-SPHERE, CYLINDER = mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CYLINDER
-PROBE = """
-import importlib, os, sys, mujoco
-context = importlib.import_module("mujoco." + sys.argv[1]).GLContext(8, 8)
-context.make_current()
-mujoco.MjrContext(mujoco.MjModel.from_xml_string("<mujoco/>"), 100)
-os._exit(0)  # past the clean-up, which fails in some drivers
-"""
-
-
-class NoDisplay(RuntimeError):
-    """Nothing to render with. The message is one line."""
-
-
-class Stage:
-    """The bodies of one of Safety Gym's tasks in MuJoCo's own model, and what is drawn over them.
-
-    It needs no display.
-    """
-
-    def __init__(self, env: SafetyGym):
-        self.env = env
-        self.scene = scenes.build(env.config, drawn=True)
-        self.model = self.scene.model
-        self.data = mujoco.MjData(self.model)
-
-    def move(self, world: World) -> None:
-        """Put the model's bodies where they are in `world`."""
-        physics, data = world.bodies, self.data
-        time = np.maximum(physics.substeps - 1, 0) * self.model.opt.timestep
-        orbit = self.scene.orbit * (physics.substeps > 0)  # gremlins start at their circles' centres
-        data.qpos[:] = physics.qpos
-        data.mocap_pos[:] = engines.mocap_at(np.asarray(physics.mocap_pos), np.asarray(orbit), time, np)
-        data.mocap_quat[:] = physics.mocap_quat
-        mujoco.mj_forward(self.model, data)
-
-    def mark(self, geoms: mujoco.MjvScene, state: State) -> None:
-        """Add to `geoms` what is no body: goal, hazards, circle, halo, and the light of a cost."""
-        env, cfg, world = self.env, self.env.config, state.physics
-        if cfg.task in ("goal", "push"):
-            size = (cfg.goal_size, cfg.goal_size / 2, 0)
-            self._add(geoms, "goal", CYLINDER, size, env.goal_position(world), colour("goal"))
-        if cfg.task == "button":  # more opaque than the original's 0.1, which is hardly seen
-            radius = 2 * cfg.buttons_size
-            size = (radius, min(radius, 0.3), 0)
-            rgba = (*colour("button")[:3], 0.35)
-            self._add(geoms, "goal", CYLINDER, size, env.goal_position(world), rgba)
-        if cfg.task == "circle":
-            size = (cfg.circle_radius, 0.01, 0)
-            self._add(geoms, "circle", CYLINDER, size, (0, 0, 0.02), colour("circle"))
-        for xy in env.positions(world, "hazards"):
-            size = (cfg.hazards_size, 0.01, 0)
-            self._add(geoms, "hazard", CYLINDER, size, (*xy, 0.02), colour("hazard"))
-        if cfg.render_lidar_markers:
-            self._mark_halo(geoms, state.obs)
-        if state.cost > 0:
-            place = self.data.body("robot").xpos
-            self._add(geoms, "cost", SPHERE, (0.25, 0, 0), place, faded(RED, 0.5))
-
-    def _mark_halo(self, geoms: mujoco.MjvScene, obs: Any) -> None:
-        """Rows of spheres above the robot, one a kind that is seen.
-
-        A sphere a bin, the more opaque the nearer its target; a larger one where a compass points.
-        """
-        cfg, robot = self.env.config, self.data.body("robot")
-        rotation = robot.xmat.reshape(3, 3)
-        parts = split(obs, self.env.observation_spec)
-        angles = lidar_angles(cfg)
-        height = cfg.render_lidar_offset_init
-        for kind in SEEN:
-            lidar, compass = parts.get(f"{kind}_lidar"), parts.get(f"{kind}_compass")
-            for angle, value in zip(angles, () if lidar is None else lidar, strict=lidar is not None):
-                x, y = cfg.render_lidar_radius * np.cos(angle), cfg.render_lidar_radius * np.sin(angle)
-                rgba = faded(colour(kind), min(1.0, float(value) + 0.1))
-                size = (cfg.render_lidar_size, 0, 0)
-                self._add(geoms, "", SPHERE, size, robot.xpos + rotation @ (x, y, height), rgba)
-            if compass is not None:
-                place = robot.xpos + rotation @ (*(0.15 * compass[:2]), height)
-                self._add(geoms, "", SPHERE, (0.05, 0, 0), place, faded(colour(kind), 0.5))
-            if lidar is not None or compass is not None:
-                height += cfg.render_lidar_offset_delta
-
-    def _add(
-        self, geoms: mujoco.MjvScene, name: str, shape: mujoco.mjtGeom, size: Any, place: Any, rgba: Any
-    ) -> None:
-        """Add one upright geom with its label."""
-        geom = geoms.geoms[geoms.ngeom]
-        add_geom(geoms, shape, size, place, rgba)
-        geom.label = name if self.env.config.render_labels else ""
-
-
-class Runway:
-    """A velocity task's robot on a checkered floor, as `Stage` has Safety Gym's. Cameras run along."""
-
-    def __init__(self, env: Velocity):
-        spec = env.spec()
-        scenes.light(spec, spec.geom("floor"), squares=40)
-        along = mujoco.mjtCamLight.mjCAMLIGHT_TRACK
-        for name, far in (("fixednear", 2), ("fixedfar", 4), ("track", 3)):
-            spec.body("torso").add_camera(name=name, pos=(0, -far, far / 2), quat=BESIDE, mode=along)
-        self.model = spec.compile()
-        self.data = mujoco.MjData(self.model)
-
-    def move(self, world: VelocityWorld) -> None:
-        self.data.qpos[:] = world.physics.qpos
-        mujoco.mj_forward(self.model, self.data)
-
-    def mark(self, geoms: mujoco.MjvScene, state: State) -> None:
-        """The light of a cost."""
-        if state.cost > 0:
-            add_geom(geoms, SPHERE, (0.35, 0, 0), self.data.body("torso").xpos, faded(RED, 0.5))
-
-
-def stage_of(env: SafetyGym | Velocity) -> Stage | Runway:
-    env = drawable(env)
-    return Runway(env) if isinstance(env, Velocity) else Stage(env)
-
-
-def add_geom(geoms: mujoco.MjvScene, shape: mujoco.mjtGeom, size: Any, place: Any, rgba: Any) -> None:
-    """Add one upright geom to a scene."""
-    size, place, rgba = np.array(size, float), np.array(place, float), np.array(rgba, np.float32)
-    mujoco.mjv_initGeom(geoms.geoms[geoms.ngeom], shape.value, size, place, np.eye(3).reshape(9), rgba)
-    geoms.ngeom += 1
 
 
 class Renderer:
@@ -211,6 +69,16 @@ class Renderer:
         mujoco.mjr_render(self._rect, self._geoms, self._context)
         mujoco.mjr_readPixels(pixels, None, self._rect, self._context)
         return pixels[::-1].copy()  # OpenGL's first row is at the bottom
+
+
+def named_camera(model: mujoco.MjModel, name: str) -> mujoco.MjvCamera:
+    names = [model.camera(i).name for i in range(model.ncam)]
+    if name not in names:
+        raise ConfigError(f"no camera {name!r}{nearest(name, names)}")
+    camera = mujoco.MjvCamera()
+    camera.type = mujoco.mjtCamera.mjCAMERA_FIXED.value
+    camera.fixedcamid = names.index(name)
+    return camera
 
 
 def render_episode(
@@ -275,16 +143,15 @@ def run_episode(player: Player, key: jax.Array, length: int) -> State:
     """The states of an episode of mean actions on the host, [length + 1, ...], from the reset on."""
     reset_key, _ = jax.random.split(key)
 
-    def step(now: tuple[State, PyTree], _: None) -> tuple[tuple[State, PyTree], State]:
-        state, carry = now
-        action, carry = player.act(carry, state)
-        state = player.task.step(state, action)
-        return (state, carry), state
+    def step(now: Playing, _: None) -> tuple[Playing, State]:
+        action, carry = player.act(now.carry, now.state)
+        state = player.task.step(now.state, action)
+        return Playing(state, carry, now.alive & ~state.ended), state
 
     def episode() -> State:
-        first = player.task.reset(reset_key)
-        _, rest = jax.lax.scan(step, (first, player.begin()), None, length)
-        return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, rest)
+        start = player.start(reset_key)
+        _, rest = jax.lax.scan(step, start, None, length)
+        return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start.state, rest)
 
     return jax.device_get(jax.jit(episode)())
 
@@ -307,92 +174,3 @@ def write_video(frames: Sequence[np.ndarray], path: str | Path, fps: float = FPS
         os.environ.setdefault("IMAGEIO_FFMPEG_NO_PREVENT_SIGINT", "1")
         options: dict[str, Any] = {"codec": "libx264", "quality": 7, "macro_block_size": 2}
         imageio.mimwrite(path, list(frames), fps=fps, **options)
-
-
-# Where to draw ---------------------------------------------------------------------------------------
-
-
-@functools.cache
-def gl_context() -> Any:
-    """The OpenGL context of this process. Only the cache holds it, so that its end is ours to time."""
-    context = importlib.import_module(f"mujoco.{find_backend()}").GLContext(64, 64)
-    atexit.register(gl_context.cache_clear)  # while its library is still there
-    return context
-
-
-def find_backend() -> str:
-    """The first of MuJoCo's OpenGL backends that works here, or the one that MUJOCO_GL names.
-
-    Raises:
-        NoDisplay: none does.
-    """
-    wanted = os.environ.get("MUJOCO_GL", "").strip().lower()
-    names = BACKENDS.get(platform.system(), ("glfw",))
-    if wanted not in ("", "1", "on", "true", "enable", "enabled"):
-        names = ({"glx": "glfw", "wgl": "glfw"}.get(wanted, wanted),)
-    for name in names:
-        if works(name):
-            return name
-    hint = f"unset MUJOCO_GL={wanted}" if names == (wanted,) else "install libegl1 or libosmesa6"
-    raise NoDisplay(f"nothing to render with here: {', '.join(names)} failed; {hint}")
-
-
-def works(backend: str) -> bool:
-    """Try a backend in a process of its own: a failure would bar the next one from this process."""
-    try:
-        probe = subprocess.run([sys.executable, "-c", PROBE, backend], capture_output=True, timeout=60)
-    except (OSError, subprocess.TimeoutExpired):
-        return False
-    return probe.returncode == 0
-
-
-# Small parts -----------------------------------------------------------------------------------------
-
-
-def drawable(env: Any) -> SafetyGym | Velocity:
-    """`env` without its wrappers.
-
-    Raises:
-        ConfigError: it is neither Safety Gym's nor a velocity task.
-    """
-    inside = innermost(env)
-    if not isinstance(inside, SafetyGym | Velocity):
-        raise ConfigError(
-            "only Safety Gym's environments and velocity tasks can be drawn, not a "
-            f"{type(inside).__name__}"
-        )
-    return inside
-
-
-def named_camera(model: mujoco.MjModel, name: str) -> mujoco.MjvCamera:
-    names = [model.camera(i).name for i in range(model.ncam)]
-    if name not in names:
-        raise ConfigError(f"no camera {name!r}{nearest(name, names)}")
-    camera = mujoco.MjvCamera()
-    camera.type = mujoco.mjtCamera.mjCAMERA_FIXED.value
-    camera.fixedcamid = names.index(name)
-    return camera
-
-
-def lidar_angles(cfg: SafetyGymConfig) -> np.ndarray:
-    """Where each bin is drawn [bins], radians to the left of the robot's x axis."""
-    middle = 0.5 if cfg.lidar_type == "pseudo" else 0.0  # a bin's sector, or the direction of a ray
-    return 2 * np.pi * (np.arange(cfg.lidar_num_bins) + middle) / cfg.lidar_num_bins
-
-
-def split(obs: Any, spec: dict[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
-    """Components of an observation by name, each flat; what follows them is left out."""
-    if isinstance(obs, dict):
-        return {name: np.asarray(value).reshape(-1) for name, value in obs.items()}
-    ends = np.cumsum([int(np.prod(shape)) for shape in spec.values()], dtype=int)
-    return dict(zip(spec, np.split(np.asarray(obs), ends), strict=False))
-
-
-def colour(name: str) -> tuple[float, ...]:
-    """RGBA of a kind, in the singular or the plural."""
-    return scenes.RGBA[name if name in scenes.RGBA else name[:-1]]
-
-
-def faded(rgba: Sequence[float], alpha: float) -> tuple[float, ...]:
-    """The original's way to draw a colour faintly: darker and more transparent, whatever its alpha."""
-    return tuple(alpha * x for x in (*rgba[:3], 1.0))

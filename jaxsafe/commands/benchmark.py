@@ -1,9 +1,9 @@
 """Measure environments and fused training: jaxsafe benchmark point_goal1 --num-envs 1024
 
-Each row is one program, compiled apart from its runs: the median of `--repeats` runs, after as many
-as make `--warmup` steps of each environment: fresh layouts, where nothing touches yet, are faster.
-With `--algo` a row is the algorithm's whole update, else random actions, resets included. A physics
-step is one substep; the forward pass at the end of a step is not counted.
+Each row is one program. Compiling is timed apart. The rate is the median of --repeats runs, after
+--warmup steps of each environment: fresh layouts, where nothing touches yet, are faster. With --algo a
+run is an update of the algorithm, else steps with random actions, resets included. A physics step is
+one substep. The forward pass at the end of a step is not counted.
 """
 
 import argparse
@@ -175,26 +175,42 @@ def main() -> int:
 def command() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.error = fail  # type: ignore[method-assign]
-    parser.add_argument("envs", nargs="*", metavar="ENV")
+    parser.add_argument("envs", nargs="*", metavar="ENV", help="tasks to measure")
     parser.add_argument(
-        "--num-envs", type=number(Amount), nargs="+", default=[256], help="of each seed"
+        "--num-envs",
+        type=number(Amount),
+        nargs="+",
+        default=[256],
+        help="environments of each seed (default 256)",
     )
-    parser.add_argument("--seeds", type=number(Devices), default=1)
     parser.add_argument(
-        "--devices", type=number(Devices), default=1, help="over which --algo splits its seeds"
+        "--seeds", type=number(Devices), default=1, help="seeds side by side (default 1)"
     )
-    parser.add_argument("--engine", default="auto", help="auto, c, warp or jax")
     parser.add_argument(
-        "--awake", type=number(Iterations), metavar="K", help="vases, and gremlins, simulated at once"
+        "--devices", type=number(Devices), default=1, help="devices over which --algo splits its seeds"
     )
-    parser.add_argument("--algo", help="measure its update instead of random actions")
+    parser.add_argument("--engine", default="auto", help="auto (default), c, warp or jax")
+    parser.add_argument(
+        "--awake",
+        type=number(Iterations),
+        metavar="K",
+        help="how many vases and gremlins are simulated at once",
+    )
+    parser.add_argument("--algo", help="measure updates of this algorithm instead of random actions")
     parser.add_argument("--horizon", type=number(Amount), help="steps of each environment in a run")
     parser.add_argument(
-        "--warmup", type=number(Period), default=200, help="steps of each environment before"
+        "--warmup",
+        type=number(Period),
+        default=200,
+        help="steps of each environment before the measurement (default 200)",
     )
-    parser.add_argument("--repeats", type=number(Iterations), default=5)
+    parser.add_argument("--repeats", type=number(Iterations), default=5, help="runs (default 5)")
     parser.add_argument(
-        "--peer", nargs="*", default=[], metavar="NAME=PYTHON", help="also measure crax, ... (peers.py)"
+        "--peer",
+        nargs="*",
+        default=[],
+        metavar="NAME=PYTHON",
+        help="also measure another library, as crax=PYTHON (see peers.py)",
     )
     parser.add_argument("--json", type=Path, help="append the rows to this file, a line each")
     args = parser.parse_args()

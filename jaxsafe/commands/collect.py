@@ -2,6 +2,7 @@
 
 import argparse
 import functools
+import sys
 import time
 from pathlib import Path
 from typing import Annotated, Any
@@ -21,6 +22,16 @@ from jaxsafe.run.policies import CODE, open_run
 Size = Annotated[int, Bounds(1, 10**9)]
 OPTIONS = {"size": 1e6, "out": "data.hdf5", "actions": "sampled", "seed": 1}
 
+EPILOG = f"""\
+  jaxsafe collect runs/ppo:0.5 runs/ppo_lag:0.5 size=1e6 out=mixed.hdf5
+
+  size=1e6         transitions in all
+  out=data.hdf5    the file to write, .hdf5 or .npz
+  actions=sampled  or mean
+  seed=1           of the episodes
+
+If a run has an environment, algorithm or robot of your own, name it: {", ".join(CODE)}."""
+
 
 def main() -> int:
     """Exit status: 2 for bad input, 130 if stopped."""
@@ -28,14 +39,17 @@ def main() -> int:
 
 
 def command() -> int:
-    parser = argparse.ArgumentParser(description="Record whole episodes of trained policies in a file.")
+    parser = argparse.ArgumentParser(
+        description="Record whole episodes of trained policies in a data set.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     parser.error = fail  # type: ignore[method-assign]
     parser.add_argument(
         "words",
         nargs="+",
         metavar="RUN:SHARE",
-        help="run folders, each with its share of the transitions; then size=1e6, out=data.hdf5 or "
-        f".npz, actions=sampled or mean, seed=1; and {', '.join(CODE)} where they are yours",
+        help="run folders, each with its share of the transitions",
     )
     words = parser.parse_args().words
     given = dict(word.split("=", 1) for word in words if "=" in word)
@@ -50,6 +64,7 @@ def command() -> int:
         stop.nothing_to_save = "stopped; nothing is written"
         runs = [Ingredient(open_run(folder, code), share) for folder, share in recipe]
         begun = time.perf_counter()
+        print(f"playing episodes with {size:,} steps ...", file=sys.stderr, flush=True)
         made = collect(runs, size, seed, sampled)
         env = runs[0].run.settings.plain()["env"]
         more = {"run": made.run, "policy": made.policy, "episode": made.data.episodes.number}

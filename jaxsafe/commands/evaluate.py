@@ -20,20 +20,23 @@ def main() -> int:
 
 
 def command() -> int:
-    parser = argparse.ArgumentParser(description="Evaluate the policy of a run over fresh episodes.")
+    parser = argparse.ArgumentParser(
+        description="Play fresh episodes with the policies of a run, and print what they earn and cost."
+    )
     parser.error = fail  # type: ignore[method-assign]
     parser.add_argument("run", type=Path, metavar="RUN", help="a run folder")
     parser.add_argument(
         "code",
         nargs="*",
         metavar=", ".join(CODE),
-        help="where the run's environment, algorithm or robot is yours",
+        help="your own environment, algorithm or robot, if the run has one",
     )
+    parser.add_argument("--seed", type=number(Seed), default=1, help="seed of the episodes (default 1)")
     parser.add_argument(
-        "--seed", type=number(Seed), default=1, help="of the fresh episodes (default 1)"
-    )
-    parser.add_argument(
-        "--episodes", type=number(EpisodeCount), default=100, help="for each seed (default 100)"
+        "--episodes",
+        type=number(EpisodeCount),
+        default=100,
+        help="episodes for each seed of the run (default 100)",
     )
     args = parser.parse_args()
     use_compilation_cache()

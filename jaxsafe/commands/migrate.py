@@ -26,10 +26,12 @@ def command() -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.error = fail  # type: ignore[method-assign]
-    parser.add_argument("source", choices=("omnisafe", "safety_gym", *COMMANDS))
-    parser.add_argument("config", metavar="CONFIG", help="a file; of ambs and alf the quoted command")
-    parser.add_argument("--algo", default="", help="OmniSafe's name (default: the file's)")
-    parser.add_argument("--env", default="", help="OmniSafe's name, or ours (default: the file's)")
+    parser.add_argument(
+        "source", choices=("omnisafe", "safety_gym", *COMMANDS), help="what CONFIG is from"
+    )
+    parser.add_argument("config", metavar="CONFIG", help="a file; of ambs and alf a command in quotes")
+    parser.add_argument("--algo", default="", help="OmniSafe's name of the algorithm")
+    parser.add_argument("--env", default="", help="OmniSafe's name of the environment, or ours")
     args = parser.parse_args()
     path = Path(args.config)
     if args.source in COMMANDS:

@@ -38,14 +38,24 @@ def command() -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.error = fail  # type: ignore[method-assign]
-    parser.add_argument("runs", nargs="+", type=Path, metavar="RUNS")
+    parser.add_argument(
+        "runs", nargs="+", type=Path, metavar="RUNS", help="run folders, sweeps, or folders of them"
+    )
     parser.add_argument(
         "--by", nargs="+", metavar="FIELD", default=[],
-        help="what tells settings apart, as algo.name or algo.cost_limit; runs that agree in it "
-        "are averaged (default: the algorithm, and whatever else they differ in)",
+        help="fields that tell settings apart, such as algo.cost_limit; runs with the same values are "
+        "averaged (default: the algorithm and all settings in which the runs differ)",
     )  # fmt: skip
-    parser.add_argument("--published", type=Path, metavar="CSV", help="figures to set beside")
-    parser.add_argument("--out", type=Path, default=Path("comparison"), metavar="DIR")
+    parser.add_argument(
+        "--published", type=Path, metavar="CSV", help="published figures to show beside the runs"
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("comparison"),
+        metavar="DIR",
+        help="folder to write to (default comparison)",
+    )
     args = parser.parse_args()
     published = read_published(args.published) if args.published else {}
     runs = read(args.runs)

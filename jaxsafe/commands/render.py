@@ -19,10 +19,12 @@ def command() -> int:
     parser = viewing.parser_of(
         "Film one episode of the policy of a run, or of several runs side by side in one layout.",
         "RUN",
-        f"run folders; and {', '.join(CODE)}, where that is yours",
+        f"run folders, and your own environment, algorithm or robot: {', '.join(CODE)}",
     )
     parser.add_argument(
-        "--out", type=Path, help="an .mp4 or .gif (default RUN/video.mp4; of several compared.mp4)"
+        "--out",
+        type=Path,
+        help="the .mp4 or .gif to write (default RUN/video.mp4, for several runs compared.mp4)",
     )
     args, what = viewing.parse(parser)
     folders = what.folders

@@ -1,10 +1,10 @@
 """Train what a study lacks: jaxsafe study NAME [--minutes 8]
 
-docs/results/NAME/study.yaml lists runs in order of worth. Each that is not done is trained by
-`jaxsafe train` in RUNS/NAME/, and when it is done its figures and curves go into the study and onto
-its page. A run that is stopped, by Ctrl-C or after --minutes, continues the next time, as long as its
-folder in RUNS is there. Failed and diverged runs are kept and marked. Failed ones are tried again, as
-the last.
+docs/results/NAME/study.yaml lists the runs of a study, the most important first. This command trains
+each run that is not done, in DIR/NAME/. Then it adds the run's figures and curves to the study and to
+its page. A run that was stopped, by Ctrl-C or by --minutes, continues the next time. Its folder in DIR
+has to be there for that. Runs that failed or diverged are kept and marked. Failed ones are tried again
+at the end.
 
 Several runs share a GPU with --at-once; start NVIDIA's multi-process service first
 (docs/performance.md). Exit status: 0 if nothing is left to do, 130 if stopped, 1 if a run failed, 2 for
@@ -57,14 +57,14 @@ def train(options: list[str], place: Place) -> int:
     """Run `jaxsafe train` with its output in a log beside the run folder. Returns its exit status."""
     place.folder.parent.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, "-m", "jaxsafe", "train", *in_folder(options, place.folder)]
-    own = {} if place.gpu is None else {"CUDA_VISIBLE_DEVICES": place.gpu}
-    own |= {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}  # several share a GPU
+    visible = {} if place.gpu is None else {"CUDA_VISIBLE_DEVICES": place.gpu}
+    visible |= {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}  # several share a GPU
     with files.appending(log_of(place.folder)) as log:
         process = subprocess.Popen(
             command,
             stdout=log,
             stderr=subprocess.STDOUT,
-            env=os.environ | own,
+            env=os.environ | visible,
             start_new_session=True,  # Ctrl-C is passed on once, below
         )
         while process.poll() is None:
@@ -209,17 +209,35 @@ def main(train: Callable[[list[str], Place], int] = train) -> int:
             description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
         )
         parser.error = fail  # type: ignore[method-assign]
-        parser.add_argument("study", metavar="NAME", help="in docs/results, or a folder")
-        parser.add_argument("--list", action="store_true", help="say what is done, and train nothing")
+        parser.add_argument("study", metavar="NAME", help="a study in docs/results, or its folder")
+        parser.add_argument("--list", action="store_true", help="only list which runs are done")
         parser.add_argument(
-            "--commands", action="store_true", help="print what is left, to run elsewhere"
+            "--commands",
+            action="store_true",
+            help="only print the commands that are left, for a scheduler",
         )
-        parser.add_argument("--page", action="store_true", help="draw the page, and train nothing")
-        parser.add_argument("--minutes", type=number(Minutes), default=float("inf"), help="then stop")
-        parser.add_argument("--only", nargs="+", default=[], metavar="RUN", help="as --list names it")
-        parser.add_argument("--gpus", help="their indices, with commas between")
-        parser.add_argument("--at-once", type=number(Devices), default=1, help="runs on each GPU")
-        parser.add_argument("--runs", type=Path, default=Path("runs") / "studies", metavar="DIR")
+        parser.add_argument("--page", action="store_true", help="only draw the page")
+        parser.add_argument(
+            "--minutes", type=number(Minutes), default=float("inf"), help="stop after so many minutes"
+        )
+        parser.add_argument(
+            "--only",
+            nargs="+",
+            default=[],
+            metavar="RUN",
+            help="only these runs, by the names that --list prints",
+        )
+        parser.add_argument("--gpus", help="which GPUs to use, as 0,1,2,3")
+        parser.add_argument(
+            "--at-once", type=number(Devices), default=1, help="runs at a time on each GPU (default 1)"
+        )
+        parser.add_argument(
+            "--runs",
+            type=Path,
+            default=Path("runs") / "studies",
+            metavar="DIR",
+            help="where the run folders are (default runs/studies)",
+        )
         args = parser.parse_args()
         study = studies.read(find_study(args.study))
         names = [study_files.name_of(run) for run in study.runs]

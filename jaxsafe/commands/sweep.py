@@ -16,10 +16,10 @@ from jaxsafe.run.progress import Reporter
 EPILOG = """\
 Options are those of training (jaxsafe train --help), and
 
-  max_parallel=N   members (settings x seeds) trained at once; default: what the memory holds
-  run_dir=FOLDER   the sweep's folder; default: runs/sweep-<env>-<algo>-<a hash of the settings>
+  max_parallel=N   how many settings x seeds are trained at once (default: as many as the memory holds)
+  run_dir=FOLDER   the folder of the sweep (default: runs/sweep-ENV-ALGO-HASH, a hash of the settings)
 
-The same command again goes on where it was stopped."""
+Give the same command again to go on after a stop."""
 
 
 def main() -> int:
@@ -29,13 +29,15 @@ def main() -> int:
 
 def command() -> int:
     parser = argparse.ArgumentParser(
-        description="Train a grid: jaxsafe sweep algo=ppo_lag algo.cost_limit=5,10,25",
+        description="Train a grid of settings: jaxsafe sweep algo=ppo_lag algo.cost_limit=5,10,25",
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.error = fail  # type: ignore[method-assign]
     parser.add_argument("options", nargs="*", metavar="key=value[,value...]")
-    parser.add_argument("--summary", type=Path, metavar="SWEEP", help="only rewrite its summary")
+    parser.add_argument(
+        "--summary", type=Path, metavar="SWEEP", help="only write the summary of this sweep again"
+    )
     args = parser.parse_args()
     given = read_values(args.options)  # this imports what is the user's code
     if args.summary:

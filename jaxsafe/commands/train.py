@@ -10,7 +10,7 @@ from rich.console import Console
 from jaxsafe.commands.guard import guarded
 from jaxsafe.commands.jaxsafe import called
 from jaxsafe.report.finish import finish
-from jaxsafe.run import distributed, session
+from jaxsafe.run import distributed, help, session
 from jaxsafe.run.arguments import each_job
 from jaxsafe.run.progress import Reporter
 from jaxsafe.run.session import Session
@@ -21,6 +21,9 @@ def main() -> int:
     """Exit status: 2 for bad input, 1 for a failed disk, 3 if it diverged, 130 if stopped."""
 
     def command() -> int:
+        if {"-h", "--help"} & {*sys.argv}:
+            print(help.text([word for word in sys.argv[1:] if "=" in word]), end="")
+            return 0
         each_job(sys.argv[1:], job)
         return 0
 

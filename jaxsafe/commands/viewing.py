@@ -26,8 +26,13 @@ def parser_of(description: str, what: str, more: str) -> argparse.ArgumentParser
     parser = argparse.ArgumentParser(description=description)
     parser.error = fail  # type: ignore[method-assign]
     parser.add_argument("what", nargs="+", metavar=what, help=more)
-    parser.add_argument("--index", type=number(Index), default=0, help="which of a run's policies (0)")
-    parser.add_argument("--seed", type=number(Seed), default=1, help="of the (first) episode (1)")
+    parser.add_argument(
+        "--index",
+        type=number(Index),
+        default=0,
+        help="which policy of a run, from 0",
+    )
+    parser.add_argument("--seed", type=number(Seed), default=1, help="of the first episode (default 1)")
     return parser
 
 

@@ -6,7 +6,9 @@ from jaxsafe.commands import viewing
 from jaxsafe.commands.guard import guarded
 from jaxsafe.commands.jaxsafe import called
 from jaxsafe.config import ConfigError, Port, one_line
-from jaxsafe.envs.view import watch
+from jaxsafe.envs.view import page, window
+from jaxsafe.envs.view.backend import NoDisplay
+from jaxsafe.envs.view.playback import Playback
 from jaxsafe.report.film import NoVideo
 from jaxsafe.run.arguments import compose, number
 from jaxsafe.run.settings import make_env
@@ -21,19 +23,19 @@ def command() -> int:
     parser = viewing.parser_of(
         "Watch the policy of a run as it acts, or drive a robot with the arrow keys.",
         "RUN or env=NAME",
-        "a run folder; or a task to drive, and options of it: env=car_goal1 env.vases_num=5",
+        "a run folder, or a task to drive with its options: env=car_goal1 env.vases_num=5",
     )
-    parser.add_argument("--page", action="store_true", help="a page, though there is a display")
+    parser.add_argument("--page", action="store_true", help="serve a page even if there is a display")
     parser.add_argument("--port", type=number(Port), default=8080, help="of the page (default 8080)")
-    parser.add_argument("--open", action="store_true", help="open the page in a browser here")
+    parser.add_argument("--open", action="store_true", help="also open the page in a browser here")
     args, what = viewing.parse(parser)
     if len(what.folders) > 1:
         raise ConfigError(
             f"{what.folders[1]}: expected one run, or env=NAME; side by side: {called('render')}"
         )
-    page = args.page or args.open or not watch.has_display()
-    if page:
-        watch.check_page(args.port, args.open)
+    in_browser = args.page or args.open or not window.has_display()
+    if in_browser:
+        page.check_page(args.port, args.open)
     if what.folders:
         (policy,) = what.policies(args.index)
         title = f"{policy.settings.env_name}, {policy.settings.algo_name}"
@@ -46,12 +48,12 @@ def command() -> int:
     print(f"{title}: compiling a step ...", flush=True)
     try:
         with contextlib.suppress(KeyboardInterrupt):  # the page's server may have taken it
-            session = watch.Playback(env, player, args.seed)  # type: ignore[arg-type]
-            if page:
-                watch.serve_page(session, title, args.port, args.open)
+            playback = Playback(env, player, args.seed)  # type: ignore[arg-type]
+            if in_browser:
+                page.serve_page(playback, title, args.port, args.open)
             else:
-                watch.open_window(session)
+                window.open_window(playback)
         print("closed")
-    except watch.render.NoDisplay as error:
+    except NoDisplay as error:
         raise NoVideo(one_line(error)) from error
     return 0

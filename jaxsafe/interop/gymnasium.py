@@ -1,8 +1,12 @@
-"""Our environments for Gymnasium: importing this module registers each under two ids.
+"""Our environments for Gymnasium: importing this module registers their ids.
 
     gymnasium.make("jaxsafe.interop.gymnasium:jaxsafe/point_goal1")
     gymnasium.make("jaxsafe.interop.gymnasium:jaxsafe/PointGoal1-v0")
+    gymnasium.make("jaxsafe.interop.gymnasium:jaxsafe/SafetyPointGoal1-v0")
     gymnasium.make_vec("jaxsafe.interop.gymnasium:jaxsafe/point_goal1", num_envs=8)
+
+The second is Safety Gym's id, the third Safety-Gymnasium's with its rules. All begin with `jaxsafe/`,
+so that none takes the place of Safety-Gymnasium's own.
 
 The cost of a step is `info["cost"]`, that of each constraint `info["cost_<name>"]`. `SixTuple` and
 `SixTupleVector` give it beside the reward, as Safety-Gymnasium does. What steps is one compiled
@@ -20,6 +24,7 @@ import numpy as np
 from jaxsafe import envs
 from jaxsafe.config import ConfigError
 from jaxsafe.envs.registry import IMPLIED
+from jaxsafe.envs.safety_gym import suite
 from jaxsafe.envs.view.render import FPS, Renderer
 from jaxsafe.learn.rollout import RolloutState, init_rollout, restart
 from jaxsafe.types import Env, State
@@ -241,10 +246,21 @@ def advance(
     return restart(env, rollout, state.terminated | truncated, key), state, state.terminated, truncated
 
 
-for _id, _name in {**{name: name for name in envs.ENVS}, **envs.ALIASES}.items():
+def ids() -> dict[str, dict[str, Any]]:
+    """What each id stands for: arguments of `GymEnv`."""
+    found: dict[str, dict[str, Any]] = {name: {"env": name} for name in envs.ENVS}
+    for alias, name in envs.ALIASES.items():
+        short = alias.removeprefix("Safexp-")
+        found[short] = {"env": name, **IMPLIED.get(alias, {})}
+        if suite.safety_gymnasium(f"Safety{short}") == name:
+            found[f"Safety{short}"] = {"env": name, "rules": "safety_gymnasium"}
+    return found
+
+
+for _id, _kwargs in ids().items():
     gymnasium.register(
-        f"jaxsafe/{_id.removeprefix('Safexp-')}",
+        f"jaxsafe/{_id}",
         entry_point="jaxsafe.interop.gymnasium:GymEnv",
         vector_entry_point="jaxsafe.interop.gymnasium:GymVectorEnv",
-        kwargs={"env": _name, **IMPLIED.get(_id, {})},
+        kwargs=_kwargs,
     )

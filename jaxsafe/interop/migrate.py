@@ -3,10 +3,11 @@
     jaxsafe migrate omnisafe CONFIG.json|.yaml [--algo PPOLag] [--env SafetyPointGoal1-v0]
     jaxsafe migrate safety_gym CONFIG.json|.yaml
 
-The command goes to stdout, what became of every key to stderr. Of OmniSafe it takes the config.json
-of a run, a file of its configs, or a part of either; what a file leaves out has OmniSafe's
-default, which is `preset=published compat=omnisafe`. Of Safety Gym it takes the dict that
-Engine(config) is given.
+The command goes to stdout. What became of every key goes to stderr. CONFIG is
+
+    omnisafe    the config.json of a run, or a file of its configs, or a part of either. What a file
+                leaves out has OmniSafe's default: preset=published compat=omnisafe.
+    safety_gym  the dict that Engine(config) is given.
 
 Source: the configs of OmniSafe after 0.5.0 (2025), and Safety Gym's Engine.
 """
@@ -26,7 +27,8 @@ from jaxsafe.envs.registry import IMPLIED
 from jaxsafe.envs.safety_gym import suite
 from jaxsafe.envs.safety_gym.config import config_from_plain as read_config
 from jaxsafe.envs.safety_gym.config import defaults
-from jaxsafe.learn.off_policy import OffPolicyConfig, PriceClockConfig
+from jaxsafe.learn.bill import PriceClockConfig
+from jaxsafe.learn.off_policy import OffPolicyConfig
 from jaxsafe.learn.offline import OfflineConfig
 from jaxsafe.learn.row import Row
 from jaxsafe.run.settings import OFFLINE_UPDATES, TrainConfig, algo_options, as_text

@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 import flax.struct
 import jax
+import jax.numpy as jnp
 
 from jaxsafe.learn.batch import select_rows
 from jaxsafe.types import Env, Policy, PyTree, State
@@ -24,6 +25,14 @@ def learned_of(ts: Any) -> Learned:
     return Learned(ts.config, ts.params, ts.dual, ts.normaliser)
 
 
+class Playing(NamedTuple):
+    """An episode so far: its state, what the policy remembers, and whether it goes on, bool []."""
+
+    state: State
+    carry: PyTree
+    alive: jax.Array
+
+
 class Player(NamedTuple):
     """A policy with what it has learned, in the environment whose observations it takes."""
 
@@ -34,6 +43,10 @@ class Player(NamedTuple):
     def begin(self) -> PyTree:
         """The carry at the start of an episode."""
         return self.policy.init(self.learned)
+
+    def start(self, key: jax.Array) -> Playing:
+        """The beginning of an episode, whose reset `key` draws."""
+        return Playing(self.task.reset(key), self.begin(), jnp.bool_(True))
 
     def act(
         self, carry: PyTree, state: State, key: jax.Array | None = None

@@ -21,17 +21,26 @@ import jax.numpy as jnp
 import optax
 
 from jaxsafe.config import Iterations, Rate, Weight, config
-from jaxsafe.learn.batch import pmean, select
-from jaxsafe.learn.constraints import Names, each, metrics_by_constraint, signal
+from jaxsafe.learn.batch import pmean
+from jaxsafe.learn.bill import PriceClockConfig
+from jaxsafe.learn.constraints import metrics_by_constraint, signal
 from jaxsafe.learn.conventions import Convention
+from jaxsafe.learn.critics import (
+    Values,
+    critic_loss,
+    critics_among,
+    expected_cost,
+    init_all_critics,
+    targets_of,
+)
 from jaxsafe.learn.learner import GradientStep, Learner
 from jaxsafe.learn.normalise import CLIP, MIN_STD
-from jaxsafe.learn.off_policy import OffPolicyConfig, PriceClockConfig
+from jaxsafe.learn.off_policy import OffPolicyConfig
 from jaxsafe.learn.replay import Transitions
 from jaxsafe.learn.sequences import averaged, no_moments, standard
-from jaxsafe.learn.steps import Trainable, adam
+from jaxsafe.learn.steps import Trainable, adam, descend_each, follow
 from jaxsafe.learn.treatments import LagrangianConfig, PIDConfig, Treatment, no_treatment
-from jaxsafe.nn.critics import init_critics, q_values
+from jaxsafe.nn.critics import q_values
 from jaxsafe.types import Env, Metrics, PyTree
 
 
@@ -142,154 +151,123 @@ class Actor(NamedTuple):
 
 def actor_critic(env: Env, actor: Actor, treatment: Treatment) -> Learner:
     """The learner that `actor` makes. Without a treatment there are no critics of cost."""
-    constrained = treatment is not no_treatment
-
     names = treatment.constrained_costs
+    explore = actor.explore or actor.act
 
     def init(key: jax.Array, obs_size: int, action_size: int, cfg: Any) -> Trainable:
         actor_key, critic_key = jax.random.split(key)
-        own = actor.init(actor_key, obs_size, action_size, cfg)
-        critics = {"critic_r": init_critics(critic_key, obs_size, action_size, actor.critics, cfg)}
-        if constrained:
-            critics["critic_c"] = init_cost_critics(
-                jax.random.fold_in(critic_key, 1), obs_size, action_size, names(cfg), cfg
-            )
+        parts = actor.init(actor_key, obs_size, action_size, cfg)
+        sizes = obs_size, action_size
+        critics = init_all_critics(critic_key, sizes, actor.critics, treatment, cfg)
         optimisers = actor.optimisers(cfg, 1.0) | dict.fromkeys(critics, adam(cfg.critic_lr, cfg))
-        trained = own | critics
-        opt_state: dict[str, Any] = {
-            name: optimisers[name].init(params) for name, params in trained.items()
-        }
-        if constrained and cfg.cost_normalize:
+        trained = parts | critics
+        opt_state = {name: optimisers[name].init(params) for name, params in trained.items()}
+        if treatment is not no_treatment and cfg.cost_normalize:
             opt_state["cost_scale"] = no_moments(max(len(names(cfg)), 1))
-        targets = critics | {name: own[name] for name in actor.followed}
+        targets = critics | {name: parts[name] for name in actor.followed}
         return Trainable(trained | {"targets": targets}, opt_state)
 
     def step(
         nets: Trainable, batch: Transitions, at: GradientStep, cfg: Any, axis_name: str | None
     ) -> tuple[Trainable, Metrics]:
-        params, targets = nets.params, nets.params["targets"]
-        next_key, key = jax.random.split(at.key)
+        critic_key, policy_key = jax.random.split(at.key)
         share = at.remaining if cfg.lr_decay else 1.0
+        charged, nets = charged_in(nets, batch, cfg, axis_name)
+        y = targets_at(nets.params, batch, charged, critic_key, cfg)
+        adams = dict.fromkeys(critics_among(nets.params), adam(cfg.critic_lr * share, cfg))
 
-        def mean(x: jax.Array) -> jax.Array:
-            return (batch.weight * x).sum()  # this device's share
+        def errors(critics: dict[str, PyTree]) -> tuple[jax.Array, Metrics]:
+            return critic_loss(critics, batch, y, names(cfg), cfg)
 
-        # critics
-        next_action, bonus = actor.next_action(params, targets, batch.next_obs, next_key, cfg)
-        goes_on = ~batch.terminated
-        next_q = q_values(targets["critic_r"], batch.next_obs, next_action, cfg).min(0)
-        y_r = batch.reward + cfg.discount**batch.steps * jnp.where(goes_on, next_q + bonus, 0.0)
-        critics = {"critic_r": params["critic_r"]}
-        y_c, scale = jnp.zeros(()), ()
-        if constrained:
-            critics["critic_c"] = params["critic_c"]
-            if cfg.cost_action == "mean":
-                next_action = actor.act(params, batch.next_obs, None, cfg)
-            next_c = reduced_costs(targets["critic_c"], batch.next_obs, next_action, names(cfg), cfg)
-            charged = signal(env, batch, names(cfg))
-            if cfg.cost_normalize:
-                costs = charged.reshape(*batch.reward.shape, -1)
-                scale = averaged(nets.opt_state["cost_scale"], costs, batch.weight, axis_name, memory=1)
-                charged = standard(scale, costs, cfg.cost_centre, MIN_STD, CLIP).reshape(charged.shape)
-            ahead = (cfg.cost_discount**batch.steps * goes_on).reshape(-1, *(1,) * (charged.ndim - 1))
-            y_c = charged + ahead * next_c
+        nets, metrics = descend_each(errors, nets, adams, axis_name)
 
-        def critic_loss(critics: dict[str, PyTree]) -> tuple[jax.Array, Metrics]:
-            q = q_values(critics["critic_r"], batch.obs, batch.action, cfg)
-            loss = mean(((q - y_r) ** 2).sum(0))
-            metrics = {"train/critic_loss": loss, "train/q": mean(q.mean(0))}
-            if constrained:
-                q_c = cost_values(critics["critic_c"], batch.obs, batch.action, names(cfg), cfg)
-                mean_c = each(mean, names(cfg))
-                loss_c = mean_c(((q_c - y_c) ** 2).sum(0))
-                metrics |= {"train/critic_loss_c": loss_c, "train/q_c": mean_c(q_c.mean(0))}
-                loss += loss_c.sum()
-            return loss, metrics
+        def improve(nets: Trainable) -> tuple[Trainable, Metrics]:
+            """The policy climbs what the new critics say, and the targets follow."""
+            loss = policy_loss(nets.params, batch, at._replace(key=policy_key), cfg, axis_name)
+            nets, metrics = descend_each(loss, nets, actor.optimisers(cfg, share), axis_name)
+            return follow(nets, cfg.tau), metrics
 
-        grads, metrics = jax.grad(critic_loss, has_aux=True)(critics)
+        nets, found = at_every(cfg.policy_delay, at.number, improve, nets)
+        return nets, metrics_by_constraint(metrics | found, names(cfg))
 
-        def moved(trained: dict[str, PyTree], grads: dict[str, PyTree], optimisers: dict[str, Any]):
-            """(parameters, states of the optimisers) after a step along `grads`."""
-            new, states = {}, {}
-            for name, gradient in pmean(grads, axis_name).items():
-                change, states[name] = optimisers[name].update(gradient, nets.opt_state[name])
-                new[name] = optax.apply_updates(trained[name], change)
-            return new, states
+    def charged_in(
+        nets: Trainable, batch: Transitions, cfg: Any, axis_name: str | None
+    ) -> tuple[jax.Array, Trainable]:
+        """What is held under the limit, as the critics see it, and `nets` with its scale."""
+        charged = signal(env, batch, names(cfg))
+        if "cost_scale" not in nets.opt_state:
+            return charged, nets
+        costs = charged.reshape(*batch.reward.shape, -1)
+        past = nets.opt_state["cost_scale"]
+        scale = averaged(past, costs, batch.weight, axis_name, memory=1)
+        charged = standard(scale, costs, cfg.cost_centre, MIN_STD, CLIP).reshape(charged.shape)
+        return charged, nets._replace(opt_state=nets.opt_state | {"cost_scale": scale})
 
-        adam_c = adam(cfg.critic_lr * share, cfg)
-        critics, critic_states = moved(critics, grads, dict.fromkeys(critics, adam_c))
+    def targets_at(
+        params: dict[str, PyTree], batch: Transitions, charged: jax.Array, key: jax.Array, cfg: Any
+    ) -> Values:
+        """What the critics aim at: y_r and y_c."""
+        targets, obs = params["targets"], batch.next_obs
+        action, bonus = actor.next_action(params, targets, obs, key, cfg)
+        q_r = q_values(targets["critic_r"], obs, action, cfg).min(0)
+        if treatment is not no_treatment and cfg.cost_action == "mean":
+            action = actor.act(params, obs, None, cfg)
+        q_c = expected_cost(targets, obs, action, names(cfg), cfg)
+        return targets_of(batch, charged, Values(q_r + bonus, q_c), names(cfg), cfg)
 
-        def unit(worth: jax.Array) -> jax.Array:
-            """What a price of 1 on one unit of cost is worth, float []."""
-            if cfg.price_unit == "reward":
-                return jnp.ones(())
-            centre = pmean(mean(worth), axis_name)
-            variance = pmean(mean((worth - centre) ** 2), axis_name)
-            return jax.lax.stop_gradient(jnp.sqrt(variance + 1e-12))
+    def policy_loss(
+        params: dict[str, PyTree],
+        batch: Transitions,
+        at: GradientStep,
+        cfg: Any,
+        axis_name: str | None,
+    ) -> Callable[[dict[str, PyTree]], tuple[jax.Array, Metrics]]:
+        """The loss of the actor's parameters, with the critics among `params`."""
 
-        # policy
-        def policy_loss(own: dict[str, PyTree]) -> tuple[jax.Array, Metrics]:
-            proposal = actor.propose(own, batch.obs, key, cfg)
-            q_r = actor.pick(q_values(critics["critic_r"], batch.obs, proposal.action, cfg))
+        def loss(parts: dict[str, PyTree]) -> tuple[jax.Array, Metrics]:
+            proposal = actor.propose(parts, batch.obs, at.key, cfg)
+            q_r = actor.pick(q_values(params["critic_r"], batch.obs, proposal.action, cfg))
             worth = q_r + proposal.bonus
-            if constrained:
-                q_c = reduced_costs(critics["critic_c"], batch.obs, proposal.action, names(cfg), cfg)
-                worth = treatment.advantage(at.dual, worth / unit(worth), q_c)
-            loss = -mean(worth)
-            metrics = {"train/actor_loss": loss, **jax.tree.map(mean, proposal.metrics)}
-            return loss + mean(proposal.extra), metrics
+            if treatment is not no_treatment:
+                q_c = expected_cost(params, batch.obs, proposal.action, names(cfg), cfg)
+                unit = price_unit(batch, worth, cfg, axis_name)
+                worth = treatment.advantage(at.dual, worth / unit, q_c)
+            climbed = batch.mean(worth)
+            metrics = {"train/actor_loss": -climbed, **jax.tree.map(batch.mean, proposal.metrics)}
+            return batch.mean(proposal.extra) - climbed, metrics
 
-        own = {name: params[name] for name in actor.optimisers(cfg, share)}
-        grads, policy_metrics = jax.grad(policy_loss, has_aux=True)(own)
-        new, states = moved(own, grads, actor.optimisers(cfg, share))
+        return loss
 
-        # targets follow, where the policy moves
-        aims = critics | {name: new[name] for name in actor.followed}
-        followed = optax.incremental_update(aims, targets, cfg.tau)
-        old_states = {name: nets.opt_state[name] for name in own}
-        due = (at.number + 1) % cfg.policy_delay == 0
-        new, states = select(
-            due,
-            (new | {"targets": followed}, states),
-            (own | {"targets": targets}, old_states),
-        )
-        metrics = pmean(metrics | policy_metrics, axis_name)
-        metrics = metrics_by_constraint(metrics, names(cfg))
-        scales = {"cost_scale": scale} if constrained and cfg.cost_normalize else {}
-        return Trainable(new | critics, states | critic_states | scales), metrics
-
-    return Learner(init=init, act=actor.act, step=step, explore=actor.explore)
+    return Learner(
+        init=init,
+        act=lambda learned, obs, key: actor.act(learned.params, obs, key, learned.config),
+        step=step,
+        explore=lambda learned, obs, key: explore(learned.params, obs, key, learned.config),
+    )
 
 
-# ---- critics of cost ---------------------------------------------------------------------------
+def price_unit(batch: Transitions, worth: jax.Array, cfg: Any, axis_name: str | None) -> jax.Array:
+    """What a price of 1 on one unit of cost weighs as much as, float []; `worth` [B] is Q_r."""
+    if cfg.price_unit == "reward":
+        return jnp.ones(())
+    centre = pmean(batch.mean(worth), axis_name)
+    variance = pmean(batch.mean((worth - centre) ** 2), axis_name)
+    return jax.lax.stop_gradient(jnp.sqrt(variance + 1e-12))
 
 
-def init_cost_critics(
-    key: jax.Array, obs_size: int, action_size: int, names: Names, cfg: Any
-) -> PyTree:
-    """Stacked, leaves [J, ...]; of several constraints [K, J, ...]."""
-    count = 1 if cfg.cost_reduce == "one" else 2
+def at_every(
+    period: int,
+    number: jax.Array,
+    step: Callable[[Trainable], tuple[Trainable, Metrics]],
+    nets: Trainable,
+) -> tuple[Trainable, Metrics]:
+    """`step(nets)` at every `period`-th gradient step. At the others `nets` stays, and metrics are NaN.
 
-    def of_one(key: jax.Array) -> PyTree:
-        return init_critics(key, obs_size, action_size, count, cfg)
-
-    return jax.vmap(of_one)(jax.random.split(key, len(names))) if names else of_one(key)
-
-
-def cost_values(
-    critics: PyTree, obs: jax.Array, action: jax.Array, names: Names, cfg: Any
-) -> jax.Array:
-    """Q_c of each critic, float [J, B]; of several constraints [J, B, K]."""
-
-    def of_one(critics: PyTree) -> jax.Array:
-        return q_values(critics, obs, action, cfg)
-
-    return jax.vmap(of_one, out_axes=-1)(critics) if names else of_one(critics)
-
-
-def reduced_costs(
-    critics: PyTree, obs: jax.Array, action: jax.Array, names: Names, cfg: Any
-) -> jax.Array:
-    """Q_c, float [B] or [B, K]."""
-    q_c = cost_values(critics, obs, action, names, cfg)
-    return q_c.max(0) if cfg.cost_reduce == "max" else q_c.mean(0)
+    `number` is a function of the loop's clock and has no member axis. So the branch that is not taken
+    costs nothing, under `vmap` over members too.
+    """
+    if period == 1:
+        return step(nets)
+    like = jax.eval_shape(step, nets)[1]
+    nothing = jax.tree.map(lambda x: jnp.full(x.shape, jnp.nan, x.dtype), like)
+    return jax.lax.cond((number + 1) % period == 0, step, lambda nets: (nets, nothing), nets)

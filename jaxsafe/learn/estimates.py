@@ -11,7 +11,7 @@ from jaxsafe.learn.batch import centre, psum, standardise
 from jaxsafe.learn.constraints import Names, each
 from jaxsafe.learn.metrics import explained_variance
 from jaxsafe.learn.normalise import init_normaliser, merge, network_inputs, normalise
-from jaxsafe.learn.returns import advantages
+from jaxsafe.learn.returns import ValuedSteps, advantages
 from jaxsafe.learn.rollout import Bad, Trajectory
 from jaxsafe.nn.gaussian import Gaussian, log_prob
 from jaxsafe.nn.networks import apply_to_rollout
@@ -138,11 +138,9 @@ def estimate_batch(
     def of_signal(
         x: jax.Array, v: jax.Array, next_v: jax.Array, discount: Any, decay: Any
     ) -> SignalEstimate:
-        ends = traj.terminated | bad, traj.done
         x = jnp.where(bad, v, x)  # whose difference to v is 0
-        advantage, error = advantages(
-            cfg.estimator, x, v, next_v, *ends, ratio, discount=discount, decay=decay
-        )
+        steps = ValuedSteps(x, v, next_v, traj.terminated | bad, traj.done)
+        advantage, error = advantages(cfg.estimator, steps, ratio, discount, decay)
         return SignalEstimate(advantage, error + v, error)
 
     v_r, next_v_r = found.value[..., 0], found.next_value[..., 0]

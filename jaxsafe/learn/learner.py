@@ -33,19 +33,20 @@ class Learner(NamedTuple):
     """What a method adds to the loop. Observations are normalised before they come here.
 
     init(key, obs_size, action_size, cfg) -> Trainable.
-    act(params, obs [..., O], key, cfg) -> action [..., A], the mean one where key is None.
+    act(learned, obs [..., O], key) -> action [..., A], the mean one where key is None. `learned` holds
+        networks, `params`, the treatment's state, `dual`, and `config`.
     step(nets, batch, at, cfg, axis_name) -> (Trainable, metrics), one gradient step on Transitions or
         on what `replayed` gives. The weights of `batch` sum to 1 over a device's share, on average over
         devices: a mean is `pmean((weight * x).sum())`.
-    explore(params, obs [N, O], key, cfg) -> action [N, A], how training acts; None: as `act`.
-    replayed(key, ring, span, normaliser, rows, cfg, axis_name) -> (batch, number dropped), what
-        a gradient step takes of a replay, from so many rows. None: Transitions.
+    explore(learned, obs [N, O], key) -> action [N, A], how training acts; None: as `act`.
+    replayed(key, ring, span, normaliser, rows, cfg, axis_name) -> (batch, number dropped), what a
+        gradient step takes of a replay, from so many rows. None: Transitions.
     """
 
     init: Callable[[jax.Array, int, int, Any], Trainable]
-    act: Callable[[PyTree, jax.Array, jax.Array | None, Any], jax.Array]
+    act: Callable[[Learned, jax.Array, jax.Array | None], jax.Array]
     step: Callable[[Trainable, Any, GradientStep, Any, str | None], tuple[Trainable, Metrics]]
-    explore: Callable[[PyTree, jax.Array, jax.Array, Any], jax.Array] | None = None
+    explore: Callable[[Learned, jax.Array, jax.Array], jax.Array] | None = None
     replayed: Callable[..., tuple[Any, jax.Array]] | None = None
 
 
@@ -56,6 +57,6 @@ def policy_by(learner: Learner) -> Policy:
         learned: Learned, carry: PyTree, obs: jax.Array, key: jax.Array | None
     ) -> tuple[jax.Array, PyTree, dict[str, Any]]:
         inputs = network_inputs(learned.normaliser, obs)
-        return learner.act(learned.params, inputs, key, learned.config), carry, {}
+        return learner.act(learned, inputs, key), carry, {}
 
     return Policy(init=lambda learned: (), act=act)

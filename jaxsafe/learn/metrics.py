@@ -17,9 +17,14 @@ BAD = ("train/bad_worlds", "train/bad_obs", "train/bad_reward", "train/bad_cost"
 class Ends(Protocol):
     """Where complete episodes ended, bool [T, N], with their sums and lengths so far, [T, N]."""
 
-    ended: jax.Array
-    episode: Episode
-    length: jax.Array
+    @property
+    def ended(self) -> jax.Array: ...
+
+    @property
+    def episode(self) -> Episode: ...
+
+    @property
+    def length(self) -> jax.Array: ...
 
 
 def explained_variance(error: jax.Array, target: jax.Array, axis_name: str | None) -> jax.Array:

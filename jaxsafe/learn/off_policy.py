@@ -2,8 +2,8 @@
 
 An update is `horizon` steps of every environment. They go in rounds: `learn_every` steps, whose rows
 are written into the replay, and then the gradient steps that `replay_ratio` asks for. What a method
-adds to this is a `Learner`, and a `Treatment` of the constraint. The treatment's price moves on a clock
-of environment steps: however many environments, rounds and gradient steps there are, it moves as often.
+adds to this is a `Learner`, and a `Treatment` of the constraint, whose price moves on a clock of
+environment steps: see `jaxsafe.learn.bill`.
 
 `jit(update)` compiles an iteration, `vmap(update, in_axes=(0, None))` runs seeds or floats of the
 config side by side, and `shard_map(update)` with `axis_name` set splits environments, replay and batch
@@ -33,18 +33,19 @@ from jaxsafe.config import (
     check_values,
     config,
 )
-from jaxsafe.learn.acting import learned_of
+from jaxsafe.learn.acting import Learned, learned_of
 from jaxsafe.learn.batch import all_finite, device_key, masked_mean, psum, select
-from jaxsafe.learn.constraints import (
-    Names,
-    check_cost_names,
-    limit,
-    metrics_by_constraint,
-    signal,
-)
+from jaxsafe.learn.bill import charge, empty_bill, settle
+from jaxsafe.learn.constraints import Names, check_cost_names, metrics_by_constraint, signal
 from jaxsafe.learn.learner import GradientStep, Learner, policy_by
 from jaxsafe.learn.metrics import episode_metrics, world_metrics
-from jaxsafe.learn.next_step_rollout import Stepping, arrival_record, collect_records, started
+from jaxsafe.learn.next_step_rollout import (
+    Stepping,
+    StepRecord,
+    arrival_record,
+    collect_records,
+    started,
+)
 from jaxsafe.learn.normalise import init_normaliser, merge, network_inputs
 from jaxsafe.learn.replay import (
     Record,
@@ -62,7 +63,7 @@ from jaxsafe.learn.returns import LostTime, expected_length, no_lost_time
 from jaxsafe.learn.rollout import check_steps, init_rollout
 from jaxsafe.learn.steps import Trainable, remaining
 from jaxsafe.learn.treatments import Treatment, no_treatment
-from jaxsafe.types import Algorithm, Clocks, Env, Metrics, PyTree, Shared
+from jaxsafe.types import Algorithm, Clocks, Count, Env, Metrics, PyTree, Shared
 
 
 @config
@@ -107,28 +108,6 @@ class OffPolicyConfig:
     max_grad_norm: Norm = 40.0  # The largest norm of each network's gradient, as in OmniSafe.
 
 
-@config
-class PriceClockConfig:
-    """For algorithms with a treatment: when its price on cost moves."""
-
-    # Environment steps between two moves of the price. OmniSafe moves it at every gradient step.
-    dual_every: Annotated[int, Bounds(1, 2**30)] = 20_000
-    # Environment steps before its first move. OmniSafe's 100 epochs are 200,000.
-    dual_starts: Annotated[int, Bounds(0, 2**31 - 1)] = 0
-
-
-class Bill(NamedTuple):
-    """What the environments of all devices were charged since the price last moved.
-
-    cost: float [], or [K] of several constraints, summed over `steps`, float []. age: int32 [],
-    environment steps of the run since then, resets included; below 0 before `dual_starts`.
-    """
-
-    cost: jax.Array
-    steps: jax.Array
-    age: jax.Array
-
-
 @flax.struct.dataclass
 class TrainState:
     """All that an update needs besides `Shared`.
@@ -162,6 +141,47 @@ class RoundCarry(NamedTuple):
     normaliser: PyTree
     stepping: Stepping
     replay: Record
+
+
+class Moment(NamedTuple):
+    """The round that the loop's clock is at. All but `remaining` is the same for all members.
+
+    before, after: Span, what the ring holds before and after the rows of the round are written.
+    warming_up: bool [], whether actions are random.
+    ready: bool [], whether there is enough in the ring to learn from.
+    gradient_steps: int32 [], those of the run that were due before this round.
+    remaining: float [], the share of training that is left.
+    """
+
+    before: Span
+    after: Span
+    warming_up: jax.Array
+    ready: jax.Array
+    gradient_steps: jax.Array
+    remaining: jax.Array
+
+
+class RoundReport(NamedTuple):
+    """What a round came to.
+
+    steps: StepRecord [learn_every, N]. metrics: of its gradient steps, [updates] each. ready: see
+    `Moment`. skipped: bool [], whether its observations would have spoilt the normaliser.
+    """
+
+    steps: StepRecord
+    metrics: Metrics
+    ready: jax.Array
+    skipped: jax.Array
+
+
+class Priced(NamedTuple):
+    """The price on cost after an update, the bill since it last moved, metrics, and whether a move of
+    the price failed, bool []."""
+
+    dual: PyTree
+    bill: PyTree
+    metrics: Metrics
+    failed: jax.Array
 
 
 def off_policy(
@@ -199,102 +219,43 @@ def off_policy(
         )
 
     def update(ts: TrainState, shared: Shared) -> tuple[TrainState, Metrics]:
-        cfg, iteration = ts.config, jnp.asarray(shared.iteration)
-        names = treatment.constrained_costs(cfg)
-        sizes = sizes_of(cfg, axis_name)
-
-        def learn(
-            nets: Trainable, normaliser: PyTree, replay: Record, number: jax.Array, key: jax.Array
-        ):
-            """The gradient steps of round `number`."""
-            rows_written = (number + 1) * cfg.learn_every
-            span = held(sizes.rows, cfg.horizon, rows_written, iteration, shared.since)
-            before = (iteration * sizes.rounds + number) * sizes.updates
-
-            def step(nets: Trainable, x: tuple[jax.Array, jax.Array]) -> tuple[Trainable, Metrics]:
-                count, key = x
-                draw_key, step_key = jax.random.split(device_key(key, axis_name))
-                source = replay, span, normaliser, sizes.batch
-                batch, dropped = replayed(draw_key, *source, cfg, axis_name)
-                at = GradientStep(count, remaining(iteration, cfg), step_key, ts.dual)
-                new, metrics = learner.step(nets, batch, at, cfg, axis_name)
-                finite = psum(~all_finite(new), axis_name) == 0
-                lost = {"train/nonfinite": dropped + ~finite}
-                return select(finite, new, nets), jax.tree.map(jnp.float32, metrics | lost)
-
-            turns = before + jnp.arange(sizes.updates), jax.random.split(key, sizes.updates)
-            return jax.lax.scan(step, nets, turns)
-
-        def one_round(now: RoundCarry, x: tuple[jax.Array, jax.Array]):
-            number, key = x
-            stepping_key, learn_key = jax.random.split(key)
-            rows_written = number * cfg.learn_every
-            warming_up = iteration * cfg.horizon + rows_written < sizes.warm_up  # in rows of this run
-
-            def act(obs: jax.Array, key: jax.Array) -> jax.Array:
-                explore_key, random_key = jax.random.split(key)
-                inputs = network_inputs(now.normaliser, obs)
-                chosen = explore(now.nets.params, inputs, explore_key, cfg)
-                uniform = jax.random.uniform(random_key, chosen.shape, minval=-1.0, maxval=1.0)
-                return jnp.where(warming_up, uniform, chosen)
-
-            keys = jax.random.split(device_key(stepping_key, axis_name), cfg.learn_every)
-            stepping, (rows, steps) = collect_records(env, act, now.stepping, keys)
-            span = held(sizes.rows, cfg.horizon, rows_written, iteration, shared.since)
-            replay = write(now.replay, rows, span)
-            normaliser, skipped = now.normaliser, jnp.bool_(False)
-            if cfg.obs_normalize:
-                merged = merge(normaliser, rows.obs, axis_name)
-                finite = all_finite(merged)
-                normaliser, skipped = select(finite, merged, normaliser), ~finite
-
-            filled = (iteration - shared.since) * cfg.horizon + rows_written + cfg.learn_every
-            ready = filled >= jnp.maximum(sizes.warm_up, 2)
-            given = now.nets, normaliser, replay, number, learn_key
-            like = jax.eval_shape(learn, *given)[1]
-            zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
-            nets, metrics = jax.lax.cond(ready, learn, lambda nets, *_: (nets, zeros), *given)
-            return RoundCarry(nets, normaliser, stepping, replay), (steps, metrics, ready, skipped)
-
+        sizes = sizes_of(ts.config, axis_name)
         key, rounds_key = jax.random.split(ts.key)
-        now = RoundCarry(Trainable(ts.params, ts.opt_state), ts.normaliser, ts.stepping, ts.replay)
-        rounds = jnp.arange(sizes.rounds), jax.random.split(rounds_key, sizes.rounds)
-        now, (steps, metrics, ready, skipped) = jax.lax.scan(one_round, now, rounds)
 
-        steps = jax.tree.map(lambda x: x.reshape(cfg.horizon, *x.shape[2:]), steps)
-        length, lost_time = expected_length(
-            ts.lost_time,
-            env.episode_length,
-            steps.terminated,
-            steps.length,
-            steps.real.sum(),
-            axis_name,
-        )
-        nonfinite = metrics.pop("train/nonfinite").sum() + skipped.sum()
-        metrics = {k: masked_mean(x.mean(1), ready, None) for k, x in metrics.items()}
-        metrics |= episode_metrics(env, steps, axis_name) | world_metrics(steps.bad, axis_name)
-        rate_r, rate_c = (masked_mean(x, steps.real, axis_name) for x in (steps.reward, steps.cost))
-        dual, bill = ts.dual, ts.bill
-        if priced:
-            bill = charge(ts.bill, signal(env, steps, names), steps.real, axis_name)
-            dual, bill, stuck = settle(treatment, ts.dual, bill, length, cfg, iteration)
-            metrics |= metrics_by_constraint(treatment.metrics(dual), names)
-            nonfinite += stuck
-        for k, name in enumerate(names):  # J_c of each; the total's is below
-            rate = masked_mean(signal(env, steps, names)[..., k], steps.real, axis_name)
-            metrics[f"train/cost_estimate_{name}"] = rate * length
-        metrics |= {
-            "train/cost_rate": rate_c,  # per environment step
-            "train/cost_estimate": rate_c * length,  # of an episode
-            "train/return_estimate": rate_r * length,  # likewise
-            "train/nonfinite": nonfinite,
-        }
+        def one_round(
+            now: RoundCarry, x: tuple[jax.Array, jax.Array]
+        ) -> tuple[RoundCarry, RoundReport]:
+            number, key = x
+            gather_key, learn_key = jax.random.split(key)
+            at = moment(number, shared, sizes, ts.config)
+            now, steps, skipped = gather(ts, now, at, gather_key)
+
+            def learn(nets: Trainable) -> tuple[Trainable, Metrics]:
+                return gradient_steps(ts, now._replace(nets=nets), at, learn_key)
+
+            like = jax.eval_shape(learn, now.nets)[1]
+            nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
+            nets, metrics = jax.lax.cond(at.ready, learn, lambda nets: (nets, nothing), now.nets)
+            return now._replace(nets=nets), RoundReport(steps, metrics, at.ready, skipped)
+
+        now = RoundCarry(Trainable(ts.params, ts.opt_state), ts.normaliser, ts.stepping, ts.replay)
+        numbers, keys = jnp.arange(sizes.rounds), jax.random.split(rounds_key, sizes.rounds)
+        now, rounds = jax.lax.scan(one_round, now, (numbers, keys))
+
+        steps = jax.tree.map(lambda x: x.reshape(ts.config.horizon, *x.shape[2:]), rounds.steps)
+        taken, limit = steps.real.sum(), env.episode_length
+        length, lost_time = expected_length(ts.lost_time, limit, steps, taken, axis_name)
+        after = pay(ts, steps, length, shared.iteration)
+        metrics = means_of_gradient_steps(rounds.metrics, rounds.ready) | after.metrics
+        metrics |= step_metrics(env, steps, length, treatment.constrained_costs(ts.config), axis_name)
+        lost = rounds.metrics["train/nonfinite"].sum() + rounds.skipped.sum() + after.failed
+        metrics["train/nonfinite"] = lost
         ts = dataclasses.replace(
             ts,
             params=now.nets.params,
             opt_state=now.nets.opt_state,
-            dual=dual,
-            bill=bill,
+            dual=after.dual,
+            bill=after.bill,
             normaliser=now.normaliser,
             stepping=now.stepping,
             replay=now.replay,
@@ -302,6 +263,58 @@ def off_policy(
             key=key,
         )
         return ts, jax.tree.map(jnp.float32, metrics)
+
+    def gather(
+        ts: TrainState, now: RoundCarry, at: Moment, key: jax.Array
+    ) -> tuple[RoundCarry, StepRecord, jax.Array]:
+        """The environment steps of a round, and whether the normaliser had to skip them."""
+        cfg = ts.config
+        learned = Learned(cfg, now.nets.params, ts.dual, now.normaliser)
+
+        def act(obs: jax.Array, key: jax.Array) -> jax.Array:
+            explore_key, random_key = jax.random.split(key)
+            chosen = explore(learned, network_inputs(now.normaliser, obs), explore_key)
+            uniform = jax.random.uniform(random_key, chosen.shape, minval=-1.0, maxval=1.0)
+            return jnp.where(at.warming_up, uniform, chosen)
+
+        keys = jax.random.split(device_key(key, axis_name), cfg.learn_every)
+        stepping, (rows, steps) = collect_records(env, act, now.stepping, keys)
+        normaliser, skipped = now.normaliser, jnp.bool_(False)
+        if cfg.obs_normalize:
+            merged = merge(normaliser, rows.obs, axis_name)
+            finite = all_finite(merged)
+            normaliser, skipped = select(finite, merged, normaliser), ~finite
+        replay = write(now.replay, rows, at.before)
+        return RoundCarry(now.nets, normaliser, stepping, replay), steps, skipped
+
+    def gradient_steps(
+        ts: TrainState, now: RoundCarry, at: Moment, key: jax.Array
+    ) -> tuple[Trainable, Metrics]:
+        """Those of a round, each on a batch of its own; metrics are [updates]."""
+        cfg, sizes = ts.config, sizes_of(ts.config, axis_name)
+        source = now.replay, at.after, now.normaliser, sizes.batch
+
+        def step(nets: Trainable, x: tuple[jax.Array, jax.Array]) -> tuple[Trainable, Metrics]:
+            number, key = x
+            draw_key, step_key = jax.random.split(device_key(key, axis_name))
+            batch, dropped = replayed(draw_key, *source, cfg, axis_name)
+            when = GradientStep(number, at.remaining, step_key, ts.dual)
+            new, metrics = learner.step(nets, batch, when, cfg, axis_name)
+            finite = psum(~all_finite(new), axis_name) == 0
+            lost = {"train/nonfinite": dropped + ~finite}
+            return select(finite, new, nets), jax.tree.map(jnp.float32, metrics | lost)
+
+        numbers = at.gradient_steps + jnp.arange(sizes.updates)
+        return jax.lax.scan(step, now.nets, (numbers, jax.random.split(key, sizes.updates)))
+
+    def pay(ts: TrainState, steps: StepRecord, length: jax.Array, iteration: Count) -> Priced:
+        """The steps of an update are put on the bill, and the price moves if it is due."""
+        if not priced:
+            return Priced((), (), {}, jnp.bool_(False))
+        cfg, names = ts.config, treatment.constrained_costs(ts.config)
+        bill = charge(ts.bill, signal(env, steps, names), steps.real, axis_name)
+        dual, bill, failed = settle(treatment, ts.dual, bill, length, cfg, iteration)
+        return Priced(dual, bill, metrics_by_constraint(treatment.metrics(dual), names), failed)
 
     def clocks(cfg: Any) -> Clocks:
         sizes = sizes_of(cfg, None)
@@ -328,44 +341,38 @@ def drawn_transitions(
     return batch._replace(obs=obs, next_obs=next_obs), dropped
 
 
-# ---- the price on cost -------------------------------------------------------------------------
+def means_of_gradient_steps(metrics: Metrics, ready: jax.Array) -> Metrics:
+    """Means over the steps [rounds, updates] of the rounds that were `ready`, NaN where there are none.
 
-
-def empty_bill(cfg: Any, names: Names) -> Bill:
-    return Bill(jnp.zeros(jnp.shape(limit(cfg, names))), jnp.float32(0), jnp.int32(-cfg.dual_starts))
-
-
-def charge(bill: Bill, cost: jax.Array, real: jax.Array, axis_name: str | None) -> Bill:
-    """`bill` with `cost`, float [T, N] or [T, N, K], of the steps that are `real`, bool [T, N]."""
-    mask = real.reshape(*real.shape, *(1,) * (cost.ndim - 2))
-    more, steps, age = psum(
-        (jnp.where(mask, cost, 0.0).sum((0, 1)), real.sum(), jnp.int32(real.size)), axis_name
-    )
-    return Bill(bill.cost + more, bill.steps + steps, bill.age + age)
-
-
-def settle(
-    treatment: Treatment, dual: PyTree, bill: Bill, length: jax.Array, cfg: Any, iteration: jax.Array
-) -> tuple[PyTree, Bill, jax.Array]:
-    """The price after the moves that are due, what remains of the bill, and whether a move failed.
-
-    J_c is what a step has cost since the last move, times the mean `length` of an episode. After an
-    iteration of more than `dual_every` steps several moves may be due; they see the same J_c.
+    A metric that a step does not have is NaN there.
     """
-    episode_cost = bill.cost / jnp.maximum(bill.steps, 1) * length
-    due = jnp.maximum(bill.age, 0) // cfg.dual_every
 
-    def move(_: jax.Array, dual: PyTree) -> PyTree:
-        return treatment.update(dual, episode_cost, cfg, iteration)
+    def mean(x: jax.Array) -> jax.Array:
+        return masked_mean(x, ready[:, None] & ~jnp.isnan(x), None)
 
-    moved = jax.lax.fori_loop(0, due, move, dual)
-    finite = all_finite(moved)
-    paid = Bill(jnp.zeros_like(bill.cost), jnp.float32(0), bill.age - due * cfg.dual_every)
-    bill = select((due > 0) | (bill.age < 0), paid, bill)
-    return select(finite, moved, dual), bill, ~finite
+    return jax.tree.map(mean, metrics)
 
 
-# ---- sizes -------------------------------------------------------------------------------------
+def step_metrics(
+    env: Env, steps: StepRecord, length: jax.Array, names: Names, axis_name: str | None
+) -> Metrics:
+    """What steps earned and cost. `length` is of an episode, in steps."""
+
+    def rate(x: jax.Array) -> jax.Array:
+        return masked_mean(x, steps.real, axis_name)
+
+    charged = signal(env, steps, names)
+    return {
+        **episode_metrics(env, steps, axis_name),
+        **world_metrics(steps.bad, axis_name),
+        "train/cost_rate": rate(steps.cost),  # per environment step
+        "train/cost_estimate": rate(steps.cost) * length,  # of an episode
+        "train/return_estimate": rate(steps.reward) * length,  # likewise
+        **{f"train/cost_estimate_{n}": rate(charged[..., k]) * length for k, n in enumerate(names)},
+    }
+
+
+# ---- sizes and clocks -------------------------------------------------------------------------
 
 
 class Sizes(NamedTuple):
@@ -419,6 +426,21 @@ def sizes_of(cfg: Any, axis_name: str | None) -> Sizes:
         batch=cfg.batch_size // devices,
         rows=rows,
         warm_up=-(-cfg.learning_starts // num_envs),
+    )
+
+
+def moment(number: jax.Array, shared: Shared, sizes: Sizes, cfg: Any) -> Moment:
+    """The moment of round `number` of an iteration."""
+    iteration, since = jnp.asarray(shared.iteration), shared.since
+    written = number * cfg.learn_every  # rows of this iteration, before the round
+    filled = (iteration - since) * cfg.horizon + written + cfg.learn_every
+    return Moment(
+        before=held(sizes.rows, cfg.horizon, written, iteration, since),
+        after=held(sizes.rows, cfg.horizon, written + cfg.learn_every, iteration, since),
+        warming_up=iteration * cfg.horizon + written < sizes.warm_up,  # in rows of the whole run
+        ready=filled >= jnp.maximum(sizes.warm_up, 2),
+        gradient_steps=(iteration * sizes.rounds + number) * sizes.updates,
+        remaining=remaining(iteration, cfg),
     )
 
 

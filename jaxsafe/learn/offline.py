@@ -33,7 +33,7 @@ from jaxsafe.config import (
     config,
     nearest,
 )
-from jaxsafe.learn.acting import Learned, learned_of
+from jaxsafe.learn.acting import learned_of
 from jaxsafe.learn.batch import all_finite, select
 from jaxsafe.learn.constraints import Names, metrics_by_constraint
 from jaxsafe.learn.conventions import Convention
@@ -244,7 +244,7 @@ def offline(
 ) -> Algorithm:
     """The algorithm that `learner` makes of the loop, with a price on cost that `treatment` moves.
 
-    A learner with a treatment is told the price as `at.dual`, and as `params['dual']` where it acts. It
+    A learner with a treatment is told the price as `at.dual`, and as `learned.dual` where it acts. It
     reports J_c as `train/cost_estimate`, float [] or [K].
     """
     priced = treatment is not no_treatment
@@ -303,14 +303,7 @@ def offline(
         check_values(cfg)
         return Clocks(0, cfg.updates)
 
-    def parameters(learned: Learned) -> Learned:
-        return dataclasses.replace(learned, params=learned.params | {"dual": learned.dual})
-
-    unpriced = policy_by(learner)
-    policy = unpriced._replace(
-        act=lambda learned, *args: unpriced.act(parameters(learned) if priced else learned, *args)
-    )
-    return Algorithm(init, update, policy, learned_of, lambda learned: env, clocks)
+    return Algorithm(init, update, policy_by(learner), learned_of, lambda learned: env, clocks)
 
 
 class Carry(NamedTuple):
@@ -372,25 +365,9 @@ def episode_cost(q_c: jax.Array, cfg: Any, env: Env) -> jax.Array:
     return (1 - cfg.cost_discount) * env.episode_length * q_c
 
 
-def descended(
-    loss: Callable[[dict[str, PyTree]], tuple[jax.Array, Metrics]],
-    params: dict[str, PyTree],
-    opt_state: dict[str, PyTree],
-    lr: jax.Array | float,
-    cfg: Any,
-) -> tuple[dict[str, PyTree], dict[str, PyTree], Metrics]:
-    """One step of Adam down `loss`, of each network alone: (params, states of their Adams, metrics)."""
-    grads, metrics = jax.grad(loss, has_aux=True)(params)
-    new, states = {}, {}
-    for name, gradient in grads.items():
-        change, states[name] = adam(lr, cfg).update(gradient, opt_state[name])
-        new[name] = optax.apply_updates(params[name], change)
-    return new, states, metrics
-
-
-def step_size(lr: jax.Array, at: GradientStep, cfg: Any) -> jax.Array:
-    """A learning rate at this moment, with its decay."""
-    return lr * at.remaining if cfg.lr_decay else lr
+def decaying_adam(lr: jax.Array, at: GradientStep, cfg: Any) -> optax.GradientTransformation:
+    """Adam at this moment, whose step has decayed if `cfg.lr_decay`."""
+    return adam(lr * at.remaining if cfg.lr_decay else lr, cfg)
 
 
 def check_costs(names: Names, data: DataSet) -> None:

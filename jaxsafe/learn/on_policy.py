@@ -51,32 +51,29 @@ from jaxsafe.learn.estimates import (
     scaled,
     weights,
 )
+from jaxsafe.learn.gaussian_policy import decide, gaussian_policy, init_nets
 from jaxsafe.learn.metrics import episode_metrics, world_metrics
-from jaxsafe.learn.normalise import init_normaliser, merge, network_inputs
+from jaxsafe.learn.normalise import init_normaliser, merge
 from jaxsafe.learn.returns import (
     Estimator,
     LostTime,
     Window,
     empty_window,
+    episode_cost,
     expected_length,
     no_lost_time,
-    window_mean,
 )
 from jaxsafe.learn.rollout import RolloutState, Trajectory, check_steps, collect, init_rollout
-from jaxsafe.learn.steps import Context, Pair, PolicyStep, Trainable, adam, fit_critic, stops_critics
+from jaxsafe.learn.steps import Context, Pair, PolicyStep, Trainable, fit_critic, stops_critics
 from jaxsafe.learn.surrogates import Surrogate, with_entropy
 from jaxsafe.learn.treatments import Treatment
-from jaxsafe.nn.gaussian import Gaussian, entropy, log_prob, sample
+from jaxsafe.nn.gaussian import entropy, log_prob, sample
 from jaxsafe.nn.networks import (
     action_dist,
-    init_params,
-    init_recurrent,
-    recurrent_step,
-    share_trunk,
     stack,
     stack_critics,
 )
-from jaxsafe.types import Algorithm, Clocks, Env, Metrics, Policy, PyTree, Shared
+from jaxsafe.types import Algorithm, Clocks, Env, Metrics, PyTree, Shared
 
 
 @config
@@ -338,7 +335,7 @@ def on_policy_loop(env: Env, method: Method, axis_name: str | None) -> Algorithm
         def behave(
             carry: PyTree, obs: jax.Array, first: jax.Array, key: jax.Array
         ) -> tuple[jax.Array, jax.Array, PyTree]:
-            carry = reset_carry(acting, learned, carry, first)
+            carry = reset_carry(gaussian_policy, learned, carry, first)
             dist, carry = decide(learned, carry, obs)
             action = sample(dist, key)
             return action, log_prob(dist, action), carry
@@ -364,14 +361,8 @@ def on_policy_loop(env: Env, method: Method, axis_name: str | None) -> Algorithm
         augmented = dataclasses.replace(traj, next_obs=augmentation.last_obs(traj, cfg))
         seen = Experience(augmented, signals, ts.rollout.carry)
         batch, explained = estimate_batch(learned_of(ts), seen, names, axis_name)
-        length, lost_time = expected_length(
-            ts.lost_time,
-            env.episode_length,
-            traj.terminated,
-            traj.length,
-            traj.terminated.size,
-            axis_name,
-        )
+        taken = traj.terminated.size
+        length, lost_time = expected_length(ts.lost_time, env.episode_length, traj, taken, axis_name)
         cost = episode_cost(ts.past_costs, charged, weight, length, axis_name)
 
         violation = cost.recent - limit(cfg, names)
@@ -406,12 +397,6 @@ def on_policy_loop(env: Env, method: Method, axis_name: str | None) -> Algorithm
         metrics["train/entropy"] = batch_mean(entropy(dist), axis_name)
         return after, jax.tree.map(jnp.float32, metrics)
 
-    def act(
-        learned: Learned, carry: PyTree, obs: jax.Array, key: jax.Array | None
-    ) -> tuple[jax.Array, PyTree, dict[str, Any]]:
-        dist, carry = decide(learned, carry, obs)
-        return (dist.mean if key is None else sample(dist, key)), carry, {}
-
     def clocks(cfg: Any) -> Clocks:
         """Gradient steps are those that teach values: of critics, or of the trunk they share."""
         check_sizes(cfg)
@@ -419,66 +404,7 @@ def on_policy_loop(env: Env, method: Method, axis_name: str | None) -> Algorithm
         passes = cfg.critic_epochs if cfg.trunk == "separate" else cfg.epochs * cfg.POLICY_STEPS
         return Clocks(cfg.num_envs * cfg.horizon, passes * cfg.minibatches)
 
-    acting = Policy(init=initial_carry, act=act)
-    return Algorithm(init, update, acting, learned_of, task, clocks)
-
-
-def init_nets(key: jax.Array, obs_size: int, action_size: int, names: Names, cfg: Any) -> Trainable:
-    """All networks, and the critics' optimiser: () where they share the policy's trunk."""
-    sizes = obs_size, action_size
-    if cfg.trunk == "gru":
-        return Trainable(init_recurrent(key, *sizes, 1 + (len(names) or 1), cfg), ())
-    params = init_params(key, *sizes, cfg)
-    if names:
-        keys = jax.random.split(jax.random.fold_in(key, 1), len(names))
-        params |= {"critic_c": jax.vmap(lambda key: init_params(key, *sizes, cfg)["critic_c"])(keys)}
-    if cfg.trunk == "shared":
-        return Trainable(share_trunk(params, cfg), ())
-    return Trainable(params, jax.vmap(adam(cfg.critic_lr, cfg).init)(stack_critics(params)))
-
-
-def decide(learned: Learned, carry: PyTree, obs: jax.Array) -> tuple[Gaussian, PyTree]:
-    """The action distribution for `obs` [..., O] as the environment gives it, and the next carry."""
-    actor, cfg = learned.params["actor"], learned.config
-    inputs = network_inputs(learned.normaliser, obs)
-    if cfg.trunk == "gru":
-        carry, dist, _ = recurrent_step(actor, carry, inputs, cfg)
-        return dist, carry
-    return action_dist(actor, inputs, cfg), carry
-
-
-def initial_carry(learned: Learned) -> PyTree:
-    """What the policy remembers at the start of an episode."""
-    return jnp.zeros(learned.config.hidden[-1]) if learned.config.trunk == "gru" else ()
-
-
-class EpisodeCost(NamedTuple):
-    """J_c, the undiscounted cost of an episode: [] or, of several constraints, [K].
-
-    of_iteration: this iteration's estimate, the mean cost of a step times the mean length.
-    recent: the mean of the estimates in `past`, which is what the method gets.
-    past: Window of the last `cost_window` estimates, this one included.
-    """
-
-    of_iteration: jax.Array
-    recent: jax.Array
-    past: Window
-
-
-def episode_cost(
-    past: Window, charged: jax.Array, weight: jax.Array, length: jax.Array, axis_name: str | None
-) -> EpisodeCost:
-    """J_c after a rollout.
-
-    Args:
-        past: of the iterations before it.
-        charged: float [T, N] or [T, N, K], what is held under the limit, 0 in bad steps.
-        weight: float [], of a good step.
-        length: float [], mean length of an episode, in steps.
-    """
-    of_iteration = batch_mean(charged, axis_name, (0, 1)) * weight * length
-    recent, past = window_mean(past, of_iteration)
-    return EpisodeCost(of_iteration, recent, past)
+    return Algorithm(init, update, gaussian_policy, learned_of, task, clocks)
 
 
 def guarded(

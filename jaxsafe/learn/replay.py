@@ -69,7 +69,7 @@ class Transitions(NamedTuple):
     obs: pytree [B, ...]. action: float [B, A]. next_obs: pytree [B, ...], the observation after
     `steps` steps, int [B]. reward, cost: float [B], costs: float [B, K], discounted sums over those
     steps. terminated: bool [B], next_obs has no value. weight: float [B], 0 for what must not count,
-    else 1: take means over weights.
+    else 1; a learner gets weights whose sum is 1, for `mean`.
     """
 
     obs: PyTree
@@ -81,6 +81,10 @@ class Transitions(NamedTuple):
     steps: jax.Array
     terminated: jax.Array
     weight: jax.Array
+
+    def mean(self, x: jax.Array) -> jax.Array:
+        """The mean of `x` [B, ...] over the transitions: this device's share of it."""
+        return (self.weight.reshape(-1, *(1,) * (x.ndim - 1)) * x).sum(0)
 
 
 # (ring, span, index) -> the observations there, pytree [B, ...]

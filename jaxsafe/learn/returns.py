@@ -1,61 +1,57 @@
 """Advantages, and what an episode costs."""
 
-from functools import partial
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Protocol
 
 import chex
 import jax
 import jax.numpy as jnp
 
-from jaxsafe.learn.batch import psum
+from jaxsafe.learn.batch import batch_mean, psum
 
 Estimator = Literal["gae", "gae_rtg", "plain", "vtrace"]
 
 
-def gae(
-    reward: jax.Array,
-    value: jax.Array,
-    next_value: jax.Array,
-    terminated: jax.Array,
-    done: jax.Array,
-    *,
-    discount: jax.Array | float,
-    decay: jax.Array | float,
-) -> jax.Array:
+class ValuedSteps(NamedTuple):
+    """T steps of N environments with what a critic says of them, [T, N] each; of rewards or of costs.
+
+    reward: float. value, next_value: float, V(s_t) and V(s_{t+1}), the latter before any reset.
+    terminated: bool, the next state is worth 0. done: bool, terminated or out of time.
+    """
+
+    reward: jax.Array
+    value: jax.Array
+    next_value: jax.Array
+    terminated: jax.Array
+    done: jax.Array
+
+
+def gae(steps: ValuedSteps, discount: jax.Array | float, decay: jax.Array | float) -> jax.Array:
     """Generalised advantage estimates, for rewards or for costs.
 
         delta_t = r_t + discount (0 if terminated_t else V(s_{t+1})) - V(s_t)
         A_t     = delta_t + discount decay (0 if done_t else A_{t+1})
 
-    `terminated` cuts the bootstrap, `done` (terminated or out of time) cuts the sum, so a
-    time limit still bootstraps from `next_value`, the value of the state before the reset.
-    Nothing is multiplied by zero: a value that is not finite stays behind the cut.
+    `terminated` cuts the bootstrap and `done` cuts the sum, so a time limit still bootstraps. Nothing
+    is multiplied by zero: a value that is not finite stays behind the cut.
 
     Args:
-        reward, value, next_value: float [T, N], over steps and environments.
-        terminated, done: bool [T, N].
         discount, decay: scalars in [0, 1]; gamma and lambda in the paper.
     Returns:
-        Advantages, float [T, N], in the units of `reward`. With `value` added they are the
+        Advantages, float [T, N], in the units of the reward. With `value` added they are the
         TD(lambda) returns.
     Raises:
-        AssertionError: while tracing, if the five arrays differ in shape.
+        AssertionError: while tracing, if the arrays differ in shape.
     Source: Schulman et al. (2016), "High-Dimensional Continuous Control Using
         Generalized Advantage Estimation", section 3.
     """
-    chex.assert_equal_shape([reward, value, next_value, terminated, done])
-    delta = td_error(reward, value, next_value, terminated, discount)
-    return backward_sums(delta, done, discount * decay, jnp.ones_like(delta))
+    chex.assert_equal_shape(steps)
+    delta = td_error(steps, discount)
+    return backward_sums(delta, steps.done, discount * decay, jnp.ones_like(delta))
 
 
-def td_error(
-    reward: jax.Array,
-    value: jax.Array,
-    next_value: jax.Array,
-    terminated: jax.Array,
-    discount: jax.Array | float,
-) -> jax.Array:
-    return reward + discount * jnp.where(terminated, 0.0, next_value) - value
+def td_error(steps: ValuedSteps, discount: jax.Array | float) -> jax.Array:
+    next_value = jnp.where(steps.terminated, 0.0, steps.next_value)
+    return steps.reward + discount * next_value - steps.value
 
 
 def backward_sums(
@@ -71,16 +67,7 @@ def backward_sums(
     return jax.lax.scan(backward, jnp.zeros_like(delta[0]), (delta, done, rho), reverse=True)[1]
 
 
-def vtrace(
-    reward: jax.Array,
-    value: jax.Array,
-    next_value: jax.Array,
-    terminated: jax.Array,
-    done: jax.Array,
-    ratio: jax.Array,
-    *,
-    discount: jax.Array | float,
-) -> jax.Array:
+def vtrace(steps: ValuedSteps, ratio: jax.Array, discount: jax.Array | float) -> jax.Array:
     """V-trace: advantages for a policy pi from the data of another, mu.
 
         A_t = rho_t (r_t + discount v_{t+1} - V(s_t)),   v_t = V(s_t) + A_t,   rho_t = min(1, pi / mu)
@@ -90,30 +77,25 @@ def vtrace(
     `gae` with a decay of 1.
 
     Args:
-        ratio: float [T, N], pi(a_t | s_t) / mu(a_t | s_t); the others as for `gae`.
+        ratio: float [T, N], pi(a_t | s_t) / mu(a_t | s_t).
     Returns:
         Advantages, float [T, N]. With `value` added they are the targets v.
     Source: Espeholt et al. (2018), "IMPALA: Scalable Distributed Deep-RL with Importance Weighted
         Actor-Learner Architectures", arXiv:1802.01561, equation 1 and section 4.2.
     """
-    chex.assert_equal_shape([reward, value, next_value, terminated, done, ratio])
-    delta = td_error(reward, value, next_value, terminated, discount)
-    return backward_sums(delta, done, discount, jnp.minimum(1.0, ratio))
+    chex.assert_equal_shape([*steps, ratio])
+    delta = td_error(steps, discount)
+    return backward_sums(delta, steps.done, discount, jnp.minimum(1.0, ratio))
 
 
 def advantages(
     estimator: Estimator,
-    reward: jax.Array,
-    value: jax.Array,
-    next_value: jax.Array,
-    terminated: jax.Array,
-    done: jax.Array,
+    steps: ValuedSteps,
     ratio: jax.Array,
-    *,
     discount: jax.Array | float,
     decay: jax.Array | float,
 ) -> tuple[jax.Array, jax.Array]:
-    """Advantages, and the errors of the critic: its targets less `value`. OmniSafe's four:
+    """Advantages, and the errors of the critic: its targets less its values. OmniSafe's four:
 
         gae:      generalised advantages; their own TD(lambda) returns as targets
         gae_rtg:  generalised advantages; discounted rewards to go as targets
@@ -125,19 +107,15 @@ def advantages(
 
     Args: as for `vtrace` and `gae`; only those two names with gae in them read `decay`.
     """
-    sums = partial(gae, reward, value, next_value, terminated, done, discount=discount)
     match estimator:
         case "gae":
-            advantage = error = sums(decay=decay)
+            advantage = error = gae(steps, discount, decay)
         case "gae_rtg":
-            advantage, error = sums(decay=decay), sums(decay=1.0)
+            advantage, error = gae(steps, discount, decay), gae(steps, discount, decay=1.0)
         case "plain":
-            advantage = td_error(reward, value, next_value, terminated, discount)
-            error = sums(decay=1.0)
+            advantage, error = td_error(steps, discount), gae(steps, discount, decay=1.0)
         case "vtrace":
-            advantage = error = vtrace(
-                reward, value, next_value, terminated, done, ratio, discount=discount
-            )
+            advantage = error = vtrace(steps, ratio, discount)
     return advantage, error
 
 
@@ -159,6 +137,35 @@ def window_mean(window: Window, value: jax.Array) -> tuple[jax.Array, Window]:
     return values.sum(0) / count, Window(values, count)
 
 
+class EpisodeCost(NamedTuple):
+    """J_c, the undiscounted cost of an episode: [] or, of several constraints, [K].
+
+    of_iteration: this iteration's estimate, the mean cost of a step times the mean length.
+    recent: the mean of the estimates in `past`, which is what the method gets.
+    past: Window of the last `cost_window` estimates, this one included.
+    """
+
+    of_iteration: jax.Array
+    recent: jax.Array
+    past: Window
+
+
+def episode_cost(
+    past: Window, charged: jax.Array, weight: jax.Array, length: jax.Array, axis_name: str | None
+) -> EpisodeCost:
+    """J_c after a rollout.
+
+    Args:
+        past: of the iterations before it.
+        charged: float [T, N] or [T, N, K], what is held under the limit, 0 in bad steps.
+        weight: float [], of a good step.
+        length: float [], mean length of an episode, in steps.
+    """
+    of_iteration = batch_mean(charged, axis_name, (0, 1)) * weight * length
+    recent, past = window_mean(past, of_iteration)
+    return EpisodeCost(of_iteration, recent, past)
+
+
 class LostTime(NamedTuple):
     """Sums over the recent past, float [] each: steps that failures took from their episodes, which
     would have lasted to the time limit, and steps taken."""
@@ -171,11 +178,20 @@ def no_lost_time() -> LostTime:
     return LostTime(jnp.zeros(()), jnp.zeros(()))
 
 
+class Failures(Protocol):
+    """Where episodes failed, bool [T, N], and the steps of the episodes so far, int [T, N]."""
+
+    @property
+    def terminated(self) -> jax.Array: ...
+
+    @property
+    def length(self) -> jax.Array: ...
+
+
 def expected_length(
     past: LostTime,
     limit: int,
-    terminated: jax.Array,
-    lengths: jax.Array,
+    steps: Failures,
     taken: jax.Array | int,
     axis_name: str | None = None,
 ) -> tuple[jax.Array, LostTime]:
@@ -199,12 +215,11 @@ def expected_length(
     Args:
         past: what the last call returned, at first `no_lost_time()`.
         limit: T, `env.episode_length`.
-        terminated: bool [T, N], where episodes failed.
-        lengths: int [T, N], the steps of the episodes so far.
-        taken: how many of the T N entries are steps; resets are none.
+        steps: this batch's.
+        taken: how many of its T N entries are steps; resets are none.
     """
-    lost = jnp.where(terminated, limit - lengths, 0).sum(dtype=jnp.float32)
-    lost, taken, num_envs = psum((lost, jnp.float32(taken), terminated.shape[1]), axis_name)
+    lost = jnp.where(steps.terminated, limit - steps.length, 0).sum(dtype=jnp.float32)
+    lost, taken, num_envs = psum((lost, jnp.float32(taken), steps.terminated.shape[1]), axis_name)
     lost, taken = past.lost + lost, past.taken + taken
     length = limit / (1 + lost / taken)
     keep = jnp.minimum(1.0, num_envs * length / taken)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxsafe.learn.batch import pmean, psum
 from jaxsafe.learn.normalise import network_inputs
 from jaxsafe.learn.replay import Record, Span, draw, sequences
-from jaxsafe.learn.returns import gae
+from jaxsafe.learn.returns import ValuedSteps, gae
 from jaxsafe.types import PyTree
 
 
@@ -77,9 +77,8 @@ def lambda_returns(
         reward, value: float [T, B], of each row; `value` is that of its observation.
     """
     ends = jnp.concatenate([~batch.follows[1:], jnp.ones_like(batch.follows[:1])])
-    terminated = batch.rows.terminated[1:]
-    found = (reward[1:], value[:-1], value[1:], terminated, ends)
-    return value[:-1] + gae(*found, discount=discount, decay=decay)
+    steps = ValuedSteps(reward[1:], value[:-1], value[1:], batch.rows.terminated[1:], ends)
+    return value[:-1] + gae(steps, discount, decay)
 
 
 class Moments(NamedTuple):

@@ -140,6 +140,34 @@ class Trainable(NamedTuple):
     opt_state: Any
 
 
+def descend_each(
+    loss: Callable[[dict[str, PyTree]], tuple[jax.Array, Metrics]],
+    nets: Trainable,
+    optimisers: dict[str, optax.GradientTransformation],
+    axis_name: str | None = None,
+) -> tuple[Trainable, Metrics]:
+    """`nets` after one step down `loss` of the networks that have `optimisers`, each alone.
+
+    Args:
+        loss: (those networks by name) -> this device's share of it, and metrics.
+    """
+    trained = {name: nets.params[name] for name in optimisers}
+    grads, metrics = pmean(jax.grad(loss, has_aux=True)(trained), axis_name)
+    params, states = {}, {}
+    for name, optimiser in optimisers.items():
+        change, states[name] = optimiser.update(grads[name], nets.opt_state[name])
+        params[name] = optax.apply_updates(trained[name], change)
+    return Trainable(nets.params | params, nets.opt_state | states), metrics
+
+
+def follow(nets: Trainable, tau: jax.Array | float) -> Trainable:
+    """`nets` whose targets have moved by a share `tau` towards the networks of the same names."""
+    targets = nets.params["targets"]
+    aims = {name: nets.params[name] for name in targets}
+    moved = optax.incremental_update(aims, targets, tau)
+    return nets._replace(params=nets.params | {"targets": moved})
+
+
 class Passes(NamedTuple):
     """Passes over a batch so far."""
 

@@ -124,7 +124,7 @@ def known_of(g: Group, metric: str) -> bool:
 def aggregates(s: Suite) -> dict[tuple[str, str, str], Estimate]:
     """Mean and IQM of each score over tasks and seeds, by setting, score and statistic."""
     return {
-        (name, metric, kind): stats.estimate(*s.samples(name, metric), statistic=statistic)
+        (name, metric, kind): stats.of_measure(metric, *s.samples(name, metric), statistic=statistic)
         for name in s.groups
         for metric in SCORES
         for kind, statistic in (("mean", stats.mean), ("IQM", stats.iqm))

@@ -43,15 +43,15 @@ def evaluate(run: RunPolicies, num: int, seed: int, data: PyTree = ()) -> list[S
     cost_names = run.algo.task(jax.tree.map(lambda x: x[0], run.learned)).cost_names
     seeds, scores = settings.train.num_seeds, []
     for i, member in enumerate(members(settings.configs, settings.train)[::seeds]):
-        own = Episodes(*(x[i * seeds : (i + 1) * seeds] for x in episodes))
+        of_setting = Episodes(*(x[i * seeds : (i + 1) * seeds] for x in episodes))
         limits, metrics = limits_of(member.config), tables[i] if i < len(tables) else {}
-        found = measures(own, cost_names, limits)
+        found = measures(of_setting, cost_names, limits)
         rows = summary(settings.env_name, found, float(member.config.cost_limit), metrics)
         if settings.train.dataset is not None:
             rows |= dsrl_scores(settings.env_name, rows, float(member.config.cost_limit))
             rows |= of_data(data, float(member.config.cost_limit))
         by_seed = {name: values.mean(1).tolist() for name, values in found.items()}
-        scores.append(Scores(member.setting, limits, own.ret.size, rows, by_seed))
+        scores.append(Scores(member.setting, limits, of_setting.ret.size, rows, by_seed))
     return scores
 
 
@@ -62,10 +62,10 @@ def summary(
     metrics: dict[str, np.ndarray],
 ) -> dict[str, Estimate]:
     """The rows of the table: `measures`, then the cost rate of training and normalised scores."""
-    rows = {name: estimate_over_seeds(values) for name, values in found.items()}
+    rows = {name: estimate_over_seeds(name, values) for name, values in found.items()}
     rate = cost_rate(metrics)
     if rate is not None:
-        rows["cost rate (training)"] = stats.estimate(rate)
+        rows["cost rate (training)"] = stats.of_measure("cost rate", rate)
     if env_name in scores.CHARACTERISTIC:
 
         def scaled(score: Callable, of: Estimate, *args: float) -> Estimate:
@@ -103,12 +103,13 @@ def of_data(data: PyTree, cost_limit: float) -> dict[str, Estimate]:
     return {name: Estimate(float(x), float(x), float(x)) for name, x in found.items()}
 
 
-def estimate_over_seeds(values: np.ndarray) -> Estimate:
-    """Mean of `values` [S, N] and its interval over seeds, whose means hold the spread of episodes too.
+def estimate_over_seeds(name: str, values: np.ndarray) -> Estimate:
+    """Mean of the measure `name`, `values` [S, N], and its interval over seeds.
 
-    With one seed the interval covers the episodes alone, not what another seed would give.
+    The means of seeds hold the spread of episodes, too. With one seed the interval covers the episodes
+    alone, not what another seed would give.
     """
-    return stats.estimate(values.mean(1) if len(values) > 1 else values[0])
+    return stats.of_measure(name, values.mean(1) if len(values) > 1 else values[0])
 
 
 def cost_rate(metrics: dict[str, np.ndarray]) -> np.ndarray | None:

@@ -7,6 +7,7 @@ import jax
 
 from jaxsafe.config import ConfigError, one_line
 from jaxsafe.envs.view import render
+from jaxsafe.envs.view.backend import NoDisplay
 from jaxsafe.run import files
 from jaxsafe.run.policies import RunPolicy
 
@@ -41,7 +42,7 @@ def film(policies: list[RunPolicy], path: Path, seed: int, labels: list[str] | N
             render.render_episode(a.env, a.player, key, label=label)  # type: ignore[arg-type]
             for a, label in zip(policies, labels or [None] * len(policies), strict=True)
         ]
-    except render.NoDisplay as error:
+    except NoDisplay as error:
         raise NoVideo(one_line(error)) from error
     path.parent.mkdir(parents=True, exist_ok=True)
     with files.replacing(path) as part:

@@ -29,8 +29,8 @@ def finish(session: Session, report: Reporter, stop: Interrupts) -> None:
 
     def curves() -> None:
         limit = float(settings.algo.cost_limit)
-        metrics, own = run_folder.read_metrics(folder), limits_by_name(settings.algo)
-        plots.curves(metrics, folder / "curves.png", title, limit, own)
+        metrics, limits = run_folder.read_metrics(folder), limits_by_name(settings.algo)
+        plots.curves(metrics, folder / "curves.png", title, limit, limits)
 
     def scores() -> None:
         found = evaluation.evaluate(run(), train.eval_episodes, train.seed, session.program.data)

@@ -66,7 +66,7 @@ class Group(NamedTuple):
         return self.values("cost")
 
     def estimate(self, name: str, statistic: Callable[..., np.ndarray] = stats.mean) -> Estimate:
-        return over_seeds(tuple(self.values(name)), statistic)
+        return over_seeds(name, tuple(self.values(name)), statistic)
 
     @property
     def ret(self) -> Estimate:
@@ -97,8 +97,8 @@ class Group(NamedTuple):
 
 
 @functools.cache
-def over_seeds(values: tuple[float, ...], statistic: Callable[..., np.ndarray]) -> Estimate:
-    return stats.estimate(np.array(values), statistic=statistic)
+def over_seeds(name: str, values: tuple[float, ...], statistic: Callable[..., np.ndarray]) -> Estimate:
+    return stats.of_measure(name, np.array(values), statistic=statistic)
 
 
 def group(runs: Sequence[SettingRun], by: Sequence[str]) -> list[Group]:

@@ -15,6 +15,9 @@ from matplotlib.ticker import EngFormatter
 
 from jaxsafe.learn.constraints import cost_title
 from jaxsafe.report import stats
+from jaxsafe.report.group import Group, Suite
+from jaxsafe.report.published import Published
+from jaxsafe.report.stats import Estimate
 from jaxsafe.run import files, run_folder
 
 FORMATS = ("png", "svg")
@@ -76,8 +79,8 @@ def curves(
                     axes.plot(*evaluated(table, column), ls="--", lw=1, label=called, **look)
         if name in limits:
             common, column = limits[name]
-            own = {t[column][0]: i for i, t in enumerate(settings.values()) if column in t}
-            for limit, i in (own or {common: 3}).items():
+            swept = {t[column][0]: i for i, t in enumerate(settings.values()) if column in t}
+            for limit, i in (swept or {common: 3}).items():
                 axes.axhline(limit, color=f"C{i % 10}", ls="--", lw=1, label=f"limit {limit:g}")
         axes.set(xlabel=axis_of(metrics), ylabel=label)
         if axes.get_legend_handles_labels()[0]:
@@ -136,7 +139,9 @@ def band(axes: Axes, steps: np.ndarray, values: np.ndarray, label: str, **style:
 
 
 def trade_off(
-    rows: Sequence[Any], title: str, published: Mapping[tuple[str, str], Any] = MappingProxyType({})
+    rows: Sequence[Group],
+    title: str,
+    published: Mapping[tuple[str, str], Published | None] = MappingProxyType({}),
 ) -> Figure:
     """Return against cost of each row of a comparison: a panel an environment or, where named costs
     have limits of their own, each of these.
@@ -190,7 +195,7 @@ def front(points: Sequence[tuple[float, float]]) -> tuple[list[float], list[floa
     return xs, ys
 
 
-def learning(groups: Sequence[Any]) -> Figure:
+def learning(groups: Sequence[Group]) -> Figure:
     """Return, cost and, where it is known, cost rate so far over training: a row a task, a line a
     setting.
 
@@ -226,9 +231,9 @@ def learning(groups: Sequence[Any]) -> Figure:
                     )
         limits = [g.cost_limit for g in shown]
         for g in shown:
-            own = limits.count(g.cost_limit) == 1 and len(set(limits)) > 1
-            if own or g is shown[limits.index(g.cost_limit)]:
-                color = looks[g.name]["color"] if own else "0.4"
+            alone = limits.count(g.cost_limit) == 1 and len(set(limits)) > 1
+            if alone or g is shown[limits.index(g.cost_limit)]:
+                color = looks[g.name]["color"] if alone else "0.4"
                 cost.axhline(g.cost_limit, color=color, ls="--", lw=1)
         for axes, label in zip(panels, ("return", "cost", "cost rate so far"), strict=False):
             axes.set(title=f"{env}, {label}")
@@ -249,8 +254,8 @@ def stretches(table: Mapping[str, np.ndarray], name: str, edges: np.ndarray) -> 
     seeds = np.unique(table["seed"])
     found = np.full((len(seeds), len(edges) - 1), np.nan)
     for row, seed in zip(found, seeds, strict=True):
-        own = table["seed"] == seed
-        values, steps = table[name][own], table[run_folder.step_column(table)][own]
+        of_seed = table["seed"] == seed
+        values, steps = table[name][of_seed], table[run_folder.step_column(table)][of_seed]
         if name == "train/cost_rate":
             values = np.cumsum(values) / np.arange(1, len(values) + 1)
         known = np.isfinite(values)
@@ -272,7 +277,7 @@ def carry(row: np.ndarray) -> None:
 
 
 def normalised(
-    names: Sequence[str], metrics: Sequence[str], found: Mapping[tuple[str, str, str], Any]
+    names: Sequence[str], metrics: Sequence[str], found: Mapping[tuple[str, str, str], Estimate]
 ) -> Figure:
     """Mean and IQM of each score with their intervals, a row a setting."""
     figure = Figure(figsize=(4 * len(metrics) + 1, 1.2 + 0.4 * len(names)), layout="constrained")
@@ -291,7 +296,7 @@ def normalised(
     return figure
 
 
-def profiles(suite: Any) -> Figure:
+def profiles(suite: Suite) -> Figure:
     """The share of seeds above each normalised return, and above each cost in limits."""
     figure, panels = grid(2, size=(5, 3.8))
     looks = styles([gs[0] for gs in suite.groups.values()])
@@ -325,7 +330,7 @@ def profiles(suite: Any) -> Figure:
 # ---- what the figures share ------------------------------------------------------------------
 
 
-def styles(rows: Sequence[Any]) -> dict[str, dict[str, Any]]:
+def styles(rows: Iterable[Group]) -> dict[str, dict[str, Any]]:
     """Colour and line of each name: ten colours, then the next kind of line."""
     names = dict.fromkeys(row.name for row in rows)
     lines = list(MARKERS)

@@ -168,7 +168,7 @@ def runs_of(folder: Path, study: study_files.Condensed) -> list[SettingRun]:
     rows, curves, settings = study
     runs = []
     for run, options in settings.items():
-        own = [row for row in rows if row["run"] == run]
+        of_run = [row for row in rows if row["run"] == run]
         env, algo = options["env.name"], options["algo.name"]
         config = defaults(env, algo) | options
         config["run_dir"] = str(folder / study_files.name_of(run))
@@ -176,11 +176,11 @@ def runs_of(folder: Path, study: study_files.Condensed) -> list[SettingRun]:
         limits = {k.removeprefix("algo.cost_limits."): float(v) for k, v in named.items()}
         limits = limits or {"": float(config["algo.cost_limit"])}
         always = ("return", "cost")  # NaN where no episode was whole
-        figures = [k for k in study.figures() if k in always or any(row[k] for row in own)]
-        values = {k: np.array([float(row[k] or "nan") for row in own]) for k in figures}
+        figures = [k for k in study.figures() if k in always or any(row[k] for row in of_run)]
+        values = {k: np.array([float(row[k] or "nan") for row in of_run]) for k in figures}
         values |= normalised(env, values, limits)
-        table = study_files.table(own, [curves[run, row["seed"]] for row in own])
-        seeds = np.array([float(row["seed"]) for row in own])
+        table = study_files.table(of_run, [curves[run, row["seed"]] for row in of_run])
+        seeds = np.array([float(row["seed"]) for row in of_run])
         runs.append(SettingRun(folder, env, config, limits, table, seeds, values))
     return runs
 
@@ -242,6 +242,6 @@ def normalised(
 
 def cost_names(columns: Iterable[str]) -> list[str]:
     """The costs that an environment tells apart, by the columns of metrics.csv."""
-    own = ("train/cost_estimate", "train/cost_rate")  # of the sum, or of each under its own limit
-    found = [name for name in columns if name.startswith("train/cost_") and not name.startswith(own)]
+    others = ("train/cost_estimate", "train/cost_rate")  # of the sum, or of each under its own limit
+    found = [name for name in columns if name.startswith("train/cost_") and not name.startswith(others)]
     return [name.removeprefix("train/cost_") for name in found]

@@ -77,6 +77,22 @@ def estimate(
     return Estimate(*(x.reshape(shape) if shape else x.item() for x in found))
 
 
+def of_measure(
+    name: str, *samples: np.ndarray, statistic: Callable[..., np.ndarray] = mean
+) -> Estimate:
+    """`estimate` of a measure with this name in tables. Its interval stops where the measure does.
+
+    The share of episodes over a limit is at most 1. Costs, rates and lengths are at least 0, unless a
+    value shows that this environment's are not.
+    """
+    e = estimate(*samples, statistic=statistic)
+    share = name.endswith("violation rate") or " over " in name
+    positive = share or "return" not in name
+    least = 0.0 if positive and not any((x < 0).any() for x in samples) else -np.inf
+    ends = np.clip(e[1:], least, 1.0 if share else np.inf)
+    return Estimate(e.mean, *(x if np.ndim(x) else float(x) for x in ends))
+
+
 def welch(columns: Sequence[np.ndarray]) -> np.ndarray:
     """Half the width of the mean's interval, float [T], of samples [S, T] with two seeds or more."""
     seeds = np.array([[len(x)] for x in columns])

@@ -157,12 +157,12 @@ def rows_of(
             "algo": trained.config["algo.name"],
             "settings": " ".join(f"{k}={v}" for k, v in unusual(trained.config).items()),
             "seed": seed,
-            "state": state or own,
+            "state": state or of_seed,
             "steps": str(int(table[clock][table["seed"] == int(seed)].max())),
         }
         | {name: "" if np.isnan(x[i]) else f"{x[i]:.9g}" for name, x in named.items()}
         | origin._asdict()
-        for i, (seed, own) in enumerate(known.items())
+        for i, (seed, of_seed) in enumerate(known.items())
     ]
 
 
@@ -199,19 +199,19 @@ def more_figures(
     late = {k.replace("_", " "): run_folder.last_tenth(dict(table), f"train/{k}") for k in estimates}
     found: dict[str, list[float]] = {}
     for seed in np.unique(table["seed"]):
-        own = {name: x[table["seed"] == seed] for name, x in table.items()}
+        part = {name: x[table["seed"] == seed] for name, x in table.items()}
         for begin, end in windows:
-            inside = (own["steps"] > begin) & (own["steps"] <= end)
-            ret, cost = (own[f"train/{name}"][inside] for name in ("return", "cost"))
+            inside = (part["steps"] > begin) & (part["steps"] <= end)
+            ret, cost = (part[f"train/{name}"][inside] for name in ("return", "cost"))
             name = window_name(begin, end)
             found.setdefault(f"return {name}", []).append(ret.mean() if len(ret) else np.nan)
             found.setdefault(f"cost {name}", []).append(cost.mean() if len(cost) else np.nan)
             swing = spans(cost).mean(1).std() if len(cost) >= SPAN else np.nan
             found.setdefault(f"swing {name}", []).append(swing)
-        if {"train/objective_c", "train/violation"} <= own.keys() and len(own["steps"]) > 2 * SPAN:
-            promise, violation = (spans(own[f"train/{k}"]) for k in ("objective_c", "violation"))
+        if {"train/objective_c", "train/violation"} <= part.keys() and len(part["steps"]) > 2 * SPAN:
+            promise, violation = (spans(part[f"train/{k}"]) for k in ("objective_c", "violation"))
             slope = np.polyfit(promise.sum(1)[:-1], np.diff(violation.mean(1)), 1)[0]
-            found.setdefault("promised", []).append(-own["train/objective_c"].mean())
+            found.setdefault("promised", []).append(-part["train/objective_c"].mean())
             found.setdefault("kept", []).append(slope)
     return late | {name: np.array(values) for name, values in found.items()}
 
@@ -381,7 +381,7 @@ def run_table(
     lines = [f"| {' | '.join(header)} |", f"|{'|'.join(ends)}|"]
     for text, row in sorted(origins.items(), key=lambda item: study_files.name_of(item[0])):
         run = named[study_files.name_of(text)]
-        ret, cost = (tables.cell(stats.estimate(run.values[k]), ".2f") for k in ("return", "cost"))
+        ret, cost = (tables.cell(stats.of_measure(k, run.values[k]), ".2f") for k in ("return", "cost"))
         words = " ".join(f"`{re.sub('^(env|algo)=', '', word)}`" for word in text.split())
         odd = ", ".join(sorted(states[text] - {"done"}))
         cells = [f"{words}{f' ({odd})' if odd else ''}", str(len(run.seeds)), ret, cost]
@@ -398,7 +398,7 @@ def final_policy(run: SettingRun, otherwise: str) -> str:
     """What the mean action made in fresh episodes, mean over seeds and its interval."""
     if not {"final return", "final cost"} <= run.values.keys():
         return otherwise
-    ret, cost = (stats.estimate(run.values[f"final {k}"]) for k in ("return", "cost"))
+    ret, cost = (stats.of_measure(k, run.values[f"final {k}"]) for k in ("return", "cost"))
     return "{:.2f} [{:.2f}, {:.2f}], cost {:.2f} [{:.2f}, {:.2f}]".format(*ret, *cost)
 
 

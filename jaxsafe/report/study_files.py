@@ -114,8 +114,8 @@ def apart(settings: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """What all runs have in common, and what else each has."""
     first, *others = settings.values()
     common = {k: v for k, v in first.items() if all(k in s and s[k] == v for s in others)}
-    own = {run: {k: v for k, v in s.items() if k not in common} for run, s in settings.items()}
-    return {"common": common, "runs": own}
+    rest = {run: {k: v for k, v in s.items() if k not in common} for run, s in settings.items()}
+    return {"common": common, "runs": rest}
 
 
 def table(rows: Sequence[Mapping[str, str]], curves: Sequence[np.ndarray]) -> dict[str, np.ndarray]:

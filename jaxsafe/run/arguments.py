@@ -27,6 +27,7 @@ from omegaconf.errors import OmegaConfBaseException
 from jaxsafe import algos, envs
 from jaxsafe.config import ConfigError, convert, kind_in_words
 from jaxsafe.run import distributed
+from jaxsafe.run.plain import repeated, to_plain
 from jaxsafe.run.settings import (
     COST_LIMITS,
     DEFAULT,
@@ -39,10 +40,8 @@ from jaxsafe.run.settings import (
     find_env,
     load,
     nested,
-    repeated,
     settings_from_config,
     settings_from_options,
-    to_plain,
 )
 
 ERRORS = (HydraException, OmegaConfBaseException)  # of arguments that only Hydra can judge
@@ -163,7 +162,7 @@ def check_kind(override: Override) -> None:
 
 def each_job(argv: list[str], job: Callable[[dict[str, Any], int | None], None]) -> None:
     """Let Hydra compose the arguments and call `job(config, number)`: once, or for each run of a
-    --multirun with its number. --help and --cfg print instead. A launcher of Hydra's may call `job` in
+    --multirun with its number. --cfg prints instead. A launcher of Hydra's may call `job` in
     another process or on another host, to which `called` is pickled.
 
     Raises:
@@ -296,7 +295,7 @@ def env_options(name: str) -> dict[str, Any]:
 
 
 def register(request: Request) -> None:
-    """Give Hydra the groups and their defaults, so that --help and --cfg show every option."""
+    """Give Hydra the groups and their defaults, so that --cfg shows every option."""
     store = ConfigStore.instance()
     for group, options in request.groups.items():
         for name, node in options.items():
@@ -318,10 +317,6 @@ def register(request: Request) -> None:
             "sweep": {"dir": "runs/.multirun", "subdir": "."},
             "output_subdir": None,
             "job": {"name": "train", "chdir": False},
-            "help": {
-                "header": "jaxsafe train env=car_push1 algo=cpo [key=value ...]",
-                "footer": "Several values with -m: seed=0,1,2. A list is written [a,b].",
-            },
         },
     }
     store.store(name="train", node=OmegaConf.create(node))

@@ -12,7 +12,7 @@ import numpy as np
 
 import jaxsafe
 from jaxsafe.config import ConfigError, flat
-from jaxsafe.learn.acting import Player
+from jaxsafe.learn.acting import Player, Playing
 from jaxsafe.learn.offline import DataSet, data_set
 from jaxsafe.run import run_folder
 from jaxsafe.run.policies import RunPolicies
@@ -86,19 +86,25 @@ def episode(player: Player, key: jax.Array, obs_size: int, sampled: bool) -> Ste
     reset_key, act_key = jax.random.split(key)
     env = player.task
 
-    def step(now: Any, t: jax.Array) -> Any:
-        state, carry, alive = now
-        own_key = jax.random.fold_in(act_key, t) if sampled else None
-        action, carry = player.act(carry, state, own_key)
+    def step(now: Playing, t: jax.Array) -> tuple[Playing, Steps]:
+        sample_key = jax.random.fold_in(act_key, t) if sampled else None
+        action, carry = player.act(now.carry, now.state, sample_key)
         action = jnp.clip(action, -1.0, 1.0)
-        after = env.step(state, action)
-        made = (after.obs[:obs_size], action, after.reward, after.cost, after.costs, after.terminated)
-        return (after, carry, alive & ~after.ended), (*made, alive)
+        after = env.step(now.state, action)
+        made = Steps(
+            obs=after.obs[:obs_size],
+            action=action,
+            reward=after.reward,
+            cost=after.cost,
+            costs=after.costs,
+            terminated=after.terminated,
+            alive=now.alive,
+        )
+        return Playing(after, carry, now.alive & ~after.ended), made
 
-    start = env.reset(reset_key)
-    begin = start, player.begin(), jnp.bool_(True)
-    _, (obs, *rest) = jax.lax.scan(step, begin, jnp.arange(env.episode_length))
-    return Steps(jnp.concatenate([start.obs[None, :obs_size], obs]), *rest)
+    start = player.start(reset_key)
+    _, steps = jax.lax.scan(step, start, jnp.arange(env.episode_length))
+    return steps._replace(obs=jnp.concatenate([start.state.obs[None, :obs_size], steps.obs]))
 
 
 def episodes(run: RunPolicies, steps: int, seed: int, sampled: bool) -> Iterator[tuple[int, Steps]]:

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsafe.learn.acting import Player
+from jaxsafe.learn.acting import Player, Playing
 from jaxsafe.types import Algorithm, PyTree
 
 # columns of metrics.csv where training is evaluated, of mean and of sampled actions
@@ -32,7 +32,7 @@ def episode(
     cost_discount: jax.Array | float = 1.0,
     sampled: bool = False,
 ) -> Episodes:
-    """One whole episode, pure: rewards and costs count until the end or the limit.
+    """One whole episode, pure: rewards and costs count until termination or the limit.
 
     Actions are the mean ones, or `sampled`; both begin with the same reset. The discounted sums,
     sum_t discount^t r_t and likewise of costs, begin with the first step.
@@ -41,21 +41,19 @@ def episode(
     env = player.task
     summed: Any = Episodes  # of jax.Array while it is traced
 
-    def step(now, t):
-        state, carry, alive = now
-        own_key = jax.random.fold_in(act_key, t) if sampled else None
-        action, carry = player.act(carry, state, own_key)
-        state = env.step(state, action)
+    def step(now: Playing, t: jax.Array) -> tuple[Playing, Episodes]:
+        sample_key = jax.random.fold_in(act_key, t) if sampled else None
+        action, carry = player.act(now.carry, now.state, sample_key)
+        state = env.step(now.state, action)
         # what comes after the end may be anything, NaN included
         reward, cost, costs = (
-            jnp.where(alive, x, 0.0) for x in (state.reward, state.cost, state.costs)
+            jnp.where(now.alive, x, 0.0) for x in (state.reward, state.cost, state.costs)
         )
         later = discount**t * reward, cost_discount**t * cost
-        sums = summed(reward, cost, costs, jnp.float32(alive), *later)
-        return (state, carry, alive & ~state.ended), sums
+        sums = summed(reward, cost, costs, jnp.float32(now.alive), *later)
+        return Playing(state, carry, now.alive & ~state.ended), sums
 
-    start = env.reset(reset_key), player.begin(), jnp.bool_(True)
-    _, sums = jax.lax.scan(step, start, jnp.arange(env.episode_length))
+    _, sums = jax.lax.scan(step, player.start(reset_key), jnp.arange(env.episode_length))
     return jax.tree.map(lambda x: x.sum(0), sums)
 
 

@@ -205,8 +205,8 @@ def of_members(program: Program, learned: PyTree) -> PyTree:
 
     A member that is split over devices has equal copies; the first is taken.
     """
-    own = jax.tree.map(lambda x: x[: len(program.members)], learned)
-    return jax.device_put(own, jax.local_devices()[0])
+    rows = jax.tree.map(lambda x: x[: len(program.members)], learned)
+    return jax.device_put(rows, jax.local_devices()[0])
 
 
 def restored(store: Path, like: PyTree, report: Reporter) -> tuple[PyTree, int, int]:

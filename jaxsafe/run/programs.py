@@ -164,7 +164,7 @@ def over_devices(
     def parted(tree: PyTree, shared: Shared) -> PyTree:
         leaves, treedef = jax.tree.flatten(tree)
 
-        def own_part(full: list[jax.Array], shared: Shared) -> PyTree:
+        def on_part(full: list[jax.Array], shared: Shared) -> PyTree:
             given = iter(full)
             tree = treedef.unflatten([next(given) if x.size else empty(x) for x in leaves])
             return fn(tree, shared)
@@ -172,7 +172,7 @@ def over_devices(
         # arrays without elements stay outside: jax 0.11 crashes on them as inputs
         full = [x for x in leaves if x.size]
         specs = {"in_specs": (spec, PartitionSpec()), "out_specs": spec}
-        return jax.shard_map(own_part, mesh=mesh, **specs, check_vma=False)(full, shared)
+        return jax.shard_map(on_part, mesh=mesh, **specs, check_vma=False)(full, shared)
 
     return parted
 

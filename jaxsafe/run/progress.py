@@ -50,13 +50,13 @@ class Reporter:
     def __init__(self, console: Console | None = None, hosted: bool = False):
         self.notebook = console is None and Console().is_jupyter
         # rich's own output in notebooks is a block of HTML a line, and its bar wants ipywidgets
-        own = Console(
+        plain = Console(
             highlight=False,
             soft_wrap=True,
             force_jupyter=False,
             force_terminal=False if self.notebook else None,
         )
-        self.console = console or own
+        self.console = console or plain
         self.hosted = hosted
         self.live: Progress | None = None
         self.width = 0  # of the changing line in a notebook

@@ -19,6 +19,7 @@ from jaxsafe.run.evaluate import make_training_evaluation
 from jaxsafe.run.interrupts import Interrupts
 from jaxsafe.run.loggers import Callback, check_logger, wandb_callback
 from jaxsafe.run.memory import check_memory, check_state_memory
+from jaxsafe.run.plain import differences
 from jaxsafe.run.policies import warm_start
 from jaxsafe.run.programs import Program, build
 from jaxsafe.run.progress import Reporter
@@ -26,7 +27,6 @@ from jaxsafe.run.settings import (
     NOT_COMPARED,
     Settings,
     TrainConfig,
-    differences,
     make_env,
     settings_from_config,
     unusual_in_words,
@@ -91,11 +91,13 @@ def agree_on_folder(settings: Settings, job: int | None, say: Callable[[str], No
     """`choose_folder` of process 0, for all processes.
 
     Raises:
-        ConfigError: as there, or this process has other settings than process 0.
+        ConfigError: as there, or this process has other settings, or another data set, than process 0.
     """
     if jax.process_count() == 1:
         return choose_folder(settings, job, say)
     mine = flat(settings.plain())
+    if settings.train.dataset is not None:
+        mine["the data set's SHA-256"] = dataset.sha256(settings.train.dataset)
     folder = choose_folder(settings, job, say) if distributed.leads() else ""
     folder, theirs = json.loads(distributed.text_from_process_0(json.dumps([str(folder), mine])))
     for name, (here, there) in differences(mine, theirs).items():
@@ -172,47 +174,17 @@ def run(session: Session, report: Reporter, finish: Finish) -> int:
     Raises:
         divergence.Diverged: the run learns no more.
     """
-    settings, folder, env, program, resume_command, callbacks = session
-    train, cfg = settings.train, settings.algo
-    hooks = loop.Hooks(
-        resume_command, about=lambda m: unusual_in_words(settings._replace(configs=(m.config,)))
-    )
-    if train.eval_every:
-        algo = settings.row.make(env, None)
-        hooks = hooks._replace(evaluate=make_training_evaluation(algo, train.eval_episodes, train.seed))
-    begun = distributed.from_process_0(np.array(run_folder.newest_progress(folder) is not None))
-    if train.init_from is not None and not begun:
-        hooks = hooks._replace(adapt=warm_start(settings, program, report.line))
-    engine = getattr(innermost(env), "engine", None)  # Safety Gym's environments have one
-    try:
-        if distributed.leads():
-            folder.mkdir(parents=True, exist_ok=True)
-            run_folder.write_config(folder, settings.plain())
-            data = None if train.dataset is None else dataset.sha256(train.dataset)
-            run_folder.append_versions(folder, device_name(), engine, data)
-    except OSError as error:
-        raise checkpoint.CheckpointError(f"cannot write to {folder}: {error.strerror}") from error
-    if train.logger == "wandb" and distributed.leads():
-        callbacks += (wandb_callback(folder, settings.plain(), program.members),)
-    hooks = hooks._replace(callbacks=callbacks)
-    several = f"{len(settings.configs)} settings x " if len(settings.configs) > 1 else ""
-    seeds = f"{train.num_seeds} seed{'s' if train.num_seeds > 1 else ''}"
-    seeds += f" x {cfg.num_envs} envs" if program.clocks.steps else ""
-    where = device_name() + (f" x {train.devices}" if train.devices > 1 else "")
-    if jax.process_count() > 1:
-        where += f" in {jax.process_count()} processes"
-    where += f", engine {engine}" if engine else ""
-    kernels = {
-        "warp": ", and a minute of Warp's kernels the first time",
-        "c": ", about a minute at every start of engine c",
-    }.get(engine or "", "")
-    report.line(
-        f"jaxsafe {jaxsafe.__version__} | {settings.env_name} | {settings.algo_name} | "
-        f"{several}{seeds} | {where} | compiling rollout and update{kernels} ..."
-    )
+    settings, program, train = session.settings, session.program, session.settings.train
+    hooks = hooks_of(session, report)
+    if distributed.leads():
+        write_head(session)
+        if train.logger == "wandb":
+            to_wandb = wandb_callback(session.folder, settings.plain(), program.members)
+            hooks = hooks._replace(callbacks=(*hooks.callbacks, to_wandb))
+    report.line(greeting(session))
     if line := about_replay(program, train):
         report.line(line)
-    outcome = loop.train(program, train, folder, report, hooks)
+    outcome = loop.train(program, train, session.folder, report, hooks)
     distributed.part()
     if outcome.interrupted:
         return 130
@@ -221,8 +193,67 @@ def run(session: Session, report: Reporter, finish: Finish) -> int:
     with Interrupts(report.line, report.hosted) as stop:
         if not report.hosted:
             stop.nothing_to_save = (
-                f"stopped; the training is saved, and for what is left {resume_command}"
+                f"stopped; the training is saved, and for what is left {session.resume_command}"
             )
         finish(session, report, stop)
-    report.line(f"run folder: {folder}")
+    report.line(f"run folder: {session.folder}")
     return 0
+
+
+def hooks_of(session: Session, report: Reporter) -> loop.Hooks:
+    """What the session adds to the loop."""
+    settings, train = session.settings, session.settings.train
+    hooks = loop.Hooks(
+        session.resume_command,
+        about=lambda m: unusual_in_words(settings._replace(configs=(m.config,))),
+        callbacks=session.callbacks,
+    )
+    if train.eval_every:
+        algo = settings.row.make(session.env, None)
+        hooks = hooks._replace(evaluate=make_training_evaluation(algo, train.eval_episodes, train.seed))
+    begun = run_folder.newest_progress(session.folder) is not None
+    if train.init_from is not None and not distributed.from_process_0(np.array(begun)):
+        hooks = hooks._replace(adapt=warm_start(settings, session.program, report.line))
+    return hooks
+
+
+def engine_of(env: Env) -> str | None:
+    """What computes the physics of an environment; None where it has no engine."""
+    return getattr(innermost(env), "engine", None)
+
+
+def write_head(session: Session) -> None:
+    """What a run folder has before the first iteration.
+
+    Raises:
+        checkpoint.CheckpointError: the disk failed.
+    """
+    folder, train = session.folder, session.settings.train
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        run_folder.write_config(folder, session.settings.plain())
+        data = None if train.dataset is None else dataset.sha256(train.dataset)
+        run_folder.append_versions(folder, device_name(), engine_of(session.env), data)
+    except OSError as error:
+        raise checkpoint.CheckpointError(f"cannot write to {folder}: {error.strerror}") from error
+
+
+def greeting(session: Session) -> str:
+    """What trains where, in one line."""
+    settings, train = session.settings, session.settings.train
+    several = f"{len(settings.configs)} settings x " if len(settings.configs) > 1 else ""
+    seeds = f"{train.num_seeds} seed{'s' if train.num_seeds > 1 else ''}"
+    seeds += f" x {settings.algo.num_envs} envs" if session.program.clocks.steps else ""
+    where = device_name() + (f" x {train.devices}" if train.devices > 1 else "")
+    if jax.process_count() > 1:
+        where += f" in {jax.process_count()} processes"
+    engine = engine_of(session.env)
+    where += f", engine {engine}" if engine else ""
+    kernels = {
+        "warp": ", and a minute of Warp's kernels the first time",
+        "c": ", about a minute at every start of engine c",
+    }.get(engine or "", "")
+    return (
+        f"jaxsafe {jaxsafe.__version__} | {settings.env_name} | {settings.algo_name} | "
+        f"{several}{seeds} | {where} | compiling rollout and update{kernels} ..."
+    )

@@ -8,12 +8,9 @@ caller left out. Only this module looks up the names of environments and algorit
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
-
-import jax
-import numpy as np
 
 from jaxsafe import algos, envs
 from jaxsafe.algos import Row
@@ -37,6 +34,7 @@ from jaxsafe.envs.safety_gym import scene
 from jaxsafe.learn.constraints import check_cost_names, limits_by_name
 from jaxsafe.run import run_folder
 from jaxsafe.run.compat import COMPAT, overrides
+from jaxsafe.run.plain import as_text, differences, merged, repeated, replaced, to_plain, together
 from jaxsafe.types import Env
 
 DEFAULT = {"env": "point_goal1", "algo": "ppo_lag"}
@@ -63,29 +61,39 @@ COST_LIMITS = "cost_limits"  # an option of algorithms: floats by name, as {haza
 class TrainConfig:
     """The settings beside `env` and `algo`."""
 
-    total_steps: RunSteps = 10_000_000  # environment steps of one seed, rounded up to whole updates
-    # gradient steps of one seed, which then end the run; null: total_steps, or 100,000 with a data set
+    # environment steps of each seed, rounded up to whole updates
+    total_steps: RunSteps = 10_000_000
+    # gradient steps of each seed; if given, they end the run. null: total_steps, or 100,000 with a data
+    # set
     total_updates: RunSteps | None = None
-    num_envs: Amount | None = None  # of one seed; null: algo.num_envs
-    num_seeds: Annotated[int, Bounds(1, 2**16)] = 1  # trained at once: seed, seed + 1, ...
-    seed: Seed = 0
-    devices: Devices = 1  # the seeds are split over them or, for a lone one, its environments
-    coordinator: str | None = None  # host:port of process 0 where several train one run together
-    num_processes: Devices | None = None  # of them; under SLURM all three are known
-    process_index: Period | None = None  # 0 .. num_processes - 1
-    preset: str = "fast"  # the algorithm's defaults: fast, published, or one of its published settings
+    num_envs: Amount | None = None  # environments of each seed; null: algo.num_envs
+    # how many seeds are trained at once: seed, seed + 1, ...
+    num_seeds: Annotated[int, Bounds(1, 2**16)] = 1
+    seed: Seed = 0  # the first seed
+    # devices over which the seeds are split or, of a lone seed, its environments
+    devices: Devices = 1
+    # host:port of process 0, for one run in several processes; SLURM tells this and the next two
+    coordinator: str | None = None
+    num_processes: Devices | None = None  # how many processes there are
+    process_index: Period | None = None  # which of them this is, from 0
+    preset: str = "fast"  # the algorithm's defaults: fast, published, or another of its presets
     compat: str = "none"  # whose departures from the papers to follow: none, or omnisafe
-    run_dir: str | None = None  # null: runs/<env>-<algo>/<time>-seed<seed>
-    resume: bool | str = False  # true: run_dir, or the newest unfinished run like this one; or a folder
-    dataset: str | None = None  # a file to learn from, for offline algorithms
+    run_dir: str | None = None  # the run folder; null: runs/ENV-ALGO/TIME-seedN
+    # true: go on in run_dir or, without it, with the newest unfinished run of these settings; or the
+    # folder of a run
+    resume: bool | str = False
+    dataset: str | None = None  # the file that an offline algorithm learns from
     init_from: str | None = None  # a run folder whose policy to start from
-    checkpoint_every: Annotated[float, Bounds(0, 1e9)] = 60.0  # s between checkpoints
-    checkpoint_iterations: Period = 0  # also after this many iterations; 0: by time alone
-    checkpoint_replay: bool | None = None  # keep the replay, to resume bit for bit; null: up to 2 GB
-    eval_every: Period = 0  # evaluate after so many environment steps, or updates without any; 0: never
-    # of an evaluation, for each seed; 0: none, at the end either
+    checkpoint_every: Annotated[float, Bounds(0, 1e9)] = 60.0  # seconds between checkpoints
+    # also a checkpoint after so many iterations; 0: by time alone
+    checkpoint_iterations: Period = 0
+    # whether checkpoints keep the replay, to resume bit for bit; null: up to 2 GB
+    checkpoint_replay: bool | None = None
+    # also evaluate after so many environment steps or, offline, gradient steps; 0: at the end alone
+    eval_every: Period = 0
+    # episodes of an evaluation, for each seed; 0: no evaluation, also not at the end
     eval_episodes: Annotated[int, Bounds(0, 10**6)] = 20
-    video: bool = True  # of the first seed's policy, at the end
+    video: bool = True  # film the first seed's policy at the end
     logger: Literal["none", "wandb"] = "none"  # where metrics go beside the run folder
 
     def __post_init__(self) -> None:
@@ -356,6 +364,31 @@ def make_env(settings: Settings) -> Env:
     return env
 
 
+# ---- options by group --------------------------------------------------------------------------
+
+
+def nested(options: Mapping[str, Any]) -> dict[str, Any]:
+    """{'env': 'car_push1', 'algo.clip': 0.1} as config.yaml has it, {'env': {'name': ...}, ...}.
+
+    Of an option that is there twice the later one counts; dicts are merged.
+    """
+    out: dict[str, Any] = {}
+    for name, value in options.items():
+        for part in reversed(f"{name}.name".split(".") if name in DEFAULT else name.split(".")):
+            value = {part: value}
+        out = merged(out, value)
+    return out
+
+
+def parted(config: dict[str, Any]) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+    """The options beside 'env' and 'algo', and a copy of those two groups; a missing one is empty."""
+    for kind in DEFAULT:
+        if not isinstance(config.get(kind) or {}, Mapping):
+            raise ConfigError(f"{kind}={shown(config[kind])}: expected options by name")
+    groups = {kind: dict(config.get(kind) or {}) for kind in DEFAULT}
+    return {k: v for k, v in config.items() if k not in DEFAULT}, groups
+
+
 # ---- checks ----------------------------------------------------------------------------------
 
 
@@ -428,97 +461,7 @@ def settings_in(algo: dict[str, Any], kind: type) -> list[dict[str, Any]]:
     return [replaced(algo, dict(zip(lists, row, strict=True))) for row in rows]
 
 
-def repeated(values: Iterable[Any]) -> Any:
-    """The first value that was there before; None if all differ. 5 and 5.0 are the same."""
-
-    def key(value: Any) -> Any:
-        if isinstance(value, list | tuple):
-            return tuple(map(key, value))
-        return value if isinstance(value, int | float) else repr(value)
-
-    known = set()
-    for value in values:
-        if (found := key(value)) in known:
-            return value
-        known.add(found)
-    return None
-
-
-def replaced(options: dict[str, Any], new: dict[str, Any], where: str = "") -> dict[str, Any]:
-    """`options` with some values, by their names in `flat`, replaced."""
-    return {
-        k: replaced(v, new, f"{where}{k}.") if isinstance(v, dict) else new.get(f"{where}{k}", v)
-        for k, v in options.items()
-    }
-
-
-def together(settings: list[Any]) -> Any:
-    """The inverse of `settings_in`: a list stands where the settings differ."""
-    first = settings[0]
-    if isinstance(first, dict):
-        return {name: together([each[name] for each in settings]) for name in first}
-    return first if all(each == first for each in settings) else settings
-
-
-# ---- plain values ----------------------------------------------------------------------------
-
-
-def to_plain(value: Any, name: str = "") -> Any:
-    """Dicts, lists and scalars of Python only, as YAML writes and reads them.
-
-    Raises:
-        ConfigError: a value that has no such form.
-    """
-    if isinstance(value, Mapping):
-        return {str(k): to_plain(v, f"{name}.{k}" if name else str(k)) for k, v in value.items()}
-    if isinstance(value, list | tuple | range):
-        return [to_plain(v, f"{name}[{i}]") for i, v in enumerate(value)]
-    if isinstance(value, np.generic | np.ndarray | jax.Array):
-        return value.tolist()
-    if isinstance(value, Path):
-        return str(value)
-    if value is None or isinstance(value, bool | int | float | str):
-        return value
-    raise ConfigError(
-        f"{name}={value!r}: expected a number, a string, true or false, None, a list or a dict"
-    )
-
-
-def nested(options: Mapping[str, Any]) -> dict[str, Any]:
-    """{'env': 'car_push1', 'algo.clip': 0.1} as config.yaml has it, {'env': {'name': ...}, ...}.
-
-    Of an option that is there twice the later one counts; dicts are merged.
-    """
-    out: dict[str, Any] = {}
-    for name, value in options.items():
-        for part in reversed(f"{name}.name".split(".") if name in DEFAULT else name.split(".")):
-            value = {part: value}
-        out = merged(out, value)
-    return out
-
-
-def merged(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any]:
-    """`old` with the values of `new`, dicts in dicts likewise."""
-    out = dict(old)
-    for name, value in new.items():
-        inside = isinstance(value, dict) and isinstance(out.get(name), dict)
-        out[name] = merged(out[name], value) if inside else value
-    return out
-
-
-def parted(config: dict[str, Any]) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-    """The options beside 'env' and 'algo', and a copy of those two groups; a missing one is empty."""
-    for kind in DEFAULT:
-        if not isinstance(config.get(kind) or {}, Mapping):
-            raise ConfigError(f"{kind}={shown(config[kind])}: expected options by name")
-    groups = {kind: dict(config.get(kind) or {}) for kind in DEFAULT}
-    return {k: v for k, v in config.items() if k not in DEFAULT}, groups
-
-
-def differences(a: dict[str, Any], b: dict[str, Any]) -> dict[str, tuple[Any, Any]]:
-    """The names that have not the same value in both, with both values."""
-    pairs = {name: (a.get(name), b.get(name)) for name in {**a, **b}}
-    return {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
+# ---- in words ----------------------------------------------------------------------------------
 
 
 def unusual_in_words(settings: Settings, most: int = 4) -> str:
@@ -541,14 +484,3 @@ def unusual_in_words(settings: Settings, most: int = 4) -> str:
     told = [f"{k}={as_text(other[k][0])} (default {as_text(other[k][1])})" for k in ranked[:most]]
     more = [f"and {len(ranked) - most} more"] if len(ranked) > most else []
     return f"unusual: {', '.join([*told, *more])}" if told else "all its settings are the defaults"
-
-
-def as_text(value: Any) -> str:
-    """A plain value as it is typed on the command line: [a,b], {a:1}, true, null."""
-    if isinstance(value, list | tuple):
-        return f"[{','.join(map(as_text, value))}]"
-    if isinstance(value, dict):
-        return f"{{{','.join(f'{k}:{as_text(v)}' for k, v in value.items())}}}"
-    if value is None or isinstance(value, bool):
-        return {None: "null", True: "true", False: "false"}[value]
-    return str(value)

@@ -27,6 +27,7 @@ from jaxsafe.config import Amount, ConfigError, convert, flat, is_float
 from jaxsafe.run import checkpoint, clock, distributed, files, memory, run_folder, session
 from jaxsafe.run.divergence import Diverged
 from jaxsafe.run.interrupts import Interrupts
+from jaxsafe.run.plain import as_text, differences, merged, repeated
 from jaxsafe.run.policies import warm_start
 from jaxsafe.run.programs import Program
 from jaxsafe.run.progress import Reporter
@@ -38,13 +39,9 @@ from jaxsafe.run.settings import (
     NOT_COMPARED,
     Extras,
     Settings,
-    as_text,
-    differences,
     find_algo,
     make_env,
-    merged,
     nested,
-    repeated,
     settings_from_options,
 )
 

@@ -31,7 +31,7 @@ from shell import (
 from toys import START
 
 from jaxsafe import algos, envs
-from jaxsafe.config import ConfigError
+from jaxsafe.config import ConfigError, flat
 from jaxsafe.learn.conventions import conventions
 from jaxsafe.run import (
     arguments,
@@ -114,7 +114,15 @@ def test_a_new_process_reports_bad_input_the_same_way(tmp_path, capsys):
 def test_help_and_cfg_show_every_option_with_its_default(capsys):
     assert not typed("train", "--help")
     out = capsys.readouterr().out
-    assert "env=car_push1 algo=cpo" in out and "total_steps: 10000000" in out
+    assert "env=car_push1 algo=cpo" in out and max(map(len, out.splitlines())) <= 100
+    assert not typed("train", "env=hopper_velocity", "algo=cpo", "-h")
+    other = capsys.readouterr().out
+    for shown, env, algo in ((out, "point_goal1", "ppo_lag"), (other, "hopper_velocity", "cpo")):
+        known = settings.defaults_of({}, {"env": env, "algo": algo})
+        for name in flat(known):
+            assert f"\n  {name}=" in shown or name.endswith(".name"), name
+    line = next(line for line in other.splitlines() if line.startswith("  algo.violation_gain=5.0"))
+    assert line.endswith("A step is asked to take back this many times v.")
     texts = ["env=Safexp-CarPush1-v0", "algo=cpo", "total_steps=1e7"]
     assert not typed("train", "--cfg", "job", *texts, "env.placements_extents=[-1,-1,1,1]")
     shown = yaml.safe_load(capsys.readouterr().out)

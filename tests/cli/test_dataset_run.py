@@ -1,5 +1,6 @@
 """Runs that learn from a data set: trained, evaluated, stopped, resumed, compared, refused."""
 
+import contextlib
 import json
 import shutil
 from typing import Any
@@ -10,7 +11,7 @@ import pytest
 from shell import TOY, assert_same_run, start, typed, wait_for
 
 import jaxsafe
-from jaxsafe.config import ConfigError
+from jaxsafe.config import ConfigError, flat
 from jaxsafe.learn.offline import DataSet, data_set
 from jaxsafe.report import read
 from jaxsafe.run import checkpoint, dataset, run_folder, session
@@ -133,6 +134,19 @@ def test_python_trains_on_a_path(data, tmp_path, capsys):
 def test_a_data_set_has_100_000_updates_unless_told_otherwise(data):
     assert compose([*BC, f"dataset={data}"]).train.total_updates == 100_000
     assert compose([*BC]).train.total_updates is None
+
+
+def test_processes_whose_files_differ_are_refused(data, tmp_path, monkeypatch):
+    """As process 1 of two whose process 0 has another file under the same path."""
+    settings = compose([*BC, f"dataset={data}", f"run_dir={tmp_path}"])
+    mine = flat(settings.plain()) | {"the data set's SHA-256": dataset.sha256(str(data))}
+    monkeypatch.setattr(jax, "process_count", lambda: 2)
+    monkeypatch.setattr(session.distributed, "leads", lambda: False)
+    for theirs, message in ((mine, None), (mine | {"the data set's SHA-256": "0"}, "SHA-256=.* 0 in")):
+        said = json.dumps([str(tmp_path), theirs])
+        monkeypatch.setattr(session.distributed, "text_from_process_0", lambda text, said=said: said)
+        with pytest.raises(ConfigError, match=message) if message else contextlib.nullcontext():
+            assert session.agree_on_folder(settings, None, print) == tmp_path
 
 
 @pytest.mark.parametrize(

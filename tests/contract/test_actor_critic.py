@@ -16,8 +16,8 @@ from toys import START, Lever, Ticker
 
 from jaxsafe.algos import ALGOS, ddpg, sac, td3
 from jaxsafe.learn.actor_critic import Actor, actor_critic
+from jaxsafe.learn.bill import charge, empty_bill, settle
 from jaxsafe.learn.learner import GradientStep
-from jaxsafe.learn.off_policy import charge, empty_bill, settle
 from jaxsafe.learn.replay import Transitions
 from jaxsafe.learn.treatments import Multiplier, lagrangian, no_treatment
 from jaxsafe.nn.critics import q_values
@@ -291,11 +291,11 @@ def test_a_delayed_policy_and_its_targets_move_at_every_second_step():
     nets = learner.init(jax.random.key(0), 3, 2, cfg)
     batch = drawn_batch()
     batch = jax.tree.map(lambda x: jnp.asarray(x, NARROW.get(x.dtype.kind, x.dtype)), batch)
-    step = jax.jit(lambda nets, at: learner.step(nets, batch, at, cfg, None)[0], compiler_options=FAST)
+    step = jax.jit(lambda nets, at: learner.step(nets, batch, at, cfg, None), compiler_options=FAST)
     for count in range(4):
         before = nets
         at = GradientStep(jnp.int32(count), jnp.float32(1), jax.random.key(count))
-        nets = step(nets, at)
+        nets, metrics = step(nets, at)
         moved = {
             name: any(
                 bool((x != y).any())
@@ -307,6 +307,19 @@ def test_a_delayed_policy_and_its_targets_move_at_every_second_step():
         }
         due = count % 2 == 1
         assert moved == {"actor": due, "log_alpha": due, "targets": due, "critic_r": True}
+        assert jnp.isfinite(metrics["train/critic_loss"])
+        assert jnp.isfinite(metrics["train/actor_loss"]) == due  # a step that is not due has none
+
+
+@pytest.mark.parametrize("delay, count", [(1, 1), (2, 2)])
+def test_a_delayed_policy_is_computed_where_it_is_due_alone_by_members_too(delay, count):
+    """One cond for the warm-up and one for the delay. Under vmap one with a member axis would be none:
+    it computes both branches."""
+    algo, cfg = ALGOS["td3_lag"].make(Lever()), ALGOS["td3_lag"].config(policy_delay=delay)
+    init = jax.vmap(lambda key: algo.init(key, cfg, START))
+    ts = jax.eval_shape(lambda: init(jax.random.split(jax.random.key(0), 2)))
+    program = jax.make_jaxpr(jax.vmap(algo.update, in_axes=(0, None)))(ts, START)
+    assert str(program).count("= cond[") == count
 
 
 # ---- values ------------------------------------------------------------------------------------
@@ -384,7 +397,8 @@ def test_the_critics_find_the_values_of_a_chain(name, circle, n_step):
 def test_the_price_moves_by_environment_steps_alone(num_envs, horizon):
     """J_c is 10 above its limit, so that each of Adam's moves is dual_lr: 0.1 for each 1,000 steps."""
     cfg = jax.tree.map(
-        jnp.float32, sac.SACLagConfig(cost_limit=10.0, dual_every=1000, dual_starts=16_000, lam_init=0)
+        jnp.float32,
+        sac.SACLagConfig(cost_limit=10.0, dual_every=1000, dual_starts=16_000, lam_init=0, dual_lr=0.1),
     )
     real = jnp.ones((horizon, num_envs), bool).at[0].set(False)  # the first of them are resets
     cost = jnp.where(real, 0.2, 7.0)

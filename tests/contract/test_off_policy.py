@@ -241,7 +241,7 @@ def test_the_clocks_count_environment_steps_and_gradient_steps():
     cfg = ALGOS["sac"].config(**TINY)
     assert ALGOS["sac"].make(Corridor()).clocks(cfg) == (8 * 6, 3 * (4 * 8 * 2 // 32))
     fast = ALGOS["sac"].config()
-    assert ALGOS["sac"].make(Corridor()).clocks(fast) == (1024 * 16, 16 * 4)
+    assert ALGOS["sac"].make(Corridor()).clocks(fast) == (1024 * 16, 16 * 16)
 
 
 @dataclass(frozen=True)

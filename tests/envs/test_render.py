@@ -16,7 +16,8 @@ from toys import reflex
 
 from jaxsafe import envs
 from jaxsafe.config import ConfigError
-from jaxsafe.envs.view import render
+from jaxsafe.envs.view import backend, render
+from jaxsafe.envs.view.stage import Stage, split
 
 WIDTH, HEIGHT = 320, 240
 
@@ -106,7 +107,7 @@ def test_a_cost_turns_on_the_red_light(display):
 @pytest.mark.parametrize("flat", [True, False])
 def test_the_halo_shows_the_lidars_of_the_observation(display, flat):
     env, state = reset("point_goal1", observation_flatten=flat)
-    parts = render.split(state.obs, env.observation_spec)
+    parts = split(state.obs, env.observation_spec)
     assert {k: v.size for k, v in parts.items()} == {
         k: np.prod(v) for k, v in env.observation_spec.items()
     }
@@ -124,7 +125,7 @@ def test_the_halo_shows_the_lidars_of_the_observation(display, flat):
 
 def marks(env, state) -> list[Any]:
     """The geoms over a scene without bodies."""
-    stage, geoms = render.Stage(env), mujoco.MjvScene(mujoco.MjModel.from_xml_string("<mujoco/>"), 500)  # type: ignore[attr-defined]
+    stage, geoms = Stage(env), mujoco.MjvScene(mujoco.MjModel.from_xml_string("<mujoco/>"), 500)  # type: ignore[attr-defined]
     stage.move(state.physics)
     stage.mark(geoms, state)
     return list(geoms.geoms[: geoms.ngeom])
@@ -179,7 +180,7 @@ def test_a_caption_says_what_an_episode_has_earned_and_cost(display, monkeypatch
 def test_what_an_algorithm_appends_to_an_observation_is_not_drawn():
     obs, spec = np.arange(5.0), {"goal_lidar": (3,), "velocimeter": (2,)}
     for seen in (obs, np.append(obs, 9.0)):
-        parts = render.split(seen, spec)
+        parts = split(seen, spec)
         np.testing.assert_array_equal(parts["goal_lidar"], [0, 1, 2])
         np.testing.assert_array_equal(parts["velocimeter"], [3, 4])
 
@@ -218,28 +219,28 @@ def test_a_film_of_another_kind_is_refused_in_one_line(tmp_path):
 
 
 def test_without_a_backend_there_is_one_line(monkeypatch):
-    monkeypatch.setattr(render, "works", lambda backend: False)
+    monkeypatch.setattr(backend, "works", lambda backend: False)
     monkeypatch.delenv("MUJOCO_GL", raising=False)
-    with pytest.raises(render.NoDisplay) as error:
-        render.find_backend()
+    with pytest.raises(backend.NoDisplay) as error:
+        backend.find_backend()
     assert "\n" not in str(error.value) and "libegl1" in str(error.value)
 
 
 def test_backends_are_tried_in_turn_unless_one_is_asked_for(monkeypatch):
     tried = []
-    monkeypatch.setattr(render.platform, "system", lambda: "Linux")
-    monkeypatch.setattr(render, "works", lambda backend: tried.append(backend) or backend == "osmesa")
+    monkeypatch.setattr(backend.platform, "system", lambda: "Linux")
+    monkeypatch.setattr(backend, "works", lambda backend: tried.append(backend) or backend == "osmesa")
     monkeypatch.delenv("MUJOCO_GL", raising=False)
-    assert render.find_backend() == "osmesa" and tried == ["egl", "osmesa"]
+    assert backend.find_backend() == "osmesa" and tried == ["egl", "osmesa"]
     monkeypatch.setenv("MUJOCO_GL", "egl")
-    with pytest.raises(render.NoDisplay, match="unset MUJOCO_GL=egl"):
-        render.find_backend()
+    with pytest.raises(backend.NoDisplay, match="unset MUJOCO_GL=egl"):
+        backend.find_backend()
 
 
 def test_a_backend_that_is_off_is_no_display(monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "off")
-    with pytest.raises(render.NoDisplay, match="unset MUJOCO_GL=off"):
-        render.find_backend()
+    with pytest.raises(backend.NoDisplay, match="unset MUJOCO_GL=off"):
+        backend.find_backend()
 
 
 def test_a_process_that_drew_ends_quietly(display):

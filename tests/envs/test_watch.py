@@ -24,18 +24,19 @@ from jaxsafe import envs
 from jaxsafe.commands import render as render_command
 from jaxsafe.commands import watch as watch_command
 from jaxsafe.config import ConfigError
-from jaxsafe.envs.view import watch
+from jaxsafe.envs.view import playback, window
 from jaxsafe.envs.view.driving import FRONT, drive, robot_of
+from jaxsafe.envs.view.page import as_bars, as_jpeg, as_table
 from jaxsafe.report import film
 
 ROOT = Path(__file__).parent.parent.parent
 
 
 @pytest.fixture(scope="module")
-def session() -> watch.Playback:
+def session() -> playback.Playback:
     """Of a policy that always turns left at half speed."""
     env = envs.make("point_goal0", engine="c", num_steps=6)
-    return watch.Playback(env, reflex(lambda obs: jnp.array([0.0, 0.5]), env), seed=3)
+    return playback.Playback(env, reflex(lambda obs: jnp.array([0.0, 0.5]), env), seed=3)
 
 
 @pytest.mark.parametrize(
@@ -70,20 +71,20 @@ def test_no_keys_drive_a_robot_of_ones_own(tmp_path):
     own.write_text((ROOT / "envs" / "safety_gym" / "assets" / "point.xml").read_text())
     env = envs.make("point_goal0", engine="c", robot_base=str(own))
     with pytest.raises(ConfigError, match=r"rover\.xml'?: keys drive point, car, doggo alone"):
-        watch.Playback(env)
+        playback.Playback(env)
     with pytest.raises(
         ConfigError,
         match="only Safety Gym's environments and velocity tasks can be drawn, not a Simple",
     ):
-        watch.Playback(SimpleNamespace())  # type: ignore[arg-type]
+        playback.Playback(SimpleNamespace())  # type: ignore[arg-type]
     assert robot_of(envs.make("car_goal0", engine="c", robot_base="xmls/car.xml")) == "car"
 
 
 def test_opposite_keys_cancel_and_letters_are_arrows_too():
-    assert watch.pushed(set()) == (0, 0)
-    assert watch.pushed({"ArrowUp", "KeyW", "KeyA"}) == (1, 1)
-    assert watch.pushed({"KeyW", "KeyS", "ArrowRight"}) == (0, -1)
-    assert watch.pushed({"KeyQ", "ArrowDown"}) == (-1, 0)
+    assert playback.pushed(set()) == (0, 0)
+    assert playback.pushed({"ArrowUp", "KeyW", "KeyA"}) == (1, 1)
+    assert playback.pushed({"KeyW", "KeyS", "ArrowRight"}) == (0, -1)
+    assert playback.pushed({"KeyQ", "ArrowDown"}) == (-1, 0)
 
 
 def test_a_session_counts_and_goes_on_to_the_next_seed(session):
@@ -94,12 +95,12 @@ def test_a_session_counts_and_goes_on_to_the_next_seed(session):
         rewards.append(float(session.state.reward))
     assert (session.seed, session.steps) == (3, 5)
     assert session.ret == pytest.approx(sum(rewards)) and any(rewards)
-    shown = watch.figures(session)
+    shown = playback.figures(session)
     assert shown["step"] == "5 of 6" and shown["return"] == f"{session.ret:.2f}"
     session.step()
     assert (session.seed, session.steps, session.ret) == (4, 0, 0.0)
     last = session.ended[0]
-    assert last[:2] == (3, 6) and f"<td>{last.ret:.2f}</td>" in watch.as_table(session)
+    assert last[:2] == (3, 6) and f"<td>{last.ret:.2f}</td>" in as_table(session)
     session.reset(3)
     np.testing.assert_array_equal(session.state.obs, first.obs)
 
@@ -124,7 +125,7 @@ def test_play_shows_all_the_time_and_steps_at_the_pace_of_the_robot_unless_pause
             session.seconds, playing, lambda: stepped.append(1)
         )
         end = time.monotonic() + 0.5
-        watch.Playback.play(fake, lambda: shown.append(1), lambda: time.monotonic() > end)  # type: ignore[arg-type]
+        playback.Playback.play(fake, lambda: shown.append(1), lambda: time.monotonic() > end)  # type: ignore[arg-type]
         return len(stepped), len(shown)
 
     stepped, shown = seconds(True)
@@ -141,13 +142,13 @@ def test_bars_have_what_is_ahead_in_the_middle_and_what_is_left_left(robot, bins
     for side, bin_ in zip(("left", "right"), bins, strict=True):
         obs = np.zeros(env.obs_size)
         obs[before + bin_] = 1.0
-        svg = watch.as_bars(env, SimpleNamespace(obs=obs))  # type: ignore[arg-type]
+        svg = as_bars(env, SimpleNamespace(obs=obs))  # type: ignore[arg-type]
         heights = [float(h) for h in re.findall(r"height='([\d.]+)' fill", svg)]
         assert int(np.argmax(heights)) == (7 if side == "left" else 8) and len(heights) == 16
 
 
 def test_pictures_are_sent_as_jpeg():
-    assert watch.as_jpeg(np.zeros((8, 8, 3), np.uint8))[:3] == b"\xff\xd8\xff"
+    assert as_jpeg(np.zeros((8, 8, 3), np.uint8))[:3] == b"\xff\xd8\xff"
 
 
 # Bad input -------------------------------------------------------------------------------------------
@@ -176,12 +177,12 @@ BAD = {
 
 @pytest.mark.parametrize("args", BAD, ids=" ".join)
 def test_watch_refuses_in_one_line(monkeypatch, capsys, args):
-    monkeypatch.setattr(watch, "has_display", lambda: False)
+    monkeypatch.setattr(window, "has_display", lambda: False)
     assert BAD[args] in said(monkeypatch, capsys, watch_command.main, *args)
 
 
 def test_without_a_display_a_page_needs_its_package_a_port_and_a_browser_to_open(monkeypatch, capsys):
-    monkeypatch.setattr(watch, "has_display", lambda: False)
+    monkeypatch.setattr(window, "has_display", lambda: False)
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()

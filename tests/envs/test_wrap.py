@@ -10,7 +10,6 @@ import pytest
 from toys import Corridor, Ticker
 
 from jaxsafe import envs
-from jaxsafe.api import choose_env
 from jaxsafe.config import ConfigError
 from jaxsafe.envs.check import check_env
 from jaxsafe.envs.wrap import (
@@ -23,6 +22,7 @@ from jaxsafe.envs.wrap import (
 )
 from jaxsafe.learn.rollout import collect, init_rollout
 from jaxsafe.run.arguments import compose
+from jaxsafe.run.choice import choose_env
 from jaxsafe.run.programs import build
 from jaxsafe.run.settings import make_env, settings_from_config
 from jaxsafe.types import Env, State

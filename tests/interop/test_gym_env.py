@@ -2,8 +2,11 @@
 
 import functools
 import importlib
+import itertools
 import sys
+import types
 from collections.abc import Iterator
+from typing import Any
 
 import gymnasium
 import jax
@@ -54,11 +57,14 @@ def test_point_goal1_is_made_by_its_id_and_passes_the_checker_with_its_pictures(
 
 def test_every_environment_of_the_suite_has_an_id():
     ids = {key for key in gymnasium.registry if key.startswith("jaxsafe/")}
-    theirs = {alias.removeprefix("Safexp-") for alias in envs.ALIASES}
-    assert ids == {f"jaxsafe/{name}" for name in {*envs.ENVS, *theirs}}
-    assert {"jaxsafe/point_goal1", "jaxsafe/PointGoal1-v0"} <= ids
+    original = {alias.removeprefix("Safexp-") for alias in envs.ALIASES}
+    parts = itertools.product(("Point", "Car"), ("Goal", "Button", "Push"), "012")
+    theirs = {f"Safety{robot}{task}{level}-v0" for robot, task, level in parts}
+    assert ids >= {f"jaxsafe/{name}" for name in {*envs.ALIASES.values(), *original, *theirs}}
     kwargs = [gymnasium.spec(f"jaxsafe/{name}").kwargs for name in ("point_goal1", "PointGoal1-v0")]
     assert kwargs == [{"env": "point_goal1"}] * 2
+    ruled = gymnasium.spec("jaxsafe/SafetyCarPush2-v0").kwargs
+    assert ruled == {"env": "car_push2", "rules": "safety_gymnasium"}
     older = gymnasium.spec("jaxsafe/SafetyAntVelocity-v0").kwargs
     assert older == {"env": "ant_velocity", "thresholds": "v0"}
 
@@ -197,27 +203,28 @@ def test_omnisafe_finds_what_its_wrappers_read(num_envs):
     assert ended >= 2
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("num_envs", [1, 2])
-def test_omnisafe_s_own_ppo_lag_trains_on_our_six_tuple(num_envs, monkeypatch, tmp_path):
-    omnisafe = pytest.importorskip("omnisafe", reason="OmniSafe 0.5 needs Python 3.8 to 3.10")
-    theirs = pytest.importorskip("safety_gymnasium")
-    monkeypatch.chdir(tmp_path)
+@pytest.fixture
+def omnisafe(monkeypatch) -> Any:
+    """OmniSafe with our environments in place of Safety-Gymnasium, which needs an old Gymnasium."""
 
-    def make(id: str, autoreset: bool = False, **kwargs):
-        return SixTuple(gymnasium.make("jaxsafe/PointGoal1-v0", num_steps=100), autoreset)
+    def make(id: str, autoreset: bool = False, **kwargs: Any) -> SixTuple:
+        return SixTuple(gymnasium.make(f"jaxsafe/{id}", num_steps=100), autoreset)
 
-    def make_vec(env_id: str, num_envs: int, **kwargs):
-        made = gymnasium.make_vec(
-            "jaxsafe/PointGoal1-v0",
-            num_envs=num_envs,
-            vectorization_mode="vector_entry_point",
-            num_steps=100,
-        )
+    def make_vec(env_id: str, num_envs: int, **kwargs: Any) -> SixTupleVector:
+        kind: Any = "vector_entry_point"
+        made = gymnasium.make_vec(f"jaxsafe/{env_id}", num_envs, kind, num_steps=100)
         return SixTupleVector(made)
 
-    monkeypatch.setattr(theirs, "make", make)
-    monkeypatch.setattr(theirs.vector, "make", make_vec)
+    stand_in: Any = types.ModuleType("safety_gymnasium")
+    stand_in.make, stand_in.vector = make, types.SimpleNamespace(make=make_vec)
+    monkeypatch.setitem(sys.modules, "safety_gymnasium", stand_in)
+    return pytest.importorskip("omnisafe", reason="needs omnisafe 0.5, installed with --no-deps")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("num_envs", [1, 2])
+def test_omnisafe_s_own_ppo_lag_trains_on_our_six_tuple(num_envs, omnisafe, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
     custom = {
         "train_cfgs": {"total_steps": 800, "vector_env_nums": num_envs, "device": "cpu"},
         "algo_cfgs": {"steps_per_epoch": 400, "update_iters": 2},

@@ -19,10 +19,10 @@ from jaxsafe.envs.wrap import WrapConfig
 from jaxsafe.learn.conventions import conventions
 from jaxsafe.run import sweep
 from jaxsafe.run.arguments import check_arguments, compose, read_values
+from jaxsafe.run.plain import as_text
 from jaxsafe.run.settings import (
     Settings,
     TrainConfig,
-    as_text,
     defaults_of,
     nested,
     settings_from_config,

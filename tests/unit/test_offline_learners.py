@@ -13,6 +13,7 @@ from toys import Corridor, Lever
 
 from jaxsafe.algos import ALGOS, bc, bcq, coptidice, crr
 from jaxsafe.config import ConfigError
+from jaxsafe.learn.acting import Learned
 from jaxsafe.learn.learner import GradientStep
 from jaxsafe.learn.offline import batch_at, constrained, data_set, first_obs_at
 from jaxsafe.learn.treatments import Multiplier, lagrangian
@@ -183,7 +184,8 @@ def test_without_a_price_bcq_takes_the_best_of_the_candidates():
     nets, batch, _, b = prepared(learner, cfg)
     params, key = double(nets.params), jax.random.key(2)
     assert "critic_c" not in params
-    taken = learner.act(nets.params, batch.obs, key, cfg)
+    learned = Learned(cfg, nets.params, (), ())
+    taken = learner.act(learned, batch.obs, key)
     z = np.clip(noise(key, (5, 20, 4)), -0.5, 0.5)
     for i in range(5):
         obs = np.tile(b["obs"][i], (20, 1))
@@ -192,7 +194,7 @@ def test_without_a_price_bcq_takes_the_best_of_the_candidates():
         a = np.clip(likely + 0.05 * np.tanh(out), -1, 1)
         best = a[q(params["critic_r"], obs, a)[0].argmax()]
         np.testing.assert_allclose(taken[i], best, atol=1e-5)
-    first, again = (learner.act(nets.params, batch.obs, None, cfg) for _ in range(2))
+    first, again = (learner.act(learned, batch.obs, None) for _ in range(2))
     np.testing.assert_array_equal(first, again)
 
 

@@ -1,4 +1,4 @@
-from typing import get_args
+from typing import NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +8,7 @@ import pytest
 from jaxsafe.learn.batch import batch_mean
 from jaxsafe.learn.returns import (
     Estimator,
+    ValuedSteps,
     advantages,
     expected_length,
     gae,
@@ -19,49 +20,54 @@ NO, YES = jnp.zeros((1, 1), bool), jnp.ones((1, 1), bool)
 ONE = jnp.ones((1, 1))
 
 
+class Failures(NamedTuple):
+    terminated: jax.Array
+    length: jax.Array
+
+
 def column(*values):
     return jnp.array(values)[:, None]
 
 
 def test_a_time_limit_bootstraps_and_a_failure_does_not():
-    timed_out = gae(ONE, 0 * ONE, 2 * ONE, NO, YES, discount=0.5, decay=1.0)
-    failed = gae(ONE, 0 * ONE, 2 * ONE, YES, YES, discount=0.5, decay=1.0)
+    timed_out = gae(ValuedSteps(ONE, 0 * ONE, 2 * ONE, NO, YES), discount=0.5, decay=1.0)
+    failed = gae(ValuedSteps(ONE, 0 * ONE, 2 * ONE, YES, YES), discount=0.5, decay=1.0)
     assert (timed_out.item(), failed.item()) == (2.0, 1.0)
 
 
 def test_a_value_that_is_not_finite_stays_behind_a_failure():
-    assert gae(ONE, 0 * ONE, jnp.nan * ONE, YES, YES, discount=0.5, decay=1.0).item() == 1.0
-    grad = jax.grad(lambda v: gae(ONE, 0 * ONE, v, YES, YES, discount=0.5, decay=1.0).sum())
-    assert grad(jnp.inf * ONE).item() == 0.0
+    def advantage(next_value):
+        return gae(ValuedSteps(ONE, 0 * ONE, next_value, YES, YES), discount=0.5, decay=1.0).sum()
+
+    assert advantage(jnp.nan * ONE) == 1.0
+    assert jax.grad(advantage)(jnp.inf * ONE).item() == 0.0
 
 
 def test_three_steps_by_hand():
     # deltas with discount 1/2: 1 + 1 - 1 = 1, 2 + 2 - 2 = 2, 3 + 4 - 4 = 3; decay 1/2 weighs by 1/4
-    advantage = gae(
+    steps = ValuedSteps(
         column(1.0, 2.0, 3.0),
         column(1.0, 2.0, 4.0),
         column(2.0, 4.0, 8.0),
         column(False, False, False),
         column(False, False, True),
-        discount=0.5,
-        decay=0.5,
     )
+    advantage = gae(steps, discount=0.5, decay=0.5)
     np.testing.assert_allclose(advantage[:, 0], [1 + (2 + 3 / 4) / 4, 2 + 3 / 4, 3])
 
 
 def test_nothing_leaks_from_the_next_episode():
     reward = column(1.0, 100.0)
-    advantage = gae(
-        reward, 0 * reward, 0 * reward, NO.repeat(2, 0), column(True, False), discount=0.9, decay=0.9
-    )
-    assert advantage[0].item() == 1.0
+    steps = ValuedSteps(reward, 0 * reward, 0 * reward, NO.repeat(2, 0), column(True, False))
+    assert gae(steps, discount=0.9, decay=0.9)[0].item() == 1.0
 
 
 def test_without_decay_the_sum_is_the_discounted_return():
     key = jax.random.split(jax.random.key(0), 2)
     reward, value = jax.random.normal(key[0], (6, 3)), jax.random.normal(key[1], (7, 3))
     no = jnp.zeros((6, 3), bool)
-    advantage = gae(reward, value[:-1], value[1:], no, no, discount=0.9, decay=1.0)
+    steps = ValuedSteps(reward, value[:-1], value[1:], no, no)
+    advantage = gae(steps, discount=0.9, decay=1.0)
     ret = sum(0.9**t * reward[t] for t in range(6)) + 0.9**6 * value[6]
     np.testing.assert_allclose(advantage[0] + value[0], ret, rtol=1e-5)
 
@@ -69,27 +75,27 @@ def test_without_decay_the_sum_is_the_discounted_return():
 def test_episode_cost_is_the_plain_mean_over_synchronous_episodes():
     cost = jax.random.uniform(jax.random.key(0), (10, 4))
     failed = jnp.zeros((10, 4), bool)
-    length, _ = expected_length(no_lost_time(), 10, failed, jnp.full((10, 4), 10), 40)
+    length, _ = expected_length(no_lost_time(), 10, Failures(failed, jnp.full((10, 4), 10)), 40)
     np.testing.assert_allclose(batch_mean(cost, None) * length, cost.sum(0).mean(), rtol=1e-6)
 
 
 def test_the_length_by_lost_time_by_hand():
     # of 8 steps one fails at step 2 of 10 and loses 8: x = 1, and 10 / (1 + 1) = 5
     failed, lengths = jnp.zeros((4, 2), bool).at[1, 0].set(True), jnp.full((4, 2), 2)
-    length, past = expected_length(no_lost_time(), 10, failed, lengths, 8)
+    length, past = expected_length(no_lost_time(), 10, Failures(failed, lengths), 8)
     assert length == 5 and past == (8, 8)  # 2 episodes of 5 steps are remembered: all of it
     # 8 more steps without a failure: x = 8 / 16, of which 2 episodes of 6 2/3 steps stay
-    length, past = expected_length(past, 10, ~failed & False, lengths, 8)
+    length, past = expected_length(past, 10, Failures(~failed & False, lengths), 8)
     np.testing.assert_allclose((length, *past), (20 / 3, 20 / 3, 40 / 3), rtol=1e-6)
     # where 4 of the first 8 entries are resets: x = 8 / 4
-    length, _ = expected_length(no_lost_time(), 10, failed, lengths, 4)
+    length, _ = expected_length(no_lost_time(), 10, Failures(failed, lengths), 4)
     np.testing.assert_allclose(length, 10 / 3, rtol=1e-6)
 
 
 def test_the_length_by_lost_time_stays_exactly_at_the_time_limit():
-    past = no_lost_time()
+    past, none = no_lost_time(), Failures(jnp.zeros((7, 13), bool), jnp.full((7, 13), 3))
     for _ in range(3):
-        length, past = expected_length(past, 1000, jnp.zeros((7, 13), bool), jnp.full((7, 13), 3), 91)
+        length, past = expected_length(past, 1000, none, 91)
         assert length == 1000
 
 
@@ -107,7 +113,8 @@ def test_the_length_by_lost_time_is_right_from_the_first_batch(limit, hazard, st
             clock += 1
             failed, lengths = [*failed, rng.random(envs) < hazard], [*lengths, clock.copy()]
             clock[failed[-1] | (clock == limit)] = 0
-        length, past = step(past, limit, jnp.array(failed), jnp.array(lengths), envs * horizon)
+        steps = Failures(jnp.array(failed), jnp.array(lengths))
+        length, past = step(past, limit, steps, envs * horizon)
         found.append(length / exact)
     np.testing.assert_allclose(found[0], 1, atol=0.3)
     np.testing.assert_allclose(found[-1], 1, atol=0.1)
@@ -115,28 +122,28 @@ def test_the_length_by_lost_time_is_right_from_the_first_batch(limit, hazard, st
 
 # Three steps of one environment: the first ends by its time limit, the second by a failure, the third
 # goes on beyond the batch. Discount 1/2, so deltas 1 + 4/2 - 1, 2 - 3, 4 + 6/2 - 5.
-ENDS = {
-    "reward": column(1.0, 2.0, 4.0),
-    "value": column(1.0, 3.0, 5.0),
-    "next_value": column(4.0, 100.0, 6.0),
-    "terminated": column(False, True, False),
-    "done": column(True, True, False),
-}
+ENDS = ValuedSteps(
+    reward=column(1.0, 2.0, 4.0),
+    value=column(1.0, 3.0, 5.0),
+    next_value=column(4.0, 100.0, 6.0),
+    terminated=column(False, True, False),
+    done=column(True, True, False),
+)
 # Three steps of an episode that ends by a failure: rewards to go 1 + (2 + 4/2)/2 = 3, 4, 4, so
 # errors 2, 1, -1 of the values 1, 3, 5; deltas 1 + 3/2 - 1, 2 + 5/2 - 3, 4 - 5.
-FAILS = {
-    "reward": column(1.0, 2.0, 4.0),
-    "value": column(1.0, 3.0, 5.0),
-    "next_value": column(3.0, 5.0, 100.0),
-    "terminated": column(False, False, True),
-    "done": column(False, False, True),
-}
+FAILS = ValuedSteps(
+    reward=column(1.0, 2.0, 4.0),
+    value=column(1.0, 3.0, 5.0),
+    next_value=column(3.0, 5.0, 100.0),
+    terminated=column(False, False, True),
+    done=column(False, False, True),
+)
 
 
 @pytest.mark.parametrize("estimator", get_args(Estimator))
 def test_every_estimator_bootstraps_at_time_limits_and_not_at_failures(estimator):
     ratio = jnp.ones((3, 1))
-    both = advantages(estimator, **ENDS, ratio=ratio, discount=0.5, decay=0.5)
+    both = advantages(estimator, ENDS, ratio, discount=0.5, decay=0.5)
     for x in both:  # nothing to sum: advantages and errors are the deltas
         np.testing.assert_allclose(x[:, 0], [2, -1, 2])
 
@@ -152,14 +159,14 @@ def test_every_estimator_bootstraps_at_time_limits_and_not_at_failures(estimator
 )
 def test_every_estimator_by_hand(estimator, advantage, error):
     ratio = jnp.ones((3, 1))
-    found = advantages(estimator, **FAILS, ratio=ratio, discount=0.5, decay=0.5)
+    found = advantages(estimator, FAILS, ratio, discount=0.5, decay=0.5)
     np.testing.assert_allclose(found[0][:, 0], advantage)
     np.testing.assert_allclose(found[1][:, 0], error)
 
 
 def test_vtrace_by_hand():
     # the ratio 3 is clipped to 1; from the back -1, (1.5 - 1/2)/2 = 1/2, 1.5 + 1/4
-    advantage = vtrace(**FAILS, ratio=column(3.0, 0.5, 1.0), discount=0.5)
+    advantage = vtrace(FAILS, column(3.0, 0.5, 1.0), discount=0.5)
     np.testing.assert_allclose(advantage[:, 0], [1.75, 0.5, -1])
 
 
@@ -187,6 +194,7 @@ def test_vtrace_is_the_papers_sum_and_its_policy_gradients_advantage():
     last = done | (np.arange(steps) == steps - 1)[:, None]
     next_target = np.where(last, boot, np.roll(target, -1, 0))
     advantage = clipped * (reward + discount * next_target - value)
-    found = vtrace(*map(jnp.array, (reward, value, after, terminated, done, ratio)), discount=discount)
+    steps = ValuedSteps(*map(jnp.array, (reward, value, after, terminated, done)))
+    found = vtrace(steps, jnp.array(ratio), discount)
     np.testing.assert_allclose(found, advantage, atol=1e-4)
     np.testing.assert_allclose(found + value, target, atol=1e-4)

@@ -102,8 +102,9 @@ def test_curves_are_drawn_for_one_seed_for_several_and_for_none(tmp_path):
 
 def test_an_interval_is_over_seeds_and_of_one_seed_over_its_episodes():
     two = np.array([[0.0, 8.0], [6.0, 6.0]])
-    assert evaluation.estimate_over_seeds(two) == stats.estimate(np.array([4.0, 6.0]))  # seeds
-    assert evaluation.estimate_over_seeds(two[:1]) == stats.estimate(two[0])  # episodes of the one seed
+    over_seeds = evaluation.estimate_over_seeds("return", two)
+    assert over_seeds == stats.estimate(np.array([4.0, 6.0]))
+    assert evaluation.estimate_over_seeds("return", two[:1]) == stats.estimate(two[0])
 
 
 def test_discounted_sums_and_named_costs_of_an_episode_by_hand():

@@ -94,6 +94,25 @@ def test_one_seed_has_no_interval_and_what_is_unknown_stays_unknown():
     np.testing.assert_allclose(np.array(columns)[:, 2], 3.0)
 
 
+@pytest.mark.parametrize(
+    "name, values, ends",
+    [
+        ("violation rate", [0.0, 0.1], (0.0, 0.05 + 12.7062 * 0.05)),
+        ("final violation rate", [0.9, 1.0], (0.95 - 12.7062 * 0.05, 1.0)),
+        ("hazards over 10", [0.0, 1.0], (0.0, 1.0)),
+        ("cost", [1.0, 3.0], (0.0, 2 + 12.7062)),
+        ("cost rate", [0.0, 0.1], (0.0, 0.05 + 12.7062 * 0.05)),
+        ("cost", [-1.0, 3.0], (1 - 12.7062 * 2, 1 + 12.7062 * 2)),  # costs may be negative there
+        ("return", [1.0, 3.0], (2 - 12.7062, 2 + 12.7062)),
+        ("normalised return", [1.0, 3.0], (2 - 12.7062, 2 + 12.7062)),
+    ],
+)
+def test_an_interval_stops_where_its_measure_does(name, values, ends):
+    e = stats.of_measure(name, np.array(values))
+    assert e.mean == np.mean(values) and isinstance(e.low, float)
+    np.testing.assert_allclose(e[1:], ends, rtol=1e-4)
+
+
 def test_probability_of_improvement_counts_pairs_and_halves_of_equal_ones():
     a, b = [np.array([1.0, 3.0])], [np.array([0.0, 1.0, 2.0])]
     e = stats.probability_of_improvement(a, b)  # 1 beats 0 and equals 1, 3 beats all
