@@ -17,7 +17,7 @@ from jaxsafe.envs.safety_gym import suite
 from jaxsafe.envs.safety_gym.config import config_from_plain, defaults
 from jaxsafe.envs.safety_gym.scene import GROUP
 from jaxsafe.envs.safety_gym.task import in_parts
-from jaxsafe.envs.view.render import Stage
+from jaxsafe.envs.view.stage import Stage
 from jaxsafe.envs.wrap import innermost
 
 native: Any = mujoco  # its functions are not known to type checkers
