@@ -1,7 +1,7 @@
 """Deep deterministic policy gradients, and with each treatment of the constraint."""
 
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxsafe.algos import sac, td3
 from jaxsafe.config import config
 from jaxsafe.learn.actor_critic import ControllerConfig, MultiplierConfig, actor_critic
+from jaxsafe.learn.conventions import Convention
 from jaxsafe.learn.off_policy import off_policy
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.treatments import (
@@ -17,7 +18,7 @@ from jaxsafe.learn.treatments import (
     no_treatment,
     pid,
 )
-from jaxsafe.types import Algorithm, Env
+from jaxsafe.types import Algorithm, Env, PyTree
 
 
 @config
@@ -36,8 +37,19 @@ class DDPGConfig(td3.DeterministicConfig):
     arXiv:1509.02971, algorithm 1.
     Differs from it: the noise is Gaussian and has no memory, as in OmniSafe, and each environment has
     its own, as in Li et al. (2023), "Parallel Q-Learning", arXiv:2307.12983. The defaults are for a
-    thousand environments, as in TD3. OmniSafe's y has mu for mu'.
+    thousand environments, as in TD3. OmniSafe's y has mu for mu' (`target_policy`).
     """
+
+    CONVENTIONS: ClassVar = (
+        Convention(
+            {"target_policy": False},
+            "targets take the policy's own next action",
+            "targets take that of the target policy",
+        ),
+    )
+
+    # Whether targets take the target policy's action, as in the paper. OmniSafe's take the policy's.
+    target_policy: bool = True
 
 
 @config
@@ -80,8 +92,12 @@ def no_noise(key: jax.Array, shape: tuple[int, ...], cfg: Any) -> jax.Array:
     return jnp.zeros(shape)
 
 
+def next_actor(params: dict[str, PyTree], targets: dict[str, PyTree], cfg: Any) -> PyTree:
+    return targets["actor"] if cfg.target_policy else params["actor"]
+
+
 def make(env: Env, axis_name: str | None = None, treatment: Treatment = no_treatment) -> Algorithm:
-    actor = td3.deterministic_actor(env.action_size, critics=1, noise=no_noise)
+    actor = td3.deterministic_actor(env.action_size, 1, no_noise, next_actor)
     return off_policy(env, actor_critic(env, actor, treatment), treatment, axis_name)
 
 
@@ -92,6 +108,7 @@ ROWS = {
         "deterministic policy, one critic, no constraint",
         td3.published({}),
         holds="nothing",
+        omnisafe="DDPG",
         lever=td3.LEVER,
     ),
     "ddpg_lag": Row(
@@ -99,6 +116,7 @@ ROWS = {
         partial(make, treatment=lagrangian),
         "DDPG with an adaptive price on cost",
         td3.published(sac.LAG, sac.LAG_NAVIGATION),
+        omnisafe="DDPGLag",
         lever=td3.LEVER,
     ),
     "ddpg_pid": Row(
@@ -106,6 +124,7 @@ ROWS = {
         partial(make, treatment=pid),
         "DDPG with a price on cost from a PID controller",
         td3.published(sac.PID, sac.PID_NAVIGATION),
+        omnisafe="DDPGPID",
         lever=td3.LEVER,
     ),
 }

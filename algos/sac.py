@@ -164,13 +164,16 @@ PARALLEL: dict[str, Any] = {"num_envs": 64, "replay_ratio": 256, "batch_size": 4
 # A price that OmniSafe moves at every step by 1e-5 moves by 0.2 in 20,000 steps; likewise the others.
 LAG: dict[str, Any] = {
     "dual_starts": 200_000, "dual_lr": 0.2, "cost_reduce": "one", "price_unit": "reward",
+    "cost_normalize": True,
 }  # fmt: skip
-LAG_NAVIGATION: dict[str, Any] = LAG | {"dual_lr": 0.01, "lam_init": 0.0}
+LAG_NAVIGATION: dict[str, Any] = LAG | {"dual_lr": 0.01, "lam_init": 0.0, "cost_normalize": False}
 PID: dict[str, Any] = {
     "dual_starts": 200_000, "pid_kp": 1e-6, "pid_ki": 2e-3, "pid_kd": 1e-7, "lr": 1e-4,
-    "cost_reduce": "one", "price_unit": "reward",
+    "cost_reduce": "one", "price_unit": "reward", "cost_normalize": True,
 }  # fmt: skip
-PID_NAVIGATION: dict[str, Any] = PID | {"pid_kp": 5e-7, "pid_ki": 2e-4, "pid_kd": 1e-8, "lr": 5e-6}
+PID_NAVIGATION: dict[str, Any] = PID | {
+    "pid_kp": 5e-7, "pid_ki": 2e-4, "pid_kd": 1e-8, "lr": 5e-6, "cost_normalize": False,
+}  # fmt: skip
 # for a problem of two levers
 LEVER: dict[str, Any] = {
     "num_envs": 32, "horizon": 8, "learn_every": 2, "batch_size": 256, "replay_size": 20_000,
@@ -185,6 +188,7 @@ ROWS = {
         "soft actor-critic, no constraint",
         {"omnisafe": OMNISAFE, "omnisafe_navigation": NAVIGATION, "parallel": PARALLEL},
         holds="nothing",
+        omnisafe="SAC",
         lever=LEVER,
     ),
     "sac_lag": Row(
@@ -196,6 +200,7 @@ ROWS = {
             "omnisafe_navigation": NAVIGATION | LAG_NAVIGATION,
             "parallel": PARALLEL,
         },
+        omnisafe="SACLag",
         lever=LEVER,
     ),
     "sac_pid": Row(
@@ -207,6 +212,7 @@ ROWS = {
             "omnisafe_navigation": NAVIGATION | PID_NAVIGATION,
             "parallel": PARALLEL,
         },
+        omnisafe="SACPID",
         lever=LEVER,
     ),
 }

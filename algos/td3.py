@@ -118,10 +118,22 @@ def optimisers(cfg: Any, share: jax.Array | float) -> dict[str, optax.GradientTr
     return {"actor": adam(cfg.lr * share, cfg)}
 
 
+def followed(params: dict[str, PyTree], targets: dict[str, PyTree], cfg: Any) -> PyTree:
+    return targets["actor"]
+
+
 def deterministic_actor(
-    action_size: int, critics: int, noise: Callable[[jax.Array, tuple[int, ...], Any], jax.Array]
+    action_size: int,
+    critics: int,
+    noise: Callable[[jax.Array, tuple[int, ...], Any], jax.Array],
+    next_actor: Callable[[dict[str, PyTree], dict[str, PyTree], Any], PyTree] = followed,
 ) -> Actor:
-    """mu(s) = tanh of a network. `noise`(key, shape, cfg) is what is added to mu'(s')."""
+    """mu(s) = tanh of a network.
+
+    Args:
+        noise: (key, shape, cfg) -> what is added to mu'(s').
+        next_actor: (params, targets, cfg) -> mu'.
+    """
 
     def mu(actor: PyTree, obs: jax.Array, cfg: Any) -> jax.Array:
         out: Any = coarse_mlp(cfg, action_size).apply(actor, obs)
@@ -148,7 +160,7 @@ def deterministic_actor(
     def next_action(
         params: dict[str, PyTree], targets: PyTree, obs: jax.Array, key: jax.Array, cfg: Any
     ) -> tuple[jax.Array, jax.Array]:
-        action = mu(targets["actor"], obs, cfg)
+        action = mu(next_actor(params, targets, cfg), obs, cfg)
         return noisy(action, noise(key, action.shape, cfg)), jnp.zeros(obs.shape[0])
 
     def propose(params: dict[str, PyTree], obs: jax.Array, key: jax.Array, cfg: Any) -> Proposal:
@@ -206,6 +218,7 @@ ROWS = {
         "deterministic policy, twin critics, no constraint",
         published({}),
         holds="nothing",
+        omnisafe="TD3",
         lever=LEVER,
     ),
     "td3_lag": Row(
@@ -213,6 +226,7 @@ ROWS = {
         partial(make, treatment=lagrangian),
         "TD3 with an adaptive price on cost",
         published(sac.LAG, sac.LAG_NAVIGATION),
+        omnisafe="TD3Lag",
         lever=LEVER,
     ),
     "td3_pid": Row(
@@ -220,6 +234,7 @@ ROWS = {
         partial(make, treatment=pid),
         "TD3 with a price on cost from a PID controller",
         published(sac.PID, sac.PID_NAVIGATION),
+        omnisafe="TD3PID",
         lever=LEVER,
     ),
 }

@@ -119,7 +119,9 @@ ENVIRONMENTS = """# Environments
 A name is a robot and a task: `point_goal1`, `car_push2`, `doggo_button1`. Safety Gym's ids, as in
 `Safexp-PointGoal1-v0`, work too. Goal, Button and Push are the suite's 27 tasks. Run, Circle and the
 grids are the original's tests. Vision is not there yet. The six [velocity tasks](velocity.md) are
-Safety-Gymnasium's: `ant_velocity` is `SafetyAntVelocity-v1`.
+Safety-Gymnasium's: `ant_velocity` is `SafetyAntVelocity-v1`. So are
+[`point_circle1`, `point_run0`](../howto/safety_gymnasium.md) and their like. `seditor_point_goal1` and
+its like are [SEditor's tasks](../howto/seditor.md).
 
 Every other option of Safety Gym's Engine is `env.OPTION`.
 [`env.rules`](../howto/safety_gymnasium.md) takes Safety-Gymnasium's rules where they differ.

@@ -56,6 +56,7 @@ def check_state(state: Any, env: Env, where: str) -> None:
         "cost": scalar,
         "costs": jax.ShapeDtypeStruct((len(env.cost_names),), jnp.float32),
         "terminated": jax.ShapeDtypeStruct((), jnp.bool_),
+        "truncated": jax.ShapeDtypeStruct((), jnp.bool_),
         **{f"info[{name!r}]": scalar for name in state.info},
     }
     found = {field: getattr(state, field) for field in expected if not field.startswith("info")}

@@ -24,12 +24,14 @@ from jaxsafe.types import Env
 # name -> options that differ from Safety Gym's defaults, the config of a velocity task, or a function
 # that makes another environment
 SUITE = suite.suite()
-ENVS: dict[str, Any] = {**SUITE, **velocities.suite()}
+OURS: dict[str, Any] = {**SUITE, **suite.circles_and_runs(), **suite.seditor()}
+ENVS: dict[str, Any] = {**OURS, **velocities.suite()}
 Config = SafetyGymConfig | VelocityConfig
 PLAIN = (type(None), bool, int, float, str, list, tuple, dict)
 ANY_ENV = "wrap"  # the option that every environment has
 OF_MAKE = ("engine", ANY_ENV)  # options of our environments that are no field of their config
 ALIASES: dict[str, str] = {suite.alias(name): name for name in SUITE}
+ALIASES |= {suite.their_id(name): name for name in suite.circles_and_runs()}
 ALIASES |= {alias: name for alias, (name, _) in velocities.aliases().items()}
 # options that an alias stands for, beside a name
 IMPLIED: dict[str, dict[str, Any]] = {a: options for a, (_, options) in velocities.aliases().items()}
@@ -178,13 +180,13 @@ def safety_gym(name: str, options: dict[str, Any], overrides: dict[str, Any]) ->
 
     def build() -> Env:
         made = SafetyGym(cfg, engine, name)
-        # the suite's own tasks are known to have layouts
-        if name in SUITE and ENVS[name] is SUITE[name] and overrides.keys() <= {"engine"}:
+        # our own tasks are known to have layouts
+        if name in OURS and ENVS[name] is OURS[name] and overrides.keys() <= {"engine"}:
             return made
         if not layout.feasible(made.place):
             raise ConfigError(
-                f"env: no valid layout in {layout.LAYOUTS:,} tries: fewer or smaller objects, smaller "
-                "keepouts or larger placements_extents"
+                f"env: no valid layout in {made.place.search.layouts:,} tries: fewer or smaller "
+                "objects, smaller keepouts or larger placements_extents"
             )
         return made
 

@@ -84,7 +84,7 @@ class ActionScale(Wrapper):
 class ActionRepeat(Wrapper):
     """Each action is taken `repeat` times. Rewards, costs and info are sums over these raw steps.
 
-    A raw step that terminates the episode is the last that counts. An episode has as many whole
+    A raw step that ends the episode is the last that counts. An episode has as many whole
     repetitions as fit into the time limit of the environment inside.
     """
 
@@ -116,7 +116,7 @@ class ActionRepeat(Wrapper):
                 costs=total.costs + new.costs,
                 info=jax.tree.map(jnp.add, total.info, new.info),
             )
-            kept = jax.tree.map(lambda old, x: jnp.where(total.terminated, old, x), total, new)
+            kept = jax.tree.map(lambda old, x: jnp.where(total.ended, old, x), total, new)
             return kept, None
 
         first = self.env.step(state, action)

@@ -24,6 +24,7 @@ class State:
         of their sum, so `cost` is not always `costs.sum()`.
     terminated: bool [], True if the episode has ended for good: its value from here on is 0.
         Running out of time is not termination; `Rollout` adds it.
+    truncated: bool [], True if the episode ends here all the same, though its value goes on.
     info: dict of float [], whatever else is worth a mean over an episode (`goal_met`, ...).
     """
 
@@ -34,6 +35,11 @@ class State:
     costs: jax.Array
     terminated: jax.Array
     info: dict[str, jax.Array]
+    truncated: jax.Array | np.bool_ = np.False_
+
+    @property
+    def ended(self) -> jax.Array:
+        return self.terminated | self.truncated
 
 
 class Env(Protocol):

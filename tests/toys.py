@@ -104,6 +104,15 @@ class Ticker:
 
 
 @dataclass(frozen=True)
+class Arriving(Ticker):
+    """A ticker whose episodes end where the others fail, and whose values go on."""
+
+    def step(self, state, action):
+        after = super().step(state, action)
+        return dataclasses.replace(after, terminated=jnp.bool_(False), truncated=after.terminated)
+
+
+@dataclass(frozen=True)
 class Lost(Ticker):
     """A ticker that never has a finite reward."""
 

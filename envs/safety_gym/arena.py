@@ -55,9 +55,9 @@ class Arena:
         """Everything at rest at positions [n, 2] (m) with headings [n] (rad), before the first goal."""
         cfg, scene = self.config, self.scene
         heights = {
-            "vases": cfg.vases_size - cfg.vases_sink,
-            "gremlins": cfg.gremlins_size,
-            "box": cfg.box_size,
+            "vases": cfg.half_height(cfg.vases_size) - cfg.vases_sink,
+            "gremlins": cfg.half_height(cfg.gremlins_size),
+            "box": cfg.half_height(cfg.box_size),
         }
         start = jnp.concatenate([xy[0], headings[:1]])
         root = start if scene.planar else pose(xy[0], scene.robot_height, headings[0])
@@ -65,12 +65,12 @@ class Arena:
         for kind in scenes.FREES:
             rows = self.place.slice(kind)
             qpos.append(pose(xy[rows], heights[kind], headings[rows]).reshape(-1))
-        # The weld keeps a gremlin's height above its mocap body, hence twice its size: it hovers.
+        # The weld keeps a gremlin's height above its mocap body, which has one of its own: it hovers.
         rest = {
-            "gremlins": 2 * cfg.gremlins_size,
+            "gremlins": cfg.gremlins_size + heights["gremlins"],
             "pillars": cfg.pillars_height,
             "walls": cfg.walls_size,
-            "buttons": cfg.buttons_size,
+            "buttons": cfg.half_height(cfg.buttons_size),
         }
         mocap = [
             pose(xy[self.place.slice(k)], rest[k], headings[self.place.slice(k)]) for k in scenes.MOCAPS

@@ -33,7 +33,7 @@ Rectangles = tuple[Rectangle, ...]
 Points = tuple[Point2, ...]
 Pixels = tuple[Annotated[int, Bounds(1, 10_000)], Annotated[int, Bounds(1, 10_000)]]  # width, height
 
-TASKS = ("goal", "button", "push", "x", "z", "circle", "none")
+TASKS = ("goal", "button", "push", "x", "z", "circle", "run", "none")
 # Observations that Safety-Gymnasium does not have.
 OURS_ALONE = tuple(
     f"observe_{part}" for part in ["goal_dist", "remaining", "qpos", "qvel", "ctrl", "freejoint", "com"]
@@ -49,7 +49,8 @@ class SafetyGymConfig:
     positions of the first objects of a kind, `*_keepout` the radius that stays free around each.
     """
 
-    rules: Literal["safety_gym", "safety_gymnasium"] = "safety_gym"  # ours: whose, where they differ
+    # ours: whose, where they differ
+    rules: Literal["safety_gym", "safety_gymnasium", "seditor"] = "safety_gym"
     # Episode
     num_steps: Amount = 1000  # time limit
     action_noise: Weight = 0.0  # standard deviation, added after the action is clipped
@@ -68,7 +69,7 @@ class SafetyGymConfig:
     # Layout
     randomize_layout: bool = True  # false: every episode repeats one layout and its later draws
     build_resample: bool = True  # never read, as in the original
-    continue_goal: bool = True  # after a success a new goal, else the end of the episode
+    continue_goal: bool = True  # after a success a new goal, else the episode ends
     terminate_resample_failure: bool = True  # no room for a new goal ends the episode, else keeps it
     # What is observed
     observation_flatten: bool = True  # one vector, components sorted by name; else a dict
@@ -113,7 +114,7 @@ class SafetyGymConfig:
     lidar_alias: bool = True
     compass_shape: Literal[2, 3] = 2
     # Task
-    task: Literal["goal", "button", "push", "x", "z", "circle", "none"] = "goal"
+    task: Literal["goal", "button", "push", "x", "z", "circle", "run", "none"] = "goal"
     goal_placements: Rectangles | None = None
     goal_locations: Points = ()
     goal_keepout: Distance = 0.4
@@ -145,8 +146,12 @@ class SafetyGymConfig:
     buttons_size: Size = 0.1
     buttons_cost: Weight = 1.0
     buttons_resampling_delay: Annotated[int, Bounds(0, 2**24)] = 10  # steps
-    # Circle
+    # Circle and run
     circle_radius: Size = 1.5
+    # ours: lines that the robot must not cross; 2 at x = +-bounds, 4 at y = +-bounds, too
+    bounds_num: Literal[0, 2, 4] = 0
+    bounds: Size = 1.125
+    bounds_cost: Weight = 1.0
     # Sensors
     sensors_obs: tuple[str, ...] = ("accelerometer", "velocimeter", "gyro", "magnetometer")
     sensors_hinge_joints: bool = True  # never read, as in the original: always observed
@@ -217,6 +222,10 @@ class SafetyGymConfig:
     def __post_init__(self) -> None:
         check_config(self)
 
+    def half_height(self, half: float) -> float:
+        """Of an object of this half height in Safety Gym: SEditor's are all 0.4 m high."""
+        return 0.2 if self.rules == "seditor" else half
+
 
 def config_from_plain(values: dict[str, Any]) -> SafetyGymConfig:
     """A config from plain values; an unknown name or a wrong type is a `ConfigError`."""
@@ -232,7 +241,12 @@ def check_rules(cfg: SafetyGymConfig) -> None:
     """Raise `ConfigError` for what Safety-Gymnasium has not, or has another way than we do."""
     unlike = [
         ("robot_base", Path(cfg.robot_base).stem == "doggo", "its Doggo is another, half as long"),
-        ("task", cfg.task not in ("goal", "button", "push"), "we follow its goal, button and push"),
+        ("task", cfg.task in ("x", "z", "none"), "it has no such task; its run is env=point_run0"),
+        (
+            "robot_keepout",
+            cfg.task == "circle" and cfg.robot_keepout > 0,
+            "its circles are env=point_circle0 to point_circle2",
+        ),
         ("lidar_type", cfg.lidar_type == "natural", "its natural lidar does not see the goal"),
         ("walls_num", cfg.walls_num > 0, "its tasks have no such walls"),
         *((name, getattr(cfg, name), "it has no such observation") for name in OURS_ALONE),

@@ -46,6 +46,13 @@ def hazards(arena: Arena, world: World, readings: Readings) -> jax.Array:
     return arena.config.hazards_cost * jnp.maximum(inside, 0).sum()
 
 
+def bounds(arena: Arena, world: World, readings: Readings) -> jax.Array:
+    """1 beyond the lines at x = +-bounds and, of four, at y = +-bounds."""
+    robot, _ = arena.robot_pose(world)
+    far = jnp.abs(robot[: arena.config.bounds_num // 2]) > arena.config.bounds
+    return arena.config.bounds_cost * far.any()
+
+
 COSTS = {  # in the order of `State.costs`
     "vases_contact": vases_contact,
     "pillars": pillars,
@@ -54,6 +61,7 @@ COSTS = {  # in the order of `State.costs`
     "vases_displace": vases_displace,
     "vases_velocity": vases_velocity,
     "hazards": hazards,
+    "out_of_bounds": bounds,
 }
 
 
@@ -66,6 +74,7 @@ def cost_names(cfg: SafetyGymConfig) -> tuple[str, ...]:
         "vases_displace": cfg.constrain_vases and cfg.vases_displace_cost != 0,
         "vases_velocity": cfg.constrain_vases and cfg.vases_velocity_cost != 0,
         "hazards": cfg.constrain_hazards,
+        "out_of_bounds": cfg.bounds_num > 0,
     }
     return tuple(name for name in COSTS if on[name])
 

@@ -3,6 +3,8 @@
 Objects are placed one after another, each uniformly in its rectangle shrunk by its own keepout, at
 the first of 100 draws that keeps its distance from all placed before it. If none does, the whole
 layout is drawn again, up to 10,000 times. Source: Safety Gym's Engine, `build_layout`.
+
+By SEditor's rules those with the largest keepouts are placed first, in 200 draws and 100,000 layouts.
 """
 
 from dataclasses import dataclass
@@ -16,9 +18,7 @@ import numpy as np
 from jaxsafe.config import ConfigError
 from jaxsafe.envs.safety_gym.config import KINDS, Rectangle, SafetyGymConfig
 
-DRAWS_PER_OBJECT = 100
-DRAWS_AT_ONCE = 25  # examined at once
-LAYOUTS = 10_000
+DRAWS_AT_ONCE = 25  # draws for an object that are examined at once
 LANES = 32  # layouts tried side by side, at most
 LAYOUT_BATCH = 100  # layouts examined at once before training
 GOAL_DRAWS = 10_000
@@ -36,16 +36,32 @@ ORDER = {  # of placing
     ],
     "safety_gymnasium": ["robot", "buttons", "goal", "hazards", "pillars", "vases", "box", "gremlins"],
 }
+ORDER["seditor"] = ORDER["safety_gym"]
 GOAL_BATCH = 16  # draws of a new goal examined at once
+
+
+class Search(NamedTuple):
+    """How many draws an object has, and how many layouts are tried."""
+
+    draws: int
+    layouts: int
+
+
+SEARCHES = {
+    "safety_gym": Search(100, 10_000),
+    "safety_gymnasium": Search(100, 10_000),
+    "seditor": Search(200, 100_000),
+}
 
 
 @dataclass(frozen=True)
 class Placement:
-    """The objects of a task in the order in which they are placed.
+    """The objects of a task.
 
     names: 'robot', 'goal', 'hazard0', ...; kinds: 'robot', 'goal', 'hazards', ...
     areas [n, r, 4] and weights [n, r]: the shrunk rectangles of each object, and how likely each is.
     keepouts [n], in m, and the margin between any two objects.
+    turns [n]: which object is placed first, second and so on.
     """
 
     names: tuple[str, ...]
@@ -54,6 +70,8 @@ class Placement:
     weights: np.ndarray
     keepouts: np.ndarray
     margin: float
+    turns: np.ndarray
+    search: Search = SEARCHES["safety_gym"]
 
     @property
     def apart(self) -> np.ndarray:
@@ -91,6 +109,7 @@ def placement(cfg: SafetyGymConfig) -> Placement:
         number = i - kinds.index(kind)
         names.append(kind if kind in ("robot", "goal", "box") else f"{kind[:-1]}{number}")
         rectangles.append(areas_of(cfg, kind, number))
+    keepouts = np.array([getattr(cfg, f"{kind}_keepout") for kind in kinds], np.float32)
     most = max(map(len, rectangles))
     areas = np.zeros((len(kinds), most, 4), np.float32)
     weights = np.zeros((len(kinds), most), np.float32)
@@ -103,8 +122,10 @@ def placement(cfg: SafetyGymConfig) -> Placement:
         kinds=tuple(kinds),
         areas=areas,
         weights=weights,
-        keepouts=np.array([getattr(cfg, f"{kind}_keepout") for kind in kinds], np.float32),
+        keepouts=keepouts,
         margin=cfg.placements_margin,
+        turns=np.argsort(-keepouts, stable=True) if cfg.rules == "seditor" else np.arange(len(kinds)),
+        search=SEARCHES[cfg.rules],
     )
 
 
@@ -157,14 +178,15 @@ class Lane(NamedTuple):
 
 
 def sample_layout(place: Placement, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Positions of all objects [n, 2], and whether one of the 10,000 layouts was valid.
+    """Positions of all objects [n, 2], and whether one of the layouts was valid.
 
     Layouts are numbered. Lane i tries those with the numbers i, i + lanes, i + 2 lanes and so on, and
     waits for no other lane. The valid layout with the lowest number is used: the one found first would
     favour layouts that need few draws.
     """
-    n, lanes = len(place.names), place.lanes
-    areas, weights, apart = (jnp.asarray(x) for x in (place.areas, place.weights, place.apart))
+    n, lanes, turns, search = len(place.names), place.lanes, place.turns, place.search
+    apart = place.apart[turns][:, turns]
+    areas, weights, apart = map(jnp.asarray, (place.areas[turns], place.weights[turns], apart))
 
     def place_next(lane: Lane) -> Lane:
         xy, i, draws, number, key = lane
@@ -172,14 +194,14 @@ def sample_layout(place: Placement, key: jax.Array) -> tuple[jax.Array, jax.Arra
         candidates = draw_positions(draw_key, areas[i], weights[i], DRAWS_AT_ONCE)
         free = jnp.all(clear(candidates, xy, apart[i]) | (jnp.arange(n) >= i), axis=1)
         found, draws = free.any() & (i < n), draws + DRAWS_AT_ONCE
-        failed = ~found & (i < n) & (draws >= DRAWS_PER_OBJECT)
+        failed = ~found & (i < n) & (draws >= search.draws)
         xy = jnp.where((jnp.arange(n) == i)[:, None], candidates[jnp.argmax(free)], xy)
         i, draws = jnp.where(failed, 0, i + found), jnp.where(found | failed, 0, draws)
         return Lane(xy, i, draws, number + lanes * failed, key)
 
     def searching(now: Lane) -> jax.Array:
         lowest = jnp.argmin(now.number)
-        return (now.placed[lowest] < n) & (now.number[lowest] < LAYOUTS)
+        return (now.placed[lowest] < n) & (now.number[lowest] < search.layouts)
 
     zeros = jnp.zeros(lanes, jnp.int32)
     numbers, keys = jnp.arange(lanes, dtype=jnp.int32), key[None]
@@ -188,7 +210,7 @@ def sample_layout(place: Placement, key: jax.Array) -> tuple[jax.Array, jax.Arra
     start = Lane(jnp.zeros((lanes, n, 2)), zeros, zeros, numbers, keys)
     end = jax.lax.while_loop(searching, jax.vmap(place_next), start)
     lowest = jnp.argmin(end.number)
-    return end.xy[lowest], end.placed[lowest] == n
+    return end.xy[lowest][np.argsort(turns)], end.placed[lowest] == n
 
 
 def has_room(place: Placement) -> bool:
@@ -203,16 +225,18 @@ def has_room(place: Placement) -> bool:
 
 
 def feasible(place: Placement) -> bool:
-    """Whether 10,000 layouts hold a valid one."""
+    """Whether as many layouts as are tried hold a valid one."""
     rng = np.random.default_rng(0)
-    return any(count_valid(place, rng) for _ in range(0, LAYOUTS, LAYOUT_BATCH))
+    return any(count_valid(place, rng) for _ in range(0, place.search.layouts, LAYOUT_BATCH))
 
 
 def count_valid(place: Placement, rng: np.random.Generator) -> int:
     """How many of 100 layouts are valid, by the search of `sample_layout` without compiling."""
     placed = np.zeros((0, 2, LAYOUT_BATCH, 1), np.float32)  # in the layouts still valid
-    for areas, weights, apart in zip(place.areas, place.weights, place.apart, strict=True):
-        shape = placed.shape[2], DRAWS_PER_OBJECT
+    turns = place.turns
+    apart_all = place.apart[turns][:, turns]
+    for areas, weights, apart in zip(place.areas[turns], place.weights[turns], apart_all, strict=True):
+        shape = placed.shape[2], place.search.draws
         area = areas[rng.choice(len(areas), shape, p=weights / weights.sum(dtype=float)).T].T
         x, y = area[:2] + rng.random((2, *shape), np.float32) * (area[2:] - area[:2])
         free = np.ones(shape, bool)

@@ -16,6 +16,7 @@ from jaxsafe.envs.safety_gym.arena import Arena, World, norm, rotation_of
 
 COORDINATE_SENSORS = ("velocimeter", "accelerometer", "gyro", "magnetometer")
 HAZARDS_AT = 9  # numbers before the hazards', where coordinates are observed
+RAY_HEIGHT = 0.3  # m, of natural lidar's rays by SEditor's rules
 JOINT_SENSORS = (  # in the order in which Safety-Gymnasium observes them
     mujoco.mjtSensor.mjSENS_JOINTVEL,
     mujoco.mjtSensor.mjSENS_BALLANGVEL,
@@ -80,12 +81,12 @@ def in_order(arena: Arena, names: Iterable[str]) -> list[str]:
     Coordinates are in the order of OmniSafe."""
     if arena.config.observation == "coordinates":
         return [*names]
-    if arena.config.rules == "safety_gym":
+    if arena.config.rules != "safety_gymnasium":
         return sorted(names)
     order = list(arena.config.sensors_obs)
     for kind in JOINT_SENSORS:
         order += [name for name, (_, found) in arena.sensors.items() if found == kind]
-    for kind in layouts.ORDER[arena.config.rules]:
+    for kind in (*layouts.ORDER[arena.config.rules], "circle"):
         order += [f"{kind}_lidar", f"{kind}_compass"]
     return sorted(names, key=order.index)
 
@@ -155,12 +156,14 @@ def lidars(
         if cfg.lidar_type == "natural":
             group = scenes.GROUP[name if name in scenes.GROUP else name[:-1]]
             shapes = shapes_of(arena, world, readings)
-            lidar = sensing.natural_lidar(shapes, position, rotation, cfg.lidar_num_bins, group, slack)
+            source = position.at[2].set(RAY_HEIGHT) if cfg.rules == "seditor" else position
+            lidar = sensing.natural_lidar(shapes, source, rotation, cfg.lidar_num_bins, group, slack)
         else:
             law = (cfg.lidar_max_dist, cfg.lidar_exp_gain, cfg.lidar_alias)
             lidar = sensing.pseudo_lidar(targets, position, rotation, cfg.lidar_num_bins, *law)
         if name == "buttons":
-            lidar = jnp.where(world.buttons_timer == 0, lidar, 0.0)
+            asleep = -lidar if cfg.rules == "seditor" else jnp.zeros_like(lidar)
+            lidar = jnp.where(world.buttons_timer == 0, lidar, asleep)
         parts[f"{name}_lidar"] = lidar
     return parts
 
@@ -177,21 +180,26 @@ def shapes_of(arena: Arena, world: World, readings: Readings) -> sensing.Shapes:
     position, rotation = (readings.fields[name][others] for name in ("geom_xpos", "geom_xmat"))
     cylinder, box = int(mujoco.mjtGeom.mjGEOM_CYLINDER), int(mujoco.mjtGeom.mjGEOM_BOX)
     extra: list[tuple] = []  # type, size, group, position, rotation
-    if arena.goal_kind == "goal":
-        size = (cfg.goal_size, cfg.goal_size / 2, 0)
-        extra.append((cylinder, size, scenes.GROUP["goal"], arena.goal_position(world), jnp.eye(3)))
+    tall = cfg.rules == "seditor"  # the goal and hazards, too; and a goal stands at the button to press
+    if arena.goal_kind == "goal" or (arena.goal_kind and tall):
+        place, half = arena.goal_position(world), cfg.half_height(cfg.goal_size / 2)
+        place = place.at[2].set(half) if tall else place
+        extra.append((cylinder, (cfg.goal_size, half, 0), scenes.GROUP["goal"], place, jnp.eye(3)))
     for xy in arena.positions(world, "hazards"):
-        size = (cfg.hazards_size, 0.01, 0)
-        extra.append((cylinder, size, scenes.GROUP["hazard"], jnp.append(xy, 0.02), jnp.eye(3)))
+        half = cfg.half_height(0.01)
+        place = jnp.append(xy, half if tall else 0.02)
+        extra.append((cylinder, (cfg.hazards_size, half, 0), scenes.GROUP["hazard"], place, jnp.eye(3)))
     if cfg.gremlins_num:
         physics, timestep = world.bodies, model.opt.timestep
         last = (physics.substeps - 1) * timestep
         guides = engines.mocap_at(physics.mocap_pos, arena.scene.orbit, last, jnp)
-        resting = physics.mocap_pos - jnp.array([0.0, 0.0, cfg.gremlins_size])
+        resting = physics.mocap_pos - jnp.array([0.0, 0.0, cfg.half_height(cfg.gremlins_size)])
         guides = jnp.where(physics.substeps > 0, guides, resting)
         for i in range(cfg.gremlins_num):
             turn = rotation_of(physics.mocap_quat[i])
-            extra.append((box, (cfg.gremlins_size,) * 3, scenes.GROUP["gremlin"], guides[i], turn))
+            side = cfg.gremlins_size
+            size = (side, side, cfg.half_height(side))
+            extra.append((box, size, scenes.GROUP["gremlin"], guides[i], turn))
     if extra:
         kind, size, group, place, turn = zip(*extra, strict=True)
         kinds, groups = np.append(kinds, kind), np.append(groups, group)

@@ -36,6 +36,8 @@ def reward(arena: Arena, before: World, after: World, readings: Readings) -> jax
         reward = (after.last_com - before.last_com)[2] * cfg.reward_z
     elif cfg.task == "circle":
         reward = circle_reward(arena, after)
+    elif cfg.task == "run":
+        reward = run_reward(arena, before, after)
     if cfg.reward_orientation:
         body = arena.scene.model.body(cfg.reward_orientation_body).id
         a, b, c, d = readings.fields["xquat"][body]
@@ -46,11 +48,27 @@ def reward(arena: Arena, before: World, after: World, readings: Readings) -> jax
 
 
 def circle_reward(arena: Arena, world: World) -> jax.Array:
-    """Speed along circles around the origin, most on the circle of `circle_radius`."""
-    (x, y), (u, v) = world.last_com[:2], world.bodies.qvel[:2]
-    radius = norm(world.last_com[:2])
+    """Speed along circles around the origin, most on the circle of `circle_radius`.
+
+    Safety Gym measures at the robot's centre of mass, Safety-Gymnasium at its body's origin.
+    """
+    theirs = arena.config.rules == "safety_gymnasium"
+    place = (arena.robot_pose(world)[0] if theirs else world.last_com)[:2]
+    (x, y), (u, v) = place, world.bodies.qvel[:2]
+    radius = norm(place)
     tangential = (v * x - u * y) / jnp.maximum(radius, 1e-12)
     return tangential / (1 + jnp.abs(radius - arena.config.circle_radius)) * arena.config.reward_circle
+
+
+def run_reward(arena: Arena, before: World, after: World) -> jax.Array:
+    """60 times how much nearer the robot is to the point (0, -1000).
+
+    As (a^2 - b^2) / (a + b) of the two distances: float32 has no digits left for their difference.
+    """
+    point = jnp.array([0.0, -1000.0])
+    old, new = (arena.robot_pose(world)[0][:2] for world in (before, after))
+    squares = ((old - new) * (old + new - 2 * point)).sum()
+    return 60.0 * squares / (norm(old - point) + norm(new - point))
 
 
 def success(arena: Arena, world: World, readings: Readings) -> jax.Array:

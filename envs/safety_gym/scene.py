@@ -158,7 +158,8 @@ def build(cfg: SafetyGymConfig, mjx: bool = False, drawn: bool = False) -> Scene
         add_cameras(spec)
     add_free_objects(spec, cfg)
     for i in range(cfg.gremlins_num):
-        add_gremlin_guide(spec, i, cfg.gremlins_size, drawn)
+        half = cfg.half_height(cfg.gremlins_size) if drawn else None
+        add_gremlin_guide(spec, i, cfg.gremlins_size, half)
     pillar = mujoco.mjtGeom.mjGEOM_CAPSULE if mjx else mujoco.mjtGeom.mjGEOM_CYLINDER
     add_fixed_objects(spec, cfg, pillar, fixed)
     kept = needed_sensors(cfg)
@@ -201,9 +202,11 @@ def read_robot(cfg: SafetyGymConfig) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
 def add_free_objects(spec: mujoco.MjSpec, cfg: SafetyGymConfig) -> None:
     """Vases, gremlins and the box, in the order of `FREES`."""
     for i in range(cfg.vases_num):
-        add_cube(spec, f"vase{i}", "vase", cfg.vases_size, cfg.vases_density)
+        half = cfg.half_height(cfg.vases_size)
+        add_block(spec, f"vase{i}", "vase", cfg.vases_size, half, cfg.vases_density)
     for i in range(cfg.gremlins_num):
-        add_cube(spec, f"gremlin{i}obj", "gremlin", cfg.gremlins_size, cfg.gremlins_density)
+        half = cfg.half_height(cfg.gremlins_size)
+        add_block(spec, f"gremlin{i}obj", "gremlin", cfg.gremlins_size, half, cfg.gremlins_density)
     if cfg.task == "push":
         add_box(spec, cfg)
 
@@ -218,12 +221,13 @@ def add_fixed_objects(
         fixed: options of the geoms of what is fixed.
     """
     box, sphere = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_SPHERE
+    button = pillar if cfg.rules == "seditor" else sphere
     sizes = {
         "pillar": (cfg.pillars_size, cfg.pillars_height, 0),
         "wall": (cfg.walls_size,) * 3,
-        "button": (cfg.buttons_size, 0, 0),
+        "button": (cfg.buttons_size, cfg.half_height(0), 0),
     }
-    for kind, shape in {"pillar": pillar, "wall": box, "button": sphere}.items():
+    for kind, shape in {"pillar": pillar, "wall": box, "button": button}.items():
         for i in range(getattr(cfg, f"{kind}s_num")):
             body = spec.worldbody.add_body(name=f"{kind}{i}", mocap=True)
             body.add_geom(name=f"{kind}{i}", type=shape, size=sizes[kind], **fixed, **look(kind))
@@ -247,6 +251,9 @@ def watched_bodies(cfg: SafetyGymConfig) -> dict[str, list[str]]:
 
 
 def check_robot(cfg: SafetyGymConfig, robot: mujoco.MjModel) -> None:
+    for i in np.flatnonzero(robot.actuator_ctrllimited == 0):
+        name = robot.actuator(i).name
+        raise ConfigError(f"env.robot_base={cfg.robot_base!r}: actuator {name!r} has no ctrlrange")
     sensors = [robot.sensor(i).name for i in range(robot.nsensor)]
     for name in cfg.sensors_obs:
         if name not in sensors:
@@ -272,14 +279,16 @@ def look(kind: str) -> dict:
     return {"rgba": RGBA[kind], "group": min(GROUP[kind], 5)}
 
 
-def add_cube(spec: mujoco.MjSpec, name: str, kind: str, size: float, density: float) -> None:
-    """A free cube. Its pose comes from the layout."""
+def add_block(
+    spec: mujoco.MjSpec, name: str, kind: str, size: float, half_height: float, density: float
+) -> None:
+    """A free block, `size` half a side of its square base. Its pose comes from the layout."""
     body = spec.worldbody.add_body(name=name)
     body.add_freejoint(name=name)
     body.add_geom(
         name=name,
         type=mujoco.mjtGeom.mjGEOM_BOX,
-        size=(size,) * 3,
+        size=(size, size, half_height),
         density=density,
         **OBJECT,
         **look(kind),
@@ -287,14 +296,14 @@ def add_cube(spec: mujoco.MjSpec, name: str, kind: str, size: float, density: fl
 
 
 def add_box(spec: mujoco.MjSpec, cfg: SafetyGymConfig) -> None:
-    """The box to push: a cube with four overlapping corner posts that a robot can catch."""
-    add_cube(spec, "box", "box", cfg.box_size, cfg.box_density)
-    s = cfg.box_size
+    """The box to push: a block with four overlapping corner posts that a robot can catch."""
+    s, half = cfg.box_size, cfg.half_height(cfg.box_size)
+    add_block(spec, "box", "box", s, half, cfg.box_density)
     for i, (x, y) in enumerate([(s, s), (-s, s), (s, -s), (-s, -s)]):
         spec.body("box").add_geom(
             name=f"col{i + 1}",
             type=mujoco.mjtGeom.mjGEOM_BOX,
-            size=(s / 2, s / 2, s),
+            size=(s / 2, s / 2, half),
             pos=(x, y, 0),
             density=cfg.box_density,
             **OBJECT,
@@ -302,18 +311,21 @@ def add_box(spec: mujoco.MjSpec, cfg: SafetyGymConfig) -> None:
         )
 
 
-def add_gremlin_guide(spec: mujoco.MjSpec, i: int, size: float, drawn: bool = False) -> None:
-    """The mocap body that leads gremlin i, a cube of half side `size`, along its circle by a soft weld.
+def add_gremlin_guide(
+    spec: mujoco.MjSpec, i: int, size: float, half_height: float | None = None
+) -> None:
+    """The mocap body that leads gremlin i, of half side `size`, along its circle by a soft weld; with a
+    `half_height` it is drawn.
 
     Safety Gym and Safety-Gymnasium ran on MuJoCo 2, which took a weld's rotational inertia for its
     translational one. Since MuJoCo 3.0 the rotation is 1.5 / size^2 times as soft. The weld's
     torquescale takes that back, so that a gremlin which is hit keeps its heading as in the original.
     """
     body = spec.worldbody.add_body(name=f"gremlin{i}mocap", mocap=True)
-    if drawn:
+    if half_height is not None:
         body.add_geom(
             type=mujoco.mjtGeom.mjGEOM_BOX,
-            size=(size,) * 3,
+            size=(size, size, half_height),
             contype=0,
             conaffinity=0,
             rgba=(*RGBA["gremlin"][:3], 0.1),

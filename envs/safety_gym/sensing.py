@@ -2,6 +2,7 @@
 
 import functools
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -90,18 +91,22 @@ def natural_lidar(
     angles = 2 * jnp.pi * jnp.arange(bins) / bins
     level = jnp.stack([jnp.cos(angles), jnp.sin(angles), jnp.zeros(bins)], -1)
     rays = (level[:, None] * rotation).sum(-1)
-    distances = [jnp.full(bins, jnp.inf)]
-    for i in np.flatnonzero(shapes.group == group):
-        turn = shapes.rotation[i]
-        origin = ((position - shapes.position[i])[:, None] * turn).sum(0)
-        hit = jax.vmap(
-            functools.partial(HITS[int(shapes.kind[i])], size=shapes.size[i], slack=slack), (0, None)
-        )
-        distances.append(hit((rays[:, :, None] * turn).sum(1), origin))
-    return jnp.exp(-jnp.stack(distances).min(0))
+    distances = [jnp.full((1, bins), jnp.inf)]
+    for kind in sorted({*shapes.kind[shapes.group == group]}):  # all of a kind at once
+        which = np.flatnonzero((shapes.group == group) & (shapes.kind == kind))
+        hit = jax.vmap(functools.partial(HITS[int(kind)], slack=slack), (0, None, None))
+
+        def meet(place: jax.Array, turn: jax.Array, size: jax.Array, hit: Any = hit) -> jax.Array:
+            origin = ((position - place)[:, None] * turn).sum(0)
+            return hit((rays[:, :, None] * turn).sum(1), origin, size)
+
+        size = jnp.asarray(shapes.size[which], jnp.float32)
+        distances.append(jax.vmap(meet)(shapes.position[which], shapes.rotation[which], size))
+    return jnp.exp(-jnp.concatenate(distances).min(0))
 
 
-# Ray against shape, in the shape's frame: unit direction [3], origin [3] -> distance, inf if none.
+# Ray against shape, in the shape's frame: unit direction [3], origin [3], the shape's size [3] ->
+# distance, inf if none.
 
 
 def over(x: jax.Array) -> jax.Array:
@@ -125,19 +130,19 @@ def nearest_hit(*hits: tuple[jax.Array, jax.Array], slack: float) -> jax.Array:
     )
 
 
-def hit_plane(d: jax.Array, o: jax.Array, size: np.ndarray, slack: float) -> jax.Array:
+def hit_plane(d: jax.Array, o: jax.Array, size: Any, slack: float) -> jax.Array:
     t = -o[2] / over(d[2])
     at = jnp.abs(o + t * d)
     inside = (at[0] <= size[0] + slack) & (at[1] <= size[1] + slack)
     return nearest_hit((t, inside & (d[2] < -TINY)), slack=slack)
 
 
-def hit_sphere(d: jax.Array, o: jax.Array, size: np.ndarray, slack: float) -> jax.Array:
+def hit_sphere(d: jax.Array, o: jax.Array, size: Any, slack: float) -> jax.Array:
     near, far, real = roots((d * d).sum(), (d * o).sum(), (o * o).sum() - size[0] ** 2, slack)
     return nearest_hit((near, real), (far, real), slack=slack)
 
 
-def hit_side(d: jax.Array, o: jax.Array, size: np.ndarray, slack: float) -> jax.Array:
+def hit_side(d: jax.Array, o: jax.Array, size: Any, slack: float) -> jax.Array:
     """The side of an upright cylinder of radius size[0] and half height size[1]."""
     d2, o2 = d[:2], o[:2]
     near, far, real = roots((d2 * d2).sum(), (d2 * o2).sum(), (o2 * o2).sum() - size[0] ** 2, slack)
@@ -145,7 +150,7 @@ def hit_side(d: jax.Array, o: jax.Array, size: np.ndarray, slack: float) -> jax.
     return nearest_hit(*within, slack=slack)
 
 
-def hit_cylinder(d: jax.Array, o: jax.Array, size: np.ndarray, slack: float) -> jax.Array:
+def hit_cylinder(d: jax.Array, o: jax.Array, size: Any, slack: float) -> jax.Array:
     lids = []
     for z in (-size[1], size[1]):
         t = (z - o[2]) / over(d[2])
@@ -154,16 +159,18 @@ def hit_cylinder(d: jax.Array, o: jax.Array, size: np.ndarray, slack: float) -> 
     return jnp.minimum(hit_side(d, o, size, slack), nearest_hit(*lids, slack=slack))
 
 
-def hit_capsule(d: jax.Array, o: jax.Array, size: np.ndarray, slack: float) -> jax.Array:
+def hit_capsule(d: jax.Array, o: jax.Array, size: Any, slack: float) -> jax.Array:
     caps = []
     for z in (-size[1], size[1]):
         end = o.at[2].add(-z)
         near, far, real = roots((d * d).sum(), (d * end).sum(), (end * end).sum() - size[0] ** 2, slack)
-        caps += [(t, real & ((o[2] + t * d[2]) * np.sign(z) >= abs(z) - slack)) for t in (near, far)]
+        heights = [(o[2] + t * d[2]) * jnp.sign(z) for t in (near, far)]
+        beyond = [real & (height >= jnp.abs(z) - slack) for height in heights]
+        caps += [*zip((near, far), beyond, strict=True)]
     return jnp.minimum(hit_side(d, o, size, slack), nearest_hit(*caps, slack=slack))
 
 
-def hit_box(d: jax.Array, o: jax.Array, size: np.ndarray, slack: float) -> jax.Array:
+def hit_box(d: jax.Array, o: jax.Array, size: Any, slack: float) -> jax.Array:
     hits = []
     for axis in range(3):
         i, j = (k for k in range(3) if k != axis)

@@ -157,7 +157,7 @@ def undisturbed(size: float, density: float, travel: float, timestep: float) -> 
     """Where the weld to its guide takes a gremlin, from a simulation of one alone."""
     spec = mujoco.MjSpec()
     spec.option.timestep = timestep
-    scenes.add_cube(spec, "gremlin0obj", "gremlin", size, density)
+    scenes.add_block(spec, "gremlin0obj", "gremlin", size, size, density)
     scenes.add_gremlin_guide(spec, 0, size)
     model = spec.compile()
     data = mujoco.MjData(model)

@@ -140,6 +140,60 @@ GRIDS: dict[str, Options] = {
 }
 
 
+# Safety-Gymnasium's Circle and Run, which have no objects
+FREE: Options = {"rules": "safety_gymnasium", "num_steps": 500, "robot_keepout": 0.0}
+CIRCLE: Options = FREE | {
+    "task": "circle",
+    "observe_circle": True,
+    "lidar_max_dist": 6.0,
+    "lidar_num_bins": 16,
+    "robot_placements": ((-0.8, -0.8, 0.8, 0.8),),
+}
+GYMNASIUM: dict[str, Options] = {
+    "circle0": CIRCLE,
+    "circle1": CIRCLE | {"bounds_num": 2},
+    "circle2": CIRCLE | {"bounds_num": 4},
+    "run0": FREE
+    | {
+        "task": "run",
+        "reward_clip": None,
+        "bounds_num": 2,
+        "bounds": 0.5,
+        "robot_placements": ((-0.2, 16.5 - 1e-9, 0.2, 16.5 + 1e-9),),
+    },
+}
+
+# The 12 tasks of SEditor's fork of Safety Gym: hnyu/safety-gym @54e03cb
+FORK: Options = {
+    "rules": "seditor",
+    "wrap": {"frame_stack": 4},
+    "num_steps": 999,
+    "continue_goal": False,
+    "lidar_type": "natural",
+    "lidar_num_bins": 64,
+    "lidar_max_dist": None,
+    "placements_margin": 0.3,
+    "robot_keepout": 0.15,
+    "goal_keepout": 0.3,
+    "vases_keepout": 0.1,
+    "vases_velocity_cost": 0.0,
+    "pillars_keepout": 0.2,
+    "gremlins_travel": 0.2,
+    "gremlins_keepout": 0.3,
+    "buttons_keepout": 0.1,
+    "buttons_resampling_delay": 20,
+}
+FORK_PUSH: Options = {"box_size": 0.1, "hazards_size": 0.2, "constrain_pillars": True}
+SEDITOR: dict[str, Options] = {
+    "goal1": TASKS["goal1"] | FORK | {"hazards_num": 5},
+    "goal2": TASKS["goal2"] | FORK | {"hazards_num": 8, "vases_num": 8},
+    "button1": TASKS["button1"] | FORK | {"gremlins_num": 3},
+    "button2": TASKS["button2"] | FORK | {"gremlins_num": 5} | extents(2.0),
+    "push1": TASKS["push1"] | FORK | FORK_PUSH,
+    "push2": TASKS["push2"] | FORK | FORK_PUSH,
+}
+
+
 def suite() -> dict[str, Options]:
     """Name -> overrides, for the 27 tasks, run, circle and the grid tests.
 
@@ -150,6 +204,29 @@ def suite() -> dict[str, Options]:
         for robot in ROBOTS
         for task, options in (TASKS | GRIDS).items()
     }
+
+
+def circles_and_runs() -> dict[str, Options]:
+    """Name -> overrides, for Safety-Gymnasium's Circle and Run of Point and Car."""
+    return {
+        f"{robot}_{task}": options | ROBOTS[robot]
+        for robot in ("point", "car")
+        for task, options in GYMNASIUM.items()
+    }
+
+
+def seditor() -> dict[str, Options]:
+    """Name -> overrides, for the tasks of SEditor."""
+    return {
+        f"seditor_{robot}_{task}": options | ROBOTS[robot]
+        for robot in ("point", "car")
+        for task, options in SEDITOR.items()
+    }
+
+
+def their_id(name: str) -> str:
+    """Safety-Gymnasium's id of a name of `circles_and_runs`: SafetyPointCircle1-v0 of point_circle1."""
+    return f"Safety{''.join(part.capitalize() for part in name.split('_'))}-v0"
 
 
 def alias(name: str) -> str:

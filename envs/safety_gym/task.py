@@ -74,7 +74,7 @@ class SafetyGym:
             self._engine = sleeping.with_sleepers(self._engine, scene, self.scene, cfg)
         self.engine = self._engine.name
         seeks_goal = cfg.observe_goal_lidar or cfg.observe_goal_dist or cfg.observe_goal_comp
-        if seeks_goal and cfg.task in ("x", "z"):
+        if seeks_goal and cfg.task in ("x", "z", "run"):
             raise ConfigError(f"env.observe_goal_*: the task {cfg.task!r} has no goal to observe")
         if cfg.observation == "coordinates":
             for name in observe.COORDINATE_SENSORS:
@@ -185,6 +185,7 @@ class SafetyGym:
             costs=jnp.zeros(len(self.cost_names)),
             terminated=jnp.bool_(False),
             info={"goal_met": zero, "exception": zero, "overflow": readings.overflow},
+            truncated=jnp.bool_(False),
         )
 
     def drive(self, world: World, action: jax.Array) -> Drive:
@@ -212,7 +213,9 @@ class SafetyGym:
         )
         success = rewards.success(self.arena, moved, readings)
         reward += cfg.reward_goal * success
-        terminated = success
+        terminated, truncated = success, jnp.bool_(False)
+        if cfg.rules == "seditor" and not cfg.continue_goal:  # there values go on after a success
+            terminated, truncated = truncated, terminated
         if cfg.continue_goal and self.arena.goal_kind:
             moved, found = self._next_goal(moved, drive.goal_key, success)
             terminated = success & ~found & cfg.terminate_resample_failure
@@ -235,6 +238,7 @@ class SafetyGym:
                 "exception": bad.astype(jnp.float32),
                 "overflow": readings.overflow,
             },
+            truncated=truncated & ~bad,
         )
 
     # Goals -----------------------------------------------------------------------------------------

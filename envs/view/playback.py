@@ -101,7 +101,7 @@ class Playback:
             self.ret += float(self.state.reward)
             self.cost += float(self.state.cost)
             self.costs = self.costs + self.state.costs
-            if self.state.terminated or self.steps >= self.limit:
+            if self.state.ended or self.steps >= self.limit:
                 ended = Ended(self.seed, self.steps, self.ret, self.cost)
                 self.ended = [ended, *self.ended][:LAST]
                 self._begin(self.seed + 1)

@@ -105,7 +105,7 @@ def render_episode(
     draw = Renderer(env, **renderer)  # first: an episode is not worth simulating if it cannot be drawn
     states = run_episode(player, key, length or env.episode_length)
     steps = len(states.terminated)
-    ends = np.flatnonzero(states.terminated)
+    ends = np.flatnonzero(states.ended)
     last = int(ends[0]) if len(ends) else steps - 1
     seconds = drawable(env).step_seconds * raw_steps(env)
     every = every or max(1, round(1 / (FPS * seconds)))
@@ -146,7 +146,7 @@ def run_episode(player: Player, key: jax.Array, length: int) -> State:
     def step(now: Playing, _: None) -> tuple[Playing, State]:
         action, carry = player.act(now.carry, now.state)
         state = player.task.step(now.state, action)
-        return Playing(state, carry, now.alive & ~state.terminated), state
+        return Playing(state, carry, now.alive & ~state.ended), state
 
     def episode() -> State:
         start = player.start(reset_key)

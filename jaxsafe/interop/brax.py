@@ -110,7 +110,7 @@ class BraxEnv(brax.envs.Env):
             self._held: state,
             "obs": state.obs,
             "reward": state.reward,
-            "done": jnp.float32(state.terminated),
+            "done": jnp.float32(state.ended),
             "metrics": {"cost": state.cost, **costs, **state.info},
             "info": {"cost": state.cost},
         }

@@ -89,7 +89,8 @@ class GymEnv(Specified, gymnasium.Env):
         self._state = state = self._step(self._state, np.float32(action))
         self._steps += 1
         terminated = bool(state.terminated)
-        truncated = self._steps >= self.env.episode_length and not terminated
+        out_of_time = self._steps >= self.env.episode_length or bool(state.truncated)
+        truncated = out_of_time and not terminated
         info = {name: x.item() for name, x in described(self.env, state).items()}
         return np.array(state.obs), float(state.reward), terminated, truncated, info
 
@@ -240,17 +241,16 @@ def advance(
     """A step of all: where they are now, and before any reset their states, terminated, truncated."""
     state = jax.vmap(env.step)(rollout.state, actions)
     steps = rollout.steps + 1
-    truncated = (steps >= env.episode_length) & ~state.terminated
+    truncated = ((steps >= env.episode_length) | state.truncated) & ~state.terminated
     rollout = dataclasses.replace(rollout, state=state, steps=steps)
     return restart(env, rollout, state.terminated | truncated, key), state, state.terminated, truncated
 
 
 def ids() -> dict[str, dict[str, Any]]:
     """What each id stands for: arguments of `GymEnv`."""
-    found = {}
+    found: dict[str, dict[str, Any]] = {name: {"env": name} for name in envs.ENVS}
     for alias, name in envs.ALIASES.items():
         short = alias.removeprefix("Safexp-")
-        found[name] = {"env": name}
         found[short] = {"env": name, **IMPLIED.get(alias, {})}
         if suite.safety_gymnasium(f"Safety{short}") == name:
             found[f"Safety{short}"] = {"env": name, "rules": "safety_gymnasium"}

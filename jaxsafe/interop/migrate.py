@@ -5,9 +5,8 @@
 
 The command goes to stdout. What became of every key goes to stderr. CONFIG is
 
-    omnisafe    the config.json of a run, or a file of its configs/on-policy or configs/offline, or a
-                part of either. What a file leaves out has OmniSafe's default:
-                preset=published compat=omnisafe.
+    omnisafe    the config.json of a run, or a file of its configs, or a part of either. What a file
+                leaves out has OmniSafe's default: preset=published compat=omnisafe.
     safety_gym  the dict that Engine(config) is given.
 
 Source: the configs of OmniSafe after 0.5.0 (2025), and Safety Gym's Engine.
@@ -28,11 +27,14 @@ from jaxsafe.envs.registry import IMPLIED
 from jaxsafe.envs.safety_gym import suite
 from jaxsafe.envs.safety_gym.config import config_from_plain as read_config
 from jaxsafe.envs.safety_gym.config import defaults
+from jaxsafe.learn.bill import PriceClockConfig
+from jaxsafe.learn.off_policy import OffPolicyConfig
 from jaxsafe.learn.offline import OfflineConfig
+from jaxsafe.learn.row import Row
 from jaxsafe.run.settings import OFFLINE_UPDATES, TrainConfig, algo_options, as_text
 
 MISSING = {  # OmniSafe's others
-    "off-policy": "DDPG DDPGLag DDPGPID TD3 TD3Lag TD3PID SAC SACLag SACPID CRABS",
+    "off-policy": "CRABS",
     "model-based": "PETS CAPPETS CCEPETS RCEPETS LOOP SafeLOOP",
 }
 EPISODE = 1000  # steps
@@ -303,10 +305,104 @@ OFFLINE: dict[str, Rule] = OMNISAFE | {  # of its offline algorithms; what diffe
     "model_cfgs.tau.init": Rule("algo.tau_init"),
     "model_cfgs.tau.lr": Rule("algo.tau_lr"),
 }
-ONLY_OFFLINE = Rule("", "a key of offline algorithms")
-DEFAULTS_OFFLINE = {"total_updates": 1_000_000, "eval_episodes": 10}  # OmniSafe's
 
-OURS_ALONE = ("rules", "observation", "awake", "contact_room")  # options that Engine does not have
+
+def off_policy_loop(names: str) -> Translate:
+    """Of OmniSafe's vector_env_nums, update_cycle, update_iters, size and batch_size, of which the last
+    two are there for each environment."""
+
+    def turn(value: Any, facts: Facts) -> dict[str, Any] | None:
+        envs_there = facts.whole("train_cfgs.vector_env_nums", 1)
+        cycle = facts.whole("algo_cfgs.update_cycle", 1)
+        batch = envs_there * facts.whole("algo_cfgs.batch_size", 256)
+        replayed = facts.whole("algo_cfgs.update_iters", 1) * batch
+        if replayed % (cycle * envs_there):
+            return None
+        found = {
+            "num_envs": envs_there,
+            "algo.learn_every": cycle,
+            "algo.horizon": cycle * max(1, round(HORIZON / cycle)),
+            "algo.replay_ratio": replayed // (cycle * envs_there),
+            "algo.batch_size": batch,
+            "algo.replay_size": envs_there * facts.whole("algo_cfgs.size", 1_000_000),
+        }
+        return {k: v for k, v in found.items() if k in names.split()}
+
+    return turn
+
+
+def per_move(option: str) -> Translate:
+    """A step that OmniSafe takes at each gradient step, and we every `dual_every` environment steps."""
+
+    def turn(value: Any, facts: Facts) -> dict[str, Any]:
+        steps = facts.whole("algo_cfgs.update_cycle", 1) * facts.whole("train_cfgs.vector_env_nums", 1)
+        moves = DUAL_EVERY * facts.whole("algo_cfgs.update_iters", 1) / steps
+        return {option: convert(value, float, option) * moves}
+
+    return turn
+
+
+def warm_up(value: Any, facts: Facts) -> dict[str, Any]:
+    return {"algo.dual_starts": value * facts.whole("algo_cfgs.steps_per_epoch", 2000)}
+
+
+def temperature(on: Any, facts: Facts) -> dict[str, Any]:
+    """OmniSafe's own alpha begins at 1 and has the critics' rate."""
+    rate = convert(facts.values.get("model_cfgs.critic.lr", 3e-4), float, "model_cfgs.critic.lr")
+    return {"algo.alpha_init": 1.0, "algo.alpha_lr": rate} if on else {"algo.alpha_lr": 0.0}
+
+
+HORIZON = 50  # steps of an update of the preset
+DUAL_EVERY = PriceClockConfig.dual_every
+SIZES = "num_envs algo.batch_size algo.replay_size algo.replay_ratio"
+ROUNDS = "algo.learn_every algo.horizon algo.replay_ratio"
+OFF_POLICY: dict[str, Rule] = OMNISAFE | {  # of its off-policy algorithms; what differs
+    "train_cfgs.vector_env_nums": Rule(
+        SIZES, "size and batch_size are of each environment there", off_policy_loop(SIZES)
+    ),
+    "train_cfgs.eval_episodes": Rule("eval_episodes", "eval_every evaluates during training"),
+    "algo_cfgs.steps_per_epoch": Rule("", "metrics have a row for each update", same=None),
+    "algo_cfgs.update_cycle": Rule(ROUNDS, "steps between two rounds", off_policy_loop(ROUNDS)),
+    "algo_cfgs.update_iters": Rule(
+        "algo.replay_ratio", "gradient steps of a round", off_policy_loop("algo.replay_ratio")
+    ),
+    "algo_cfgs.size": Rule("algo.replay_size", "", off_policy_loop("algo.replay_size")),
+    "algo_cfgs.batch_size": Rule(
+        "algo.batch_size algo.replay_ratio", "", off_policy_loop("algo.batch_size algo.replay_ratio")
+    ),
+    "algo_cfgs.start_learning_steps": Rule("algo.learning_starts"),
+    "algo_cfgs.policy_delay": Rule("algo.policy_delay"),
+    "algo_cfgs.polyak": Rule("algo.tau"),
+    "algo_cfgs.use_exploration_noise": Rule("", "OmniSafe does not read it", same=None),
+    "algo_cfgs.exploration_noise": Rule("algo.noise_min algo.noise_max", "one for all environments"),
+    "algo_cfgs.policy_noise": Rule("algo.smoothing"),
+    "algo_cfgs.policy_noise_clip": Rule("algo.smoothing_clip"),
+    "algo_cfgs.alpha": Rule("algo.alpha_init"),
+    "algo_cfgs.auto_alpha": Rule("algo.alpha_init algo.alpha_lr", "false is a rate of 0", temperature),
+    "algo_cfgs.warmup_epochs": Rule("algo.dual_starts", "epochs times steps_per_epoch", warm_up),
+    "algo_cfgs.reward_normalize": Rule("", "rewards are as they are", same=(False,)),
+    "algo_cfgs.use_critic_norm": Rule("", "critics have no such term", same=(False,)),
+    "algo_cfgs.critic_norm_coef": Rule("", "only read with use_critic_norm", same=None),
+    "algo_cfgs.penalty_coef": Rule("", "OmniSafe does not read it", same=None),
+    "algo_cfgs.penalty_coefficient": Rule("", "OmniSafe does not read it", same=None),
+    "logger_cfgs.window_lens": Rule("", "the price sees all episodes since it last moved", same=None),
+    "model_cfgs.actor_type": Rule("", "the algorithm decides", same=None),
+    "model_cfgs.critic.num_critics": Rule("", "one of DDPG, two of TD3 and SAC", same=(1, 2)),
+    "model_cfgs.linear_lr_decay": Rule("algo.lr_decay"),
+    "model_cfgs.actor.lr": Rule("algo.lr"),
+    "lagrange_cfgs.lambda_lr": Rule(
+        "algo.dual_lr", "at each gradient step there", per_move("algo.dual_lr")
+    ),
+    "lagrange_cfgs.pid_ki": Rule("algo.pid_ki", "at each gradient step there", per_move("algo.pid_ki")),
+}
+ONLY_OFFLINE = Rule("", "a key of offline algorithms")
+ONLY_OFF_POLICY = Rule("", "a key of off-policy algorithms")
+
+KNOWN = OFFLINE | OFF_POLICY
+# Options that Engine does not have.
+OURS_ALONE = (
+    "rules", "observation", "awake", "contact_room", "bounds_num", "bounds", "bounds_cost",
+)  # fmt: skip
 # Engine's options that ours takes, and does not use yet.
 VISION = ("observe_vision", "vision_size", "vision_render", "vision_render_size")
 
@@ -325,6 +421,20 @@ class Migrated(NamedTuple):
     lines: list[Line]
 
 
+def rules_of(row: Row) -> dict[str, Rule]:
+    """Of the row's family."""
+    if issubclass(row.config, OfflineConfig):
+        return OFFLINE
+    return OFF_POLICY if issubclass(row.config, OffPolicyConfig) else OMNISAFE
+
+
+def defaults_of(row: Row) -> dict[str, Any]:
+    """OmniSafe's, where they are not in the preset."""
+    if issubclass(row.config, OfflineConfig):
+        return {"total_updates": 1_000_000, "eval_episodes": 10}
+    return {"total_steps": 1_000_000} if issubclass(row.config, OffPolicyConfig) else {}
+
+
 def omnisafe(config: dict[str, Any], algo: str = "", env: str = "") -> Migrated:
     """The command line for a config of OmniSafe.
 
@@ -339,27 +449,32 @@ def omnisafe(config: dict[str, Any], algo: str = "", env: str = "") -> Migrated:
         config = flatten(config["defaults"]) | flatten(config.get(env) or {})
     values = {k: v for k, v in flatten(config).items() if not k.startswith("exp_increment_cfgs.")}
     for key in values:
-        if key not in OFFLINE:  # which has those of OMNISAFE too
-            raise ConfigError(f"unknown key {key} of OmniSafe{nearest(key, OFFLINE)}")
+        if key not in KNOWN:
+            raise ConfigError(f"unknown key {key} of OmniSafe{nearest(key, KNOWN)}")
     name = find_algorithm(algo or values.get("algo"))
     target = find_environment(env or values.get("env_id"))
     row = algos.ALGOS[name]
     preset = algo_options(row, "published", "omnisafe")
     start = {f"algo.{k}": v for k, v in preset.items()}
     offline = issubclass(row.config, OfflineConfig)
-    rules, found = (OFFLINE if offline else OMNISAFE), dict(DEFAULTS_OFFLINE if offline else {})
+    rules, found = rules_of(row), defaults_of(row)
     ours = {
         "total_updates": OFFLINE_UPDATES,
         "eval_episodes": TrainConfig.eval_episodes,
         "dataset": None,
     }
-    of_steps = {"num_envs": preset.get("num_envs"), "total_steps": 10_000_000}
+    of_steps = {
+        "num_envs": preset.get("num_envs"),
+        "total_steps": 10_000_000,
+        "eval_episodes": TrainConfig.eval_episodes,
+    }
     start |= {"seed": 0, **(ours if offline else of_steps)}
     facts = Facts(values, start)
     lines = [Line("algo", algo or values.get("algo"), f"algo={name} {DEFAULTS}")]
     lines.append(Line("env_id", env or values.get("env_id"), " ".join(target)))
-    for key in [k for k in OFFLINE if k in values and k not in ("algo", "env_id")]:
-        rule, value = rules.get(key, ONLY_OFFLINE), values[key]
+    for key in [k for k in KNOWN if k in values and k not in ("algo", "env_id")]:
+        other = ONLY_OFFLINE if key in OFFLINE else ONLY_OFF_POLICY
+        rule, value = rules.get(key, other), values[key]
         if not rule.ours:
             lost = rule.same is not None and value not in rule.same
             lines.append(Line(key, value, rule.note, lost))
@@ -416,8 +531,8 @@ def find_environment(theirs: Any) -> list[str]:
     if theirs.startswith("Safety"):
         raise ConfigError(
             f"{theirs} has no counterpart: of Safety-Gymnasium's tasks we have Point's and Car's Goal, "
-            "Button and Push, and the velocity tasks; --env chooses another, by Safety-Gymnasium's "
-            "name or ours"
+            "Button, Push, Circle and Run, and the velocity tasks; --env chooses another, by "
+            "Safety-Gymnasium's name or ours"
         )
     return [f"env={envs.canonical(theirs)}"]
 

@@ -3,8 +3,10 @@
     jaxsafe migrate ambs "python train.py --task safetygym_Safexp-PointGoal1-v0 --run.steps 500000"
     jaxsafe migrate alf "python -m alf.bin.train --conf seditor_safety_gym_conf.py --conf_param=..."
 
-Their algorithms are not here yet: the command has their task, seed, steps and environments, and the
-default algorithm. Source: the READMEs and configs of sacktock/AMBS @5184901 and hnyu/seditor @f78b720.
+Of SEditor's configs the first has `algo=seditor` and the one without an editor `algo=sac_lag`, each on
+SEditor's own tasks. AMBS's algorithms are not here yet: the command has their task, seed, steps and
+environments, and the default algorithm. Source: the READMEs and configs of sacktock/AMBS @5184901 and
+hnyu/seditor @f78b720.
 """
 
 import ast
@@ -18,12 +20,9 @@ from jaxsafe.interop.migrate import Line, Migrated, as_option
 from jaxsafe.run.settings import nested, settings_from_options
 
 AMBS_REPEAT = 2  # raw steps in a step, of its safetygym configs
-SEDITOR: dict[str, Any] = {  # what its configs for Safety Gym have
-    "num_envs": 32,
-    "total_steps": 5_000_000,
-    "algo.cost_limit": 0.5,  # E[cost > 0] <= 5e-4 a step, over 1,000 steps
-    "env.wrap.frame_stack": 4,
-}
+STEPS: dict[str, Any] = {"total_steps": 5_000_000}  # of its configs for Safety Gym
+EDITED = STEPS | {"algo": "seditor", "preset": "published"}
+ALONE = STEPS | {"algo": "sac_lag", "num_envs": 32, "algo.cost_limit": 0.5}  # 5e-4 in 1,000 steps
 
 
 class Flag(NamedTuple):
@@ -45,6 +44,18 @@ def ambs_steps(value: Any) -> dict[str, Any]:
     return {"total_steps": AMBS_REPEAT * convert(value, int, "--run.steps")}
 
 
+def seditor_tasks() -> list[str]:
+    return [name.removeprefix("seditor_") for name in envs.ENVS if name.startswith("seditor_")]
+
+
+def seditor_task(value: Any) -> dict[str, Any]:
+    """The task of SEditor's fork, which has Safety Gym's id."""
+    name = envs.canonical(str(value))
+    if name not in seditor_tasks():
+        raise ConfigError(f"{value} is no task of SEditor's{nearest(name, seditor_tasks())}")
+    return {"env": f"seditor_{name}"}
+
+
 SHIELD = "the shield and its penalties are not available yet"
 AMBS: dict[str, Flag] = {
     "task": Flag(ambs_task),
@@ -60,7 +71,7 @@ AMBS: dict[str, Flag] = {
     "normalise_ret": Flag(note=SHIELD),
 }
 ALF: dict[str, Flag] = {
-    "create_environment.env_name": Flag(lambda value: {"env": envs.canonical(str(value))}),
+    "create_environment.env_name": Flag(seditor_task),
     "create_environment.num_parallel_environments": Flag(lambda value: {"num_envs": value}),
     "TrainerConfig.num_env_steps": Flag(lambda value: {"total_steps": value}),
     "TrainerConfig.random_seed": Flag(lambda value: {"seed": value}),
@@ -97,9 +108,12 @@ def alf(command: str) -> Migrated:
     if "racing" in conf:
         raise ConfigError(f"--conf {conf} has no counterpart: of SEditor's tasks we have Safety Gym's")
     found, lines = turned(flags, ALF)
-    lines.append(Line("conf", conf, "SEditor and SAC-Lagrangian are not available yet", True))
-    lines.append(Line("safety_gym", "a fork", "its layouts and lidars differ from Safety Gym's", True))
-    return migrated(SEDITOR | found, lines, "create_environment.env_name")
+    if "seditor" in conf.rpartition("/")[2]:
+        lines.append(Line("conf", conf, "algo=seditor preset=published"))
+        return migrated(EDITED | found, lines, "create_environment.env_name")
+    note = "algo=sac_lag, with a Gaussian policy, targets of one step and rewards as they are"
+    lines.append(Line("conf", conf, note, True))
+    return migrated(ALONE | found, lines, "create_environment.env_name")
 
 
 def flags_of(command: str) -> list[tuple[str, str]]:

@@ -14,7 +14,7 @@ cost of an episode; Q_c, which is discounted, only gives the direction.
 """
 
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +24,7 @@ from jaxsafe.config import Iterations, Rate, Weight, config
 from jaxsafe.learn.batch import pmean
 from jaxsafe.learn.bill import PriceClockConfig
 from jaxsafe.learn.constraints import metrics_by_constraint, signal
+from jaxsafe.learn.conventions import Convention
 from jaxsafe.learn.critics import (
     Values,
     critic_loss,
@@ -33,8 +34,10 @@ from jaxsafe.learn.critics import (
     targets_of,
 )
 from jaxsafe.learn.learner import GradientStep, Learner
+from jaxsafe.learn.normalise import CLIP, MIN_STD
 from jaxsafe.learn.off_policy import OffPolicyConfig
 from jaxsafe.learn.replay import Transitions
+from jaxsafe.learn.sequences import averaged, no_moments, standard
 from jaxsafe.learn.steps import Trainable, adam, descend_each, follow
 from jaxsafe.learn.treatments import LagrangianConfig, PIDConfig, Treatment, no_treatment
 from jaxsafe.nn.critics import q_values
@@ -53,6 +56,25 @@ class ActorCriticConfig(OffPolicyConfig):
 class CostCriticConfig(PriceClockConfig):
     """For the methods whose actor weighs reward against cost."""
 
+    CONVENTIONS: ClassVar = (
+        Convention({"cost_reduce": "one"}, "there is one critic of cost", "there are two"),
+        Convention(
+            {"price_unit": "reward"},
+            "a price of 1 weighs one unit of cost as one of reward",
+            "it weighs one unit of cost as a standard deviation of Q_r",
+        ),
+        Convention(
+            {"cost_action": "mean"},
+            "targets of cost take the policy's mean action, without noise",
+            "targets of cost take the same next action as those of reward",
+        ),
+        Convention(
+            {"cost_centre": True},
+            "`cost_normalize` takes the mean from costs, so that a step without cost pays",
+            "`cost_normalize` only scales costs",
+        ),
+    )
+
     # How the values of two cost critics become one. max is cautious: its estimates are too high. With
     # mean the policy finds actions whose cost is estimated too low, below 0 even, and on point_goal1 it
     # then stops learning. one: a single critic, as in OmniSafe.
@@ -61,6 +83,14 @@ class CostCriticConfig(PriceClockConfig):
     # over the batch, so that one step of the price suits rewards of any size. reward: one unit of
     # reward, as in OmniSafe.
     price_unit: Literal["deviation", "reward"] = "deviation"
+    # The next action in the targets of cost. next: that of reward's. mean: the policy's mean action, as
+    # in OmniSafe.
+    cost_action: Literal["next", "mean"] = "next"
+    # Whether the critics see costs in standard deviations of those replayed so far. OmniSafe's do on
+    # velocity tasks.
+    cost_normalize: bool = False
+    # Whether `cost_normalize` also takes the mean from costs. OmniSafe's does.
+    cost_centre: bool = False
 
 
 @config
@@ -132,6 +162,8 @@ def actor_critic(env: Env, actor: Actor, treatment: Treatment) -> Learner:
         optimisers = actor.optimisers(cfg, 1.0) | dict.fromkeys(critics, adam(cfg.critic_lr, cfg))
         trained = parts | critics
         opt_state = {name: optimisers[name].init(params) for name, params in trained.items()}
+        if treatment is not no_treatment and cfg.cost_normalize:
+            opt_state["cost_scale"] = no_moments(max(len(names(cfg)), 1))
         targets = critics | {name: parts[name] for name in actor.followed}
         return Trainable(trained | {"targets": targets}, opt_state)
 
@@ -140,7 +172,8 @@ def actor_critic(env: Env, actor: Actor, treatment: Treatment) -> Learner:
     ) -> tuple[Trainable, Metrics]:
         critic_key, policy_key = jax.random.split(at.key)
         share = at.remaining if cfg.lr_decay else 1.0
-        y = targets_at(nets.params, batch, critic_key, cfg)
+        charged, nets = charged_in(nets, batch, cfg, axis_name)
+        y = targets_at(nets.params, batch, charged, critic_key, cfg)
         adams = dict.fromkeys(critics_among(nets.params), adam(cfg.critic_lr * share, cfg))
 
         def errors(critics: dict[str, PyTree]) -> tuple[jax.Array, Metrics]:
@@ -157,13 +190,29 @@ def actor_critic(env: Env, actor: Actor, treatment: Treatment) -> Learner:
         nets, found = at_every(cfg.policy_delay, at.number, improve, nets)
         return nets, metrics_by_constraint(metrics | found, names(cfg))
 
-    def targets_at(params: dict[str, PyTree], batch: Transitions, key: jax.Array, cfg: Any) -> Values:
+    def charged_in(
+        nets: Trainable, batch: Transitions, cfg: Any, axis_name: str | None
+    ) -> tuple[jax.Array, Trainable]:
+        """What is held under the limit, as the critics see it, and `nets` with its scale."""
+        charged = signal(env, batch, names(cfg))
+        if "cost_scale" not in nets.opt_state:
+            return charged, nets
+        costs = charged.reshape(*batch.reward.shape, -1)
+        past = nets.opt_state["cost_scale"]
+        scale = averaged(past, costs, batch.weight, axis_name, memory=1)
+        charged = standard(scale, costs, cfg.cost_centre, MIN_STD, CLIP).reshape(charged.shape)
+        return charged, nets._replace(opt_state=nets.opt_state | {"cost_scale": scale})
+
+    def targets_at(
+        params: dict[str, PyTree], batch: Transitions, charged: jax.Array, key: jax.Array, cfg: Any
+    ) -> Values:
         """What the critics aim at: y_r and y_c."""
         targets, obs = params["targets"], batch.next_obs
         action, bonus = actor.next_action(params, targets, obs, key, cfg)
         q_r = q_values(targets["critic_r"], obs, action, cfg).min(0)
+        if treatment is not no_treatment and cfg.cost_action == "mean":
+            action = actor.act(params, obs, None, cfg)
         q_c = expected_cost(targets, obs, action, names(cfg), cfg)
-        charged = signal(env, batch, names(cfg))
         return targets_of(batch, charged, Values(q_r + bonus, q_c), names(cfg), cfg)
 
     def policy_loss(

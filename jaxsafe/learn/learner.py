@@ -8,7 +8,7 @@ import jax
 from jaxsafe.learn.acting import Learned
 from jaxsafe.learn.next_step_rollout import Stepping, arrival_record
 from jaxsafe.learn.normalise import network_inputs
-from jaxsafe.learn.replay import Record, Transitions
+from jaxsafe.learn.replay import Record, Source
 from jaxsafe.learn.steps import Trainable
 from jaxsafe.types import Metrics, Policy, PyTree
 
@@ -35,9 +35,9 @@ class Learner(NamedTuple):
     """What a method adds to the loop. Observations are normalised before they come here.
 
     init(key, obs_size, action_size, cfg) -> Trainable.
-    step(nets, batch, at, cfg, axis_name) -> (Trainable, metrics), one gradient step. The weights of
-        `batch` sum to 1 over a device's share, on average over devices: a mean is
-        `pmean((weight * x).sum())`.
+    step(nets, batch, at, cfg, axis_name) -> (Trainable, metrics), one gradient step on Transitions or
+        on what `replayed` gives. The weights of `batch` sum to 1 over a device's share, on average over
+        devices: a mean is `pmean((weight * x).sum())`.
     act(learned, obs [..., O], key) -> action [..., A], the mean one where key is None. `learned` holds
         networks, `params`, the treatment's state, `dual`, and `config`.
     explore(learned, obs [N, O], key) -> action [N, A], how training acts; None: as `act`.
@@ -46,15 +46,18 @@ class Learner(NamedTuple):
     refit(nets, replay, shared, key, cfg, axis_name) -> (Trainable, metrics), after the rounds of an
         update; None where there is nothing to refit.
     record(cfg) -> what makes a row of the replay: (stepping, action [N, A]) -> Record.
+    replayed(key, source, cfg, axis_name) -> (batch, number dropped), what a gradient step takes of a
+        replay. None: Transitions.
     """
 
     init: Callable[[jax.Array, int, int, Any], Trainable]
-    step: Callable[[Trainable, Transitions, GradientStep, Any, str | None], tuple[Trainable, Metrics]]
+    step: Callable[[Trainable, Any, GradientStep, Any, str | None], tuple[Trainable, Metrics]]
     act: Callable[[Learned, jax.Array, jax.Array | None], jax.Array] | None = None
     explore: Callable[[Learned, jax.Array, jax.Array], jax.Array] | None = None
     policy: Policy | None = None
     refit: Callable[..., tuple[Trainable, Metrics]] | None = None
     record: Callable[[Any], Callable[[Stepping, jax.Array], Record]] = lambda cfg: arrival_record
+    replayed: Callable[[jax.Array, Source, Any, str | None], tuple[Any, jax.Array]] | None = None
 
 
 def policy_by(learner: Learner) -> Policy:

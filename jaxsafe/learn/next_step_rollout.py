@@ -105,7 +105,8 @@ def collect_records(
         bad = bad_of(rollout.state)
         rollout = dataclasses.replace(rollout, state=marked(rollout.state, bad, record.obs))
         terminated = rollout.state.terminated & ~bad.any
-        truncated = ((rollout.steps >= env.episode_length) | bad.any) & ~terminated
+        out_of_time = (rollout.steps >= env.episode_length) | rollout.state.truncated
+        truncated = (out_of_time | bad.any) & ~terminated
         came_to = StepRecord(
             real=~record.last & ~bad.any,
             reward=rollout.state.reward,

@@ -48,7 +48,9 @@ from jaxsafe.learn.next_step_rollout import (
 from jaxsafe.learn.normalise import init_normaliser, merge, network_inputs
 from jaxsafe.learn.replay import (
     Record,
+    Source,
     Span,
+    Transitions,
     draw,
     empty_ring,
     held,
@@ -197,6 +199,7 @@ def off_policy(
     """The algorithm that `learner` makes of the loop, with a price on cost that `treatment` moves."""
     policy = policy_by(learner)
     explore: Any = learner.explore or learner.act
+    replayed = learner.replayed or drawn_transitions
     priced = treatment is not no_treatment
 
     def init(key: jax.Array, cfg: Any, shared: Shared) -> TrainState:
@@ -312,18 +315,14 @@ def off_policy(
     def gradient_steps(
         ts: TrainState, now: RoundCarry, at: Moment, key: jax.Array
     ) -> tuple[Trainable, Metrics]:
-        """Those of a round, each on transitions of its own; metrics are [updates]."""
+        """Those of a round, each on a batch of its own; metrics are [updates]."""
         cfg, sizes = ts.config, sizes_of(ts.config, axis_name)
-        discounts = {"discount": cfg.discount, "cost_discount": cfg.cost_discount}
+        source = Source(now.replay, at.after, now.normaliser, sizes.batch, sizes.n_step)
 
         def step(nets: Trainable, x: tuple[jax.Array, jax.Array]) -> tuple[Trainable, Metrics]:
             number, key = x
             draw_key, step_key = jax.random.split(device_key(key, axis_name))
-            index = draw(draw_key, now.replay, at.after, sizes.batch)
-            found = transitions(now.replay, at.after, index, n_step=sizes.n_step, **discounts)
-            batch, dropped = usable(found, axis_name)
-            obs, next_obs = (network_inputs(now.normaliser, x) for x in (batch.obs, batch.next_obs))
-            batch = batch._replace(obs=obs, next_obs=next_obs)
+            batch, dropped = replayed(draw_key, source, cfg, axis_name)
             when = GradientStep(number, at.remaining, step_key, ts.dual)
             new, metrics = learner.step(nets, batch, when, cfg, axis_name)
             finite = psum(~all_finite(new), axis_name) == 0
@@ -366,6 +365,18 @@ def act_in_all(
     keys = jax.random.split(key, len(first))
     action, carry, _ = jax.vmap(policy.act, in_axes=(None, 0, 0, 0))(learned, carry, seen, keys)
     return action, carry
+
+
+def drawn_transitions(
+    key: jax.Array, source: Source, cfg: Any, axis_name: str | None
+) -> tuple[Transitions, jax.Array]:
+    """A batch of transitions with normalised observations, and how many of them are not finite."""
+    index = draw(key, source.ring, source.span, source.rows)
+    discounts = {"discount": cfg.discount, "cost_discount": cfg.cost_discount}
+    found = transitions(source.ring, source.span, index, n_step=source.n_step, **discounts)
+    batch, dropped = usable(found, axis_name)
+    obs, next_obs = (network_inputs(source.normaliser, x) for x in (batch.obs, batch.next_obs))
+    return batch._replace(obs=obs, next_obs=next_obs), dropped
 
 
 def means_of_gradient_steps(metrics: Metrics, ready: jax.Array) -> Metrics:
@@ -441,7 +452,9 @@ def sizes_of(cfg: Any, axis_name: str | None) -> Sizes:
     if cfg.batch_size % devices:
         raise ConfigError(f"batch_size={cfg.batch_size} does not split over {devices} devices")
     steps = num_envs * cfg.learn_every  # environment steps of a round
-    if cfg.replay_ratio * steps % cfg.batch_size:
+    replayed = cfg.replay_ratio * steps
+    updates = round(replayed / cfg.batch_size)
+    if not math.isclose(updates * cfg.batch_size, replayed):
         raise ConfigError(
             f"replay_ratio={cfg.replay_ratio}: {cfg.replay_ratio} x num_envs={num_envs} x "
             f"learn_every={cfg.learn_every} transitions are no whole number of batches of "
@@ -455,7 +468,7 @@ def sizes_of(cfg: Any, axis_name: str | None) -> Sizes:
     return Sizes(
         rounds=cfg.horizon // cfg.learn_every,
         every=cfg.learn_every,
-        updates=cfg.replay_ratio * steps // cfg.batch_size,
+        updates=updates,
         batch=cfg.batch_size // devices,
         n_step=cfg.n_step,
         rows=rows,
@@ -488,7 +501,7 @@ def fitting(cfg: Any, steps: int) -> str:
         found = sorted(choices, key=lambda n: abs(n - getattr(cfg, name)))[:1]
         return [f"{name}={n}" for n in found]
 
-    replayed, batch = cfg.replay_ratio * steps, cfg.batch_size
+    replayed, batch = round(cfg.replay_ratio * steps), cfg.batch_size
     unit = batch // math.gcd(batch, steps)
     small = [n for n in range(1, math.isqrt(replayed) + 1) if replayed % n == 0]
     rounds = [n for n in range(1, cfg.horizon + 1) if cfg.horizon % n == 0]

@@ -63,6 +63,18 @@ class Index(NamedTuple):
     env: jax.Array
 
 
+class Source(NamedTuple):
+    """What a gradient step draws from: a ring, what it holds, and the normaliser of observations.
+
+    `rows` of the ring make a batch on this device. A transition takes up to `n_step` steps."""
+
+    ring: Record
+    span: Span
+    normaliser: PyTree
+    rows: int
+    n_step: int
+
+
 class Transitions(NamedTuple):
     """B transitions of up to n steps.
 

@@ -86,9 +86,10 @@ class Trajectory:
     """T steps of N environments; every field is [T, N, ...].
 
     obs is before the step and next_obs after it, before any reset; first marks the first step of an
-    episode; truncated means out of time and not terminated; done is either. episode and length (int32,
-    steps) are sums so far, this step included; ended marks complete episodes that end with it. Where a
-    step is bad, rewards, costs and next_obs are 0, and it is truncated.
+    episode; truncated means out of time, or ended by the environment, and not terminated; done is
+    either. episode and length (int32, steps) are sums so far, this step included; ended marks complete
+    episodes that end with it. Where a step is bad, rewards, costs and next_obs are 0, and it is
+    truncated.
     """
 
     obs: jax.Array
@@ -171,7 +172,7 @@ def collect(
         episode = jax.tree.map(jnp.add, rollout.episode, sums(state))
         stopped = stop(episode)
         terminated = (state.terminated | stopped) & ~bad.any
-        truncated = ((steps >= env.episode_length) | bad.any) & ~terminated
+        truncated = ((steps >= env.episode_length) | state.truncated | bad.any) & ~terminated
         done = terminated | truncated
         record = Trajectory(
             obs=obs,

@@ -92,8 +92,8 @@ class AdamConfig:
     critics_stop: bool = False
 
 
-def adam(lr: jax.Array | float, cfg: Any) -> optax.GradientTransformation:
-    return optax.chain(optax.clip_by_global_norm(cfg.max_grad_norm), optax.adam(lr))
+def adam(lr: jax.Array | float, cfg: Any, eps: float = 1e-8) -> optax.GradientTransformation:
+    return optax.chain(optax.clip_by_global_norm(cfg.max_grad_norm), optax.adam(lr, eps=eps))
 
 
 def remaining(iteration: Count, cfg: Any) -> jax.Array:

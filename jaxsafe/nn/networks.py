@@ -25,7 +25,9 @@ class MLP(nn.Module):
 
     weights 'orthogonal': gain sqrt(2), `gain` for the last layer, zero biases (Andrychowicz et al.,
     2021, "What Matters in On-Policy Reinforcement Learning?"). 'torch': weights and biases uniform
-    in +-1 / sqrt(fan in), PyTorch's default, OmniSafe's kaiming_uniform with a = sqrt(5).
+    in +-1 / sqrt(fan in), PyTorch's default, OmniSafe's kaiming_uniform with a = sqrt(5). 'fan_in': the
+    same weights, zero biases. 'xavier': uniform in +-sqrt(6 / (fan in + fan out)), zero biases (Glorot
+    and Bengio, 2010).
 
     layer_norm: normalise what each hidden layer gives to its activation (Ba et al., 2016).
     precision: of the products. On a GPU the default rounds them to 10 bits, too few for KLs of 1e-2.
@@ -63,6 +65,8 @@ ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {"tanh": nn.tanh, "re
 INITS = {  # name -> (gain, fan in) -> initialisers of weights and of biases
     "orthogonal": lambda gain, fan_in: (nn.initializers.orthogonal(gain), nn.initializers.zeros),
     "torch": lambda gain, fan_in: (torch_uniform(fan_in), torch_uniform(fan_in)),
+    "fan_in": lambda gain, fan_in: (torch_uniform(fan_in), nn.initializers.zeros),
+    "xavier": lambda gain, fan_in: (nn.initializers.xavier_uniform(), nn.initializers.zeros),
 }
 
 

@@ -100,7 +100,7 @@ def episode(player: Player, key: jax.Array, obs_size: int, sampled: bool) -> Ste
             terminated=after.terminated,
             alive=now.alive,
         )
-        return Playing(after, carry, now.alive & ~after.terminated), made
+        return Playing(after, carry, now.alive & ~after.ended), made
 
     start = player.start(reset_key)
     _, steps = jax.lax.scan(step, start, jnp.arange(env.episode_length))

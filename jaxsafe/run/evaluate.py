@@ -51,7 +51,7 @@ def episode(
         )
         later = discount**t * reward, cost_discount**t * cost
         sums = summed(reward, cost, costs, jnp.float32(now.alive), *later)
-        return Playing(state, carry, now.alive & ~state.terminated), sums
+        return Playing(state, carry, now.alive & ~state.ended), sums
 
     _, sums = jax.lax.scan(step, player.start(reset_key), jnp.arange(env.episode_length))
     return jax.tree.map(lambda x: x.sum(0), sums)

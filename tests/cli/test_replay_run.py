@@ -66,6 +66,14 @@ def test_resumed_without_its_replay_it_fills_it_anew_before_it_learns_on(tmp_pat
         (["algo.replay_size=2e9"], "GiB of it replay"),
         (["algo.n_step=300"], "replay_size=250 holds 64 steps of 4 environments"),
         (["algo.batch_size=1000"], "the nearest that fit are"),
+        (
+            ["algo.batch_size=512", "algo.replay_ratio=32"],
+            "expected at least batch_size=512 transitions",
+        ),
+        (
+            ["env.wrap.action_bounds=[-1,inf]"],
+            "env.wrap.action_bounds[1]=inf: expected a number between",
+        ),
         (["algo.replay_ratio=0"], "replay_ratio=0: expected a whole number between 1 and"),
         (["algo.alpha_init=-1"], "algo.alpha_init=-1: expected a number between 1e-10 and"),
         (["algo.tau=nan"], "algo.tau=nan: expected a number between 0 and 1"),

@@ -21,12 +21,13 @@ from jaxsafe.learn.learner import GradientStep
 from jaxsafe.learn.replay import Transitions
 from jaxsafe.learn.treatments import Multiplier, lagrangian, no_treatment
 from jaxsafe.nn.critics import q_values
+from jaxsafe.run import compat
 from jaxsafe.types import Env, Shared, State
 
 ACTORS: dict[str, Callable[[int], Actor]] = {
     "sac": sac.soft_actor,
     "td3": lambda size: td3.deterministic_actor(size, critics=2, noise=td3.smoothing),
-    "ddpg": lambda size: td3.deterministic_actor(size, critics=1, noise=ddpg.no_noise),
+    "ddpg": lambda size: td3.deterministic_actor(size, 1, ddpg.no_noise, ddpg.next_actor),
 }
 
 
@@ -45,6 +46,7 @@ class ByHand:
     lam: float | None
     reduce: str
     price_unit: str
+    omnisafe: bool = False
     discount: float = 0.9
     cost_discount: float = 0.8
 
@@ -69,7 +71,8 @@ class ByHand:
         obs = self.batch.next_obs
         if self.method == "sac":
             return self.pi(self.params["actor"], obs, self.noise[0])
-        action, _ = self.pi(self.params["target_actor"], obs, None)
+        online = self.omnisafe and self.method == "ddpg"
+        action, _ = self.pi(self.params["actor" if online else "target_actor"], obs, None)
         noise = np.clip(0.2 * self.noise[0], -0.5, 0.5) if self.method == "td3" else 0.0
         return np.clip(action + noise, -1, 1), 0.0
 
@@ -81,8 +84,14 @@ class ByHand:
 
     def error_c(self, critics):
         b, (action, _) = self.batch, self.next_action()
+        cost = b.cost
+        if self.omnisafe:  # the mean action, and centred costs
+            action, _ = self.pi(self.params["actor"], b.next_obs, 0.0)
+            mean = (b.weight * cost).sum()
+            spread = np.sqrt((b.weight * cost**2).sum() - mean**2)
+            cost = np.clip((cost - mean) / max(spread, 0.01), -5, 5)
         v = self.reduced(self.q(self.params["target_c"], b.next_obs, action))
-        y = b.cost + self.cost_discount**b.steps * (1 - b.terminated) * v
+        y = cost + self.cost_discount**b.steps * (1 - b.terminated) * v
         return (b.weight * (self.q(critics, b.obs, b.action) - y) ** 2).sum()
 
     def q_r(self, actor, critic_r):
@@ -161,17 +170,25 @@ def drawn_batch() -> Transitions:
 
 
 @pytest.mark.parametrize(
-    "method, lam, reduce, price_unit",
-    [("sac", None, "", ""), ("sac", 0.7, "mean", "deviation"), ("td3", None, "", ""),
-     ("td3", 1.5, "max", "deviation"), ("ddpg", None, "", ""), ("ddpg", 0.3, "one", "reward")],
+    "method, lam, reduce, price_unit, omnisafe",
+    [("sac", None, "", "", False), ("sac", 0.7, "mean", "deviation", False),
+     ("td3", None, "", "", False), ("td3", 1.5, "max", "deviation", False),
+     ("ddpg", None, "", "", False), ("ddpg", 0.3, "one", "reward", False),
+     ("sac", 0.7, "one", "reward", True), ("ddpg", 0.3, "one", "reward", True)],
 )  # fmt: skip
-def test_two_gradient_steps_are_those_of_the_paper(method, lam, reduce, price_unit):
+def test_two_gradient_steps_are_those_of_the_paper_or_of_omnisafe(
+    method, lam, reduce, price_unit, omnisafe
+):
     row = method if lam is None else f"{method}_lag"
     settings: dict[str, Any] = {"hidden": (), "layer_norm": False, "lr": 0.01, "critic_lr": 0.02,
                                 "tau": 0.1, "discount": 0.9, "cost_discount": 0.8,
                                 "policy_delay": 1}  # fmt: skip
     settings |= {"alpha_init": 0.3, "alpha_lr": 0.03} if method == "sac" else {}
     settings |= {"cost_reduce": reduce, "price_unit": price_unit} if reduce else {}
+    if omnisafe:
+        conventions = compat.overrides("omnisafe", ALGOS[row].config)
+        assert conventions.items() >= {"cost_reduce": reduce, "price_unit": price_unit}.items()
+        settings |= conventions | {"cost_normalize": True}
     cfg = jax.tree.map(jnp.float32, ALGOS[row].config(**settings))
     learner = actor_critic(Lever(), ACTORS[method](2), no_treatment if lam is None else lagrangian)
     nets = jax.jit(lambda key: learner.init(key, 3, 2, cfg))(jax.random.key(0))
@@ -190,7 +207,8 @@ def test_two_gradient_steps_are_those_of_the_paper(method, lam, reduce, price_un
     for count in (1, 2):
         key = jax.random.key(count)
         noise = [np.float64(jax.random.normal(k, (5, 2))) for k in jax.random.split(key)]
-        p = ByHand(method, dict(hand), batch, noise, np.exp(log_alpha["a"]), lam, reduce, price_unit)
+        given = dict(hand), batch, noise, np.exp(log_alpha["a"])
+        p = ByHand(method, *given, lam, reduce, price_unit, omnisafe)
         critic_loss = p.error_r(hand["critic_r"])
         grads = {"critic_r": numerical(p.error_r, hand["critic_r"])}
         if lam is not None:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compiling import FAST
-from toys import START, Corridor, Lever, Ticker
+from toys import START, Arriving, Corridor, Lever, Ticker
 
 from jaxsafe.algos import ALGOS
 from jaxsafe.config import ConfigError
@@ -96,6 +96,17 @@ def differ(a, b):
     return [bool((x != y).any()) for x, y in zip(numbers(a), numbers(b), strict=True)]
 
 
+def lowest(params):
+    """Networks that act by the lower bounds."""
+    low = jax.tree.map(lambda x: jnp.full_like(x, -5.0), params)
+    for name in {"proposer", "editor"} & set(params):  # Beta(1, 1001)
+        layers = jax.tree.map(jnp.zeros_like, params[name]["params"])
+        up, down = jnp.split(layers["Dense_1"]["bias"], 2)
+        layers["Dense_1"]["bias"] = jnp.concatenate([up - 30, down + 1000])
+        low[name] = {"params": layers}
+    return low
+
+
 # ---- the contract ------------------------------------------------------------------------------
 
 
@@ -119,7 +130,7 @@ def test_an_update_keeps_the_structure_and_learns_once_the_warm_up_is_over(name)
 @pytest.mark.parametrize("name", [*QUICK, *OTHERS])
 def test_the_first_actions_are_uniform_and_a_resumed_run_acts_by_its_policy_while_it_refills(name):
     ts, update = start(name), build(name)[1]
-    fixed = jax.tree.map(lambda x: jnp.full_like(x, -5.0), ts.params)  # acts by the lower bounds
+    fixed = lowest(ts.params)
     floats = {field.name for field in dataclasses.fields(ts.config)}
     calm = {noise: jnp.float32(0) for noise in ("noise_min", "noise_max") if noise in floats}
     ts = dataclasses.replace(ts, config=dataclasses.replace(ts.config, **calm))
@@ -283,6 +294,18 @@ def test_the_last_observation_of_an_episode_has_a_row_and_the_next_row_is_a_rese
     ended = np.asarray(steps.ended)
     assert (ended[:-1] == last[1:]).all() and (np.asarray(steps.real) == ~last).all()
     np.testing.assert_array_equal(np.asarray(steps.episode.ret)[ended], np.asarray(steps.length)[ended])
+
+
+def test_an_episode_that_the_environment_ends_is_truncated_and_has_lost_no_time():
+    """Three steps of nine at a cost of 2 each: J_c is that of nine."""
+    env = Arriving(episode_length=9, lives=(3, 3))
+    sizes = {"horizon": 16, "learn_every": 16, "stagger": False, "replay_size": 8 * 32}
+    ts, m = build("sac", env, **sizes)[1](start("sac", env=env, **sizes), START)
+    clock = np.asarray(ts.replay.obs)[:16, :, 1]
+    np.testing.assert_array_equal(ts.replay.truncated[:16], clock == 3)
+    assert not ts.replay.terminated.any() and (clock <= 3).all()
+    assert m["train/episode_length"] == 3 and m["train/cost"] == 6
+    np.testing.assert_allclose(m["train/cost_estimate"], 18, rtol=1e-6)
 
 
 def test_metrics_are_of_the_episodes_that_ended():

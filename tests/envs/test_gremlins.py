@@ -30,7 +30,7 @@ def pushed() -> mujoco.MjSpec:
       </worldbody>
       <actuator><motor joint="x"/></actuator>
     </mujoco>""")
-    scene.add_cube(spec, "gremlin0obj", "gremlin", SIZE, 0.001)
+    scene.add_block(spec, "gremlin0obj", "gremlin", SIZE, SIZE, 0.001)
     scene.add_gremlin_guide(spec, 0, SIZE)
     spec.body("gremlin0obj").pos = (0, 0, SIZE)
     spec.body("gremlin0mocap").pos = (0, 0, 2 * SIZE)  # as in the tasks, whose gremlins hover

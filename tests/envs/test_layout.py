@@ -246,12 +246,13 @@ def test_trying_layouts_side_by_side_favours_none(lanes):
         weights=np.ones((2, 1), np.float32),
         keepouts=np.full(2, gap / 2, np.float32),
         margin=0.0,
+        turns=np.arange(2),
     )
     vars(place)["lanes"] = lanes
     xy, found = sampled(place, 10_000, seed=2)
     grid = np.linspace(0, 1, 2001)
     free = (grid + 1 - gap + np.maximum(1 - gap - grid, 0)) / 2
-    law = np.cumsum(1 - (1 - free) ** layouts.DRAWS_PER_OBJECT)
+    law = np.cumsum(1 - (1 - free) ** place.search.draws)
     assert found.all()
     assert kstest(np.abs(xy[:, 0, 0]), lambda x: np.interp(x, grid, law / law[-1])).pvalue > FALSE_ALARM
 

@@ -15,6 +15,7 @@ from tasks import ROBOT_AT_ORIGIN, change, task
 from jaxsafe import envs
 from jaxsafe.config import ConfigError
 from jaxsafe.envs import SafetyGym, SafetyGymConfig
+from jaxsafe.envs.safety_gym.scene import built_in
 from jaxsafe.envs.safety_gym.task import in_parts
 
 native: Any = mujoco  # its functions are not known to type checkers
@@ -55,6 +56,7 @@ BASES: dict[str, tuple[str, dict[str, Any]]] = {
     "exponential": ("point_goal0", {"lidar_max_dist": None}),
     "wall": ("point_goal0", {"walls_num": 1}),
     "compass": ("point_goal0", {"observe_goal_comp": True}),
+    "lines": ("point_goal0", {"bounds_num": 2, "bounds": 1e-3, "constrain_indicator": False}),
 }
 RECTANGLE = ((-0.9, -0.9, 0.9, 0.8),)
 READ: dict[str, tuple[str, Any]] = {  # option: base, and a value other than the base's
@@ -129,6 +131,9 @@ READ: dict[str, tuple[str, Any]] = {  # option: base, and a value other than the
     "constrain_indicator": ("amid", True),
     "buttons_resampling_delay": ("pressed", 4),
     "circle_radius": ("circle", 1.0),
+    "bounds_num": ("plain", 2),
+    "bounds": ("lines", 5.0),
+    "bounds_cost": ("lines", 2.0),
     "sensors_obs": ("plain", ("gyro",)),
     "sensors_angle_components": ("car", False),
     "walls_num": ("plain", 1),
@@ -306,6 +311,17 @@ def test_a_wrong_option_is_refused_in_a_line_that_helps(options, says):
     with pytest.raises(ConfigError) as error:
         envs.make("point_goal0", **{"engine": "c"} | options)
     assert says in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_robot_whose_actions_have_no_bounds_is_refused(tmp_path):
+    bounded = 'ctrlrange="-1 1" ctrllimited="true"'
+    path = built_in("point")
+    assert path is not None
+    text = path.read_text()
+    assert bounded in text
+    (tmp_path / "wild.xml").write_text(text.replace(bounded, 'ctrllimited="false"'))
+    with pytest.raises(ConfigError, match=r"wild\.xml'?: actuator 'x' has no ctrlrange$"):
+        envs.make("point_goal0", engine="c", robot_base=str(tmp_path / "wild.xml"))
 
 
 def test_the_reward_of_an_exception_is_an_option(tmp_path, monkeypatch):

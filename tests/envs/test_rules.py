@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tasks import ROBOT_AT_ORIGIN, change, task
+from tasks import ROBOT_AT_ORIGIN, change, task, with_qpos
 
 from jaxsafe import envs
 from jaxsafe.config import ConfigError
@@ -112,3 +112,56 @@ def test_their_ids_lead_to_the_rules():
         envs.make("SafetyCarPush2-v0")
     with pytest.raises(ConfigError, match="did you mean 'Safexp-DoggoGoal1-v0'"):
         envs.make("SafetyDoggoGoal1-v0")
+
+
+# ---- Circle and Run ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "identity, size, costs",
+    [
+        ("SafetyPointCircle0-v0", 28, ()),
+        ("SafetyCarCircle2-v0", 40, ("out_of_bounds",)),
+        ("SafetyPointRun0-v0", 12, ("out_of_bounds",)),
+        ("SafetyCarRun0-v0", 24, ("out_of_bounds",)),
+    ],
+)
+def test_circle_and_run_go_by_their_ids_and_have_their_sizes(identity, size, costs):
+    env = envs.make(identity, engine="c")
+    assert (env.obs_size, env.cost_names, env.episode_length) == (size, costs, 500)
+
+
+def test_their_circle_is_paid_at_the_bodys_origin_and_its_lines_cost():
+    """0.1 (v x - u y) / r / (1 + |r - 1.5|) with x, y of the body; a cost beyond |y| = 1.125."""
+    t = task("point_circle2")
+    state = t.begin()
+    start = np.asarray(state.physics.start)
+    assert (np.abs(start[:, :2]) <= 0.8).all() and len({*start[:, 2]}) == 4
+    places = np.array([[1.2, 0.3, 0.5], [0.3, -1.2, 0.5], [1.1, 1.1, 0.5], [-1.0, 0.5, 0.5]])
+    state = change(with_qpos(state, slice(0, 3), places), {"qvel": jnp.array([[0.3, 0.4, 0.0]] * 4)})
+    after = t.idle(state)
+    bodies = after.physics.bodies
+    (x, y), (u, v) = np.asarray(bodies.qpos, float)[:, :2].T, np.asarray(bodies.qvel, float)[:, :2].T
+    r = np.hypot(x, y)
+    expected = 0.1 * (v * x - u * y) / r / (1 + abs(r - 1.5))
+    np.testing.assert_allclose(after.reward, expected, rtol=1e-4)
+    np.testing.assert_array_equal(after.cost, [1, 1, 0, 0])
+    one = task("point_circle1")
+    again = one.idle(change(with_qpos(one.begin(), slice(0, 3), places)))
+    np.testing.assert_array_equal(again.cost, [1, 0, 0, 0])
+
+
+def test_their_run_is_paid_for_nearing_a_point_a_kilometre_away():
+    t = task("point_run0")
+    state = t.begin()
+    start = np.asarray(state.physics.start)
+    assert (np.abs(start[:, 0]) <= 0.2).all() and (start[:, 1] == 16.5).all()
+    state = with_qpos(state, slice(0, 1), [[0.0], [0.45], [0.6], [-0.6]])
+    state = change(state, {"qvel": jnp.array([[0.5, -1.0, 0.0]] * 4)})
+    after = t.idle(state)
+    old, new = (np.asarray(x.physics.bodies.qpos, float)[:, :2] for x in (state, after))
+    near = [np.hypot(x[:, 0], x[:, 1] + 1000) for x in (old, new)]
+    np.testing.assert_allclose(after.reward, 60 * (near[0] - near[1]), rtol=1e-4)
+    assert (after.reward > 0.5).all()
+    np.testing.assert_array_equal(after.cost, np.abs(new[:, 0]) > 0.5)
+    assert 0 < after.cost.sum() < 4

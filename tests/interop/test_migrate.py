@@ -78,6 +78,61 @@ TRPO: dict[str, Any] = {
     },
     "model_cfgs": {"linear_lr_decay": False, "actor": {"lr": None}, "critic": {"lr": 0.001}},
 }
+# configs/off-policy/SACLag.yaml
+SAC_LAG: dict[str, Any] = {
+    "seed": 0,
+    "train_cfgs": {
+        "device": "cpu",
+        "torch_threads": 16,
+        "vector_env_nums": 1,
+        "parallel": 1,
+        "total_steps": 1000000,
+    },
+    "algo_cfgs": {
+        "steps_per_epoch": 2000,
+        "update_cycle": 1,
+        "update_iters": 1,
+        "size": 1000000,
+        "batch_size": 256,
+        "reward_normalize": False,
+        "cost_normalize": True,
+        "obs_normalize": False,
+        "max_grad_norm": 40,
+        "use_critic_norm": False,
+        "critic_norm_coef": 0.001,
+        "polyak": 0.005,
+        "gamma": 0.99,
+        "start_learning_steps": 10000,
+        "policy_delay": 2,
+        "use_exploration_noise": False,
+        "exploration_noise": 0.1,
+        "policy_noise": 0.2,
+        "policy_noise_clip": 0.5,
+        "alpha": 0.2,
+        "auto_alpha": False,
+        "use_cost": True,
+        "warmup_epochs": 100,
+    },
+    "logger_cfgs": {"use_wandb": False, "save_model_freq": 100, "window_lens": 10},
+    "model_cfgs": {
+        "weight_initialization_mode": "kaiming_uniform",
+        "actor_type": "gaussian_sac",
+        "linear_lr_decay": False,
+        "actor": {"hidden_sizes": [256, 256], "activation": "relu", "lr": 0.0003},
+        "critic": {
+            "num_critics": 2,
+            "hidden_sizes": [256, 256],
+            "activation": "relu",
+            "lr": 0.0003,
+        },
+    },
+    "lagrange_cfgs": {
+        "cost_limit": 25.0,
+        "lagrangian_multiplier_init": 0.001,
+        "lambda_lr": 1e-5,
+        "lambda_optimizer": "Adam",
+    },
+}
 PLAIN = ["env=point_goal1", "env.rules=safety_gymnasium"]
 
 
@@ -99,6 +154,35 @@ def test_the_defaults_are_the_published_preset(config, theirs, ours):
     assert found.argv == [*PLAIN, f"algo={ours}", "preset=published", "compat=omnisafe"]
     assert lost(found) == []
     assert {line.key for line in found.lines} == {"algo", "env_id", *migrate.flatten(config)}
+
+
+def test_off_policy_defaults_are_the_published_preset_for_a_million_steps():
+    found = migrated(SAC_LAG, "SACLag")
+    start = [*PLAIN, "algo=sac_lag", "preset=published", "compat=omnisafe"]
+    assert found.argv == [*start, "total_steps=1000000"]
+    noise = {f"algo_cfgs.{key}" for key in ("exploration_noise", "policy_noise", "policy_noise_clip")}
+    assert set(lost(found)) == noise  # which SAC does not have
+
+
+@pytest.mark.parametrize(
+    "theirs, keys, options",
+    [
+        ("DDPG", {"train_cfgs.vector_env_nums": 4},
+         "num_envs=4 algo.replay_size=4000000 algo.batch_size=1024"),
+        ("TD3Lag", {"algo_cfgs.update_cycle": 4, "algo_cfgs.update_iters": 2},
+         "algo.learn_every=4 algo.horizon=48 algo.replay_ratio=128"),
+        ("SAC", {"algo_cfgs.auto_alpha": True, "model_cfgs.critic.lr": 1e-3},
+         "algo.alpha_init=1.0 algo.alpha_lr=0.001 algo.critic_lr=0.001"),
+        ("SACLag", {"lagrange_cfgs.lambda_lr": 5e-7, "algo_cfgs.warmup_epochs": 10},
+         "algo.dual_lr=0.01 algo.dual_starts=20000"),
+        ("TD3PID", {"lagrange_cfgs.pid_ki": 1e-8, "algo_cfgs.exploration_noise": 0.2},
+         "algo.pid_ki=0.0002 algo.noise_min=0.2 algo.noise_max=0.2"),
+    ],
+)  # fmt: skip
+def test_an_off_policy_key_becomes_its_options(theirs, keys, options):
+    found = migrated(keys, theirs)
+    assert set(options.split()) <= set(found.argv) and not lost(found)
+    assert len(found.argv) == 5 + 1 + len(options.split())
 
 
 CHANGES = [  # algorithm, key, value, options
@@ -223,7 +307,7 @@ def test_offline_configs_count_gradient_steps_and_keep_a_path():
             "batch_size=0: expected a whole number between 1 and",
         ),
         ({}, "PPOlag", "point_goal1", "did you mean 'PPOLag'"),
-        ({}, "SACLag", "point_goal1", "off-policy"),
+        ({}, "CRABS", "point_goal1", "off-policy"),
         ({}, "", "point_goal1", "add --algo"),
         ({}, "CPO", "", "add --env"),
         ({}, "CPO", "SafetyRacecarGoal1-v0", "no counterpart"),

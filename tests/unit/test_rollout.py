@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from toys import Corridor, Ticker
+from toys import Arriving, Corridor, Ticker
 
 from jaxsafe.learn.rollout import collect, init_rollout, memoryless
 
@@ -33,6 +33,9 @@ def test_time_limits_truncate_and_failures_terminate():
     assert not traj.truncated.any()
     _, traj = run(Ticker(episode_length=5), 2, 11)
     np.testing.assert_array_equal(np.flatnonzero(traj.truncated[:, 0]), [4, 9])
+    assert not traj.terminated.any()
+    _, traj = run(Arriving(episode_length=5, lives=(3, 3)), 2, 9)
+    np.testing.assert_array_equal(np.flatnonzero(traj.truncated[:, 0]), [2, 5, 8])
     assert not traj.terminated.any()
 
 

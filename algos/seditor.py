@@ -1,0 +1,426 @@
+"""SEditor: a policy that seeks reward, and one that edits its actions to keep them safe."""
+
+import dataclasses
+from typing import Annotated, Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from jaxsafe.config import (
+    Amount,
+    Bounds,
+    ConfigError,
+    Iterations,
+    Norm,
+    Rate,
+    Share,
+    Units,
+    Weight,
+    config,
+)
+from jaxsafe.learn.acting import Learned
+from jaxsafe.learn.batch import pmean
+from jaxsafe.learn.bill import PriceClockConfig
+from jaxsafe.learn.constraints import (
+    constrained_costs,
+    each,
+    limit,
+    metrics_by_constraint,
+    signal,
+)
+from jaxsafe.learn.critics import cost_values, init_cost_critics, reduced_costs
+from jaxsafe.learn.learner import GradientStep, Learner
+from jaxsafe.learn.off_policy import OffPolicyConfig, off_policy
+from jaxsafe.learn.row import Row
+from jaxsafe.learn.sequences import (
+    SequenceBatch,
+    averaged,
+    drawn_sequences,
+    lambda_returns,
+    no_moments,
+    standard,
+)
+from jaxsafe.learn.steps import Trainable, adam, descend_each, follow
+from jaxsafe.learn.treatments import LagrangianConfig, Treatment, initial_price, lagrangian
+from jaxsafe.nn.beta import beta_mode, beta_policy, beta_sample, init_beta
+from jaxsafe.nn.critics import init_critics, q_values
+from jaxsafe.types import Algorithm, Count, Env, Metrics, PyTree
+
+Positive = Annotated[float, Bounds(1e-6, 1e6)]
+Chance = Annotated[float, Bounds(1e-6, 1)]
+EPS = 1e-7  # of Adam, as in the authors' code
+
+
+@config
+class SEditorConfig(LagrangianConfig, PriceClockConfig, OffPolicyConfig):
+    """SEditor: a safety editor corrects the actions of a policy that only seeks reward.
+
+        a = h(u, v) = clip(u + 2 v, +-1),   proposal u ~ pi(s),   change v ~ mu(s, u)
+        maximise_pi     E[Q_r(s, a) + alpha_1 H(pi)],   mu fixed
+        maximise_mu     E[(-(Q_r(s, u) - Q_r(s, a))+ - lam Q_c(s, a)) / (1 + lam) + alpha_2 H(mu)]
+        minimise_Q      E[sum_i (Q_ri(s, a) - G_r)^2 + (Q_ci(s, a) - G_c)^2],   G: TD(lambda) returns
+        minimise_alpha  log alpha_j (H_j - target_j),   target_j = action size * log(2 min_prob)
+        minimise_lam    (cost_limit - J_c) lam,   lam = softplus(l),  by Adam
+        Q' <- Q' + tau (Q - Q')
+
+    Q_r is the smaller of two critics' values and Q_c the larger, and so are their targets', which take
+    actions that both policies draw anew. Both policies are Beta distributions. While one is trained,
+    the other is fixed. TD(lambda) returns run over replayed sequences of `n_step` + 1 rows. Rewards and
+    costs are normalised when they are replayed. lam moves once every `dual_every` environment steps,
+    and J_c is what an episode has cost since then. The paper allows 5e-4 violations a step. Where a
+    step with a violation costs 1, that is a `cost_limit` of 0.5 for an episode of 1,000 steps.
+
+    Source: Yu, Xu and Zhang (2022), "Towards Safe Reinforcement Learning with a Safety Editor Policy",
+    arXiv:2201.12427; networks, returns and schedules are from the authors' code.
+    Differs from it: the defaults are for a thousand environments. Batches are smaller, observations are
+    normalised, and critics have layer norm. `preset=published` has the authors' settings.
+    """
+
+    # Rows replayed for each environment step. The authors have 51.2.
+    replay_ratio: Amount | Annotated[float, Bounds(1e-6, 1e6)] = 16
+    # Rows of a gradient step, of all devices together: 256 sequences of 8. The authors have 1,024. With
+    # 16 rows replayed for each environment step, there are about as many gradient steps as theirs.
+    batch_size: Amount = 2048
+    # Steps of a replayed sequence. It has a row more: 8, as the authors have.
+    n_step: Iterations = 7
+    # How far TD(lambda) returns reach: 0 is one step. The authors have 0.95.
+    td_lambda: Share = 0.95
+    # Units of the hidden layers of each network, as in the paper.
+    hidden: tuple[Units, ...] = (256, 256, 256)
+    activation: Literal["relu", "tanh"] = "tanh"  # Of the hidden layers, as in the authors' code.
+    # The critics' first weights. fan_in: uniform, as in the authors' code. The policies' are Xavier's.
+    init: Literal["fan_in", "torch", "orthogonal"] = "fan_in"
+    # The undiscounted cost that an episode may have: 5e-4 a step, as in the paper, in 1,000 steps.
+    cost_limit: Weight = 0.5
+    # How the values of two cost critics become one. max is cautious, as in the authors' code.
+    cost_reduce: Literal["mean", "max", "one"] = "max"
+    lam_init: Positive = 1.0  # The price on cost at the start, as in the authors' code.
+    # The highest price. The authors have no bound.
+    lam_max: Annotated[float, Bounds(1e-6, 1e6, inf="no bound")] = float("inf")
+    dual_lr: Rate = (
+        0.01  # Adam's step of l, whatever the size of the violation, as in the authors' code.
+    )
+    # Environment steps between two moves of the price. The authors have 160.
+    dual_every: Annotated[int, Bounds(1, 2**30)] = 1000
+    # The share of the critics that their targets take on at each step, as in the authors' code.
+    tau: Share = 0.005
+    alpha_init: Positive = 1.0  # Both temperatures at first, as in the authors' code.
+    alpha_lr: Rate = 3e-4  # The learning rate of log alpha, by Adam, as in the authors' code.
+    # The proposals' target entropy is that of a uniform density this high, in each dimension, as in
+    # the authors' code.
+    min_prob: Chance = 0.1
+    # The same of the editor. The authors have 0.1 on Safety Gym, and 0.2 in racing.
+    editor_min_prob: Chance = 0.1
+    # The longest gradient of one sample's concentrations, as in the authors' code.
+    concentration_clip: Norm = 0.01
+    # What an edit is charged. hinge: the reward it loses, as in the paper. action: the mean square of
+    # a - u, the paper's SEditor-L2. reward: nothing; the editor earns Q_r(s, a) itself.
+    distance: Literal["hinge", "action", "reward"] = "hinge"
+    # How the change is applied. add: as in the paper. overwrite: a = v, an ablation of the authors.
+    edit: Literal["add", "overwrite"] = "add"
+    # Whether the mean is taken from rewards and costs before they are scaled, as in the authors' code.
+    # Where episodes can fail, a failure is then worth as much as going on at the mean.
+    centre: bool = True
+
+
+# ---- the price on cost -------------------------------------------------------------------------
+
+
+class SoftMultiplier(NamedTuple):
+    """The price lam = softplus(`raw`), float [] or [K], and Adam's state."""
+
+    raw: jax.Array
+    opt_state: PyTree
+
+    @property
+    def lam(self) -> jax.Array:
+        return jax.nn.softplus(self.raw)
+
+
+def softplus_inverse(x: jax.Array) -> jax.Array:
+    return x + jnp.log(-jnp.expm1(-x))
+
+
+def init_soft_multiplier(cfg: Any) -> SoftMultiplier:
+    raw = softplus_inverse(initial_price(cfg))
+    return SoftMultiplier(raw, optax.adam(cfg.dual_lr, eps=EPS).init(raw))
+
+
+def soft_ascent(
+    dual: SoftMultiplier, episode_cost: jax.Array, cfg: Any, iteration: Count
+) -> SoftMultiplier:
+    """One Adam step on the loss (cost_limit - J_c) softplus(l), then lam in [0, lam_max]."""
+    grad = (limit(cfg, constrained_costs(cfg)) - episode_cost) * jax.nn.sigmoid(dual.raw)
+    change, opt_state = optax.adam(cfg.dual_lr, eps=EPS).update(grad, dual.opt_state)
+    raw: Any = optax.apply_updates(dual.raw, change)
+    return SoftMultiplier(jnp.minimum(raw, softplus_inverse(cfg.lam_max)), opt_state)
+
+
+soft_lagrangian = Treatment(
+    init=init_soft_multiplier,
+    update=soft_ascent,
+    advantage=lagrangian.advantage,
+    metrics=lambda dual: {"train/lam": dual.lam},
+    constrained_costs=constrained_costs,
+)
+
+
+# ---- the two policies --------------------------------------------------------------------------
+
+
+class Edited(NamedTuple):
+    """Proposals and what the editor makes of them, float [..., A]; the log probabilities of the
+    proposals and of the changes, float [...]."""
+
+    proposal: jax.Array
+    action: jax.Array
+    log_prob: jax.Array
+    log_prob_change: jax.Array
+
+
+def edit(proposal: jax.Array, change: jax.Array, cfg: Any) -> jax.Array:
+    """h(u, v), float [..., A]. Some v in [-1, 1] makes any action of any proposal."""
+    return jnp.clip(proposal + 2 * change, -1.0, 1.0) if cfg.edit == "add" else change
+
+
+def editor_of(editor: PyTree, obs: jax.Array, proposal: jax.Array, cfg: Any) -> Any:
+    return beta_policy(editor, jnp.concatenate([obs, proposal], -1), cfg)
+
+
+def edited(proposer: PyTree, editor: PyTree, obs: jax.Array, key: jax.Array, cfg: Any) -> Edited:
+    """Both policies' draws for `obs` [..., O]."""
+    proposal_key, change_key = jax.random.split(key)
+    proposal, log_prob = beta_sample(beta_policy(proposer, obs, cfg), proposal_key)
+    change, log_prob_change = beta_sample(editor_of(editor, obs, proposal, cfg), change_key)
+    return Edited(proposal, edit(proposal, change, cfg), log_prob, log_prob_change)
+
+
+def act(learned: Learned, obs: jax.Array, key: jax.Array | None) -> jax.Array:
+    """A draw, or the edited mode of the proposals where `key` is None."""
+    params, cfg = learned.params, learned.config
+    if key is not None:
+        return edited(params["proposer"], params["editor"], obs, key, cfg).action
+    proposal = beta_mode(beta_policy(params["proposer"], obs, cfg))
+    return edit(proposal, beta_mode(editor_of(params["editor"], obs, proposal, cfg)), cfg)
+
+
+# ---- the gradient step -------------------------------------------------------------------------
+
+
+def init_small_critics(key: jax.Array, critics: PyTree, cfg: Any) -> PyTree:
+    """`critics` with last layers in +-0.003."""
+    last = f"Dense_{len(cfg.hidden)}"
+    leaves, structure = jax.tree.flatten(critics["params"][last])
+    keys = jax.random.split(key, len(leaves))
+    small = [
+        jax.random.uniform(k, x.shape, minval=-0.003, maxval=0.003)
+        for k, x in zip(keys, leaves, strict=True)
+    ]
+    return {"params": critics["params"] | {last: jax.tree.unflatten(structure, small)}}
+
+
+def optimisers(cfg: Any, share: jax.Array | float) -> dict[str, optax.GradientTransformation]:
+    policy, critic = (adam(lr * share, cfg, EPS) for lr in (cfg.lr, cfg.critic_lr))
+    temperature = optax.adam(cfg.alpha_lr, eps=EPS)
+    return {
+        "proposer": policy,
+        "editor": policy,
+        "critic_r": critic,
+        "critic_c": critic,
+        "log_alpha": temperature,
+        "log_alpha_editor": temperature,
+    }
+
+
+def reward_value(params: dict[str, PyTree], obs: jax.Array, action: jax.Array, cfg: Any) -> jax.Array:
+    """Q_r, the smaller value, float [...]."""
+    return q_values(params["critic_r"], obs, action, cfg).min(0)
+
+
+def proposer_gain(
+    proposer: PyTree, params: dict[str, PyTree], obs: jax.Array, key: jax.Array, cfg: Any
+) -> tuple[jax.Array, jax.Array]:
+    """What the proposer climbs at `obs` [..., O], float [...], and the log probabilities."""
+    found = edited(proposer, params["editor"], obs, key, cfg)
+    q_r = reward_value(params, obs, found.action, cfg)
+    return q_r - jnp.exp(params["log_alpha"]) * found.log_prob, found.log_prob
+
+
+def editor_gain(
+    editor: PyTree,
+    params: dict[str, PyTree],
+    dual: Any,
+    obs: jax.Array,
+    key: jax.Array,
+    cfg: Any,
+) -> tuple[jax.Array, Edited, jax.Array]:
+    """What the editor climbs at `obs` [..., O], float [...]; the draws; the reward that edits lose."""
+    found = edited(params["proposer"], editor, obs, key, cfg)
+    q_r = reward_value(params, obs, found.action, cfg)
+    lost = jax.nn.relu(reward_value(params, obs, found.proposal, cfg) - q_r)
+    match cfg.distance:
+        case "hinge":
+            worth = -lost
+        case "action":
+            worth = -jnp.square(found.action - found.proposal).mean(-1)
+        case "reward":
+            worth = q_r
+    q_c = reduced_costs(params["critic_c"], obs, found.action, constrained_costs(cfg), cfg)
+    worth = soft_lagrangian.advantage(dual, worth, q_c)
+    return worth - jnp.exp(params["log_alpha_editor"]) * found.log_prob_change, found, lost
+
+
+def seditor_learner(env: Env) -> Learner:
+    size = env.action_size
+
+    def init(key: jax.Array, obs_size: int, action_size: int, cfg: Any) -> Trainable:
+        if cfg.batch_size % (cfg.n_step + 1):
+            raise ConfigError(
+                f"batch_size={cfg.batch_size}: expected a multiple of n_step + 1 = {cfg.n_step + 1}, "
+                "the rows of a sequence"
+            )
+        names = constrained_costs(cfg)
+        keys = jax.random.split(key, 6)
+        critics = {
+            "critic_r": init_critics(keys[2], obs_size, action_size, 2, cfg),
+            "critic_c": init_cost_critics(keys[3], obs_size, action_size, names, cfg),
+        }
+        critics = {
+            name: init_small_critics(key, critics[name], cfg)
+            for name, key in zip(critics, keys[4:], strict=True)
+        }
+        trained = critics | {
+            "proposer": init_beta(keys[0], obs_size, action_size, cfg),
+            "editor": init_beta(keys[1], obs_size + action_size, action_size, cfg),
+            "log_alpha": jnp.log(cfg.alpha_init),
+            "log_alpha_editor": jnp.log(cfg.alpha_init),
+        }
+        rules = optimisers(cfg, 1.0)
+        opt_state: dict[str, Any] = {name: rules[name].init(x) for name, x in trained.items()}
+        opt_state["moments"] = no_moments(1 + max(len(names), 1))
+        return Trainable(trained | {"targets": critics}, opt_state)
+
+    def step(
+        nets: Trainable, batch: SequenceBatch, at: GradientStep, cfg: Any, axis_name: str | None
+    ) -> tuple[Trainable, Metrics]:
+        params, targets = nets.params, nets.params["targets"]
+        rows, names = batch.rows, constrained_costs(cfg)
+        target_key, proposer_key, editor_key = jax.random.split(at.key, 3)
+        devices = 1 if axis_name is None else jax.lax.axis_size(axis_name)
+        # a device's sum over its share is as many times the whole's
+        cfg = dataclasses.replace(cfg, concentration_clip=cfg.concentration_clip * devices)
+
+        def mean(x: jax.Array) -> jax.Array:
+            return (batch.weight * x.mean(0)).sum()  # this device's share
+
+        counted = batch.weight * batch.follows
+        counted /= jnp.maximum(pmean(counted.sum(), axis_name), 1e-6)
+
+        def mean_step(x: jax.Array) -> jax.Array:
+            return (counted * x).sum()
+
+        # rewards and costs
+        charged = signal(env, rows, names)
+        paid = jnp.concatenate([rows.reward[..., None], charged.reshape(*rows.reward.shape, -1)], -1)
+        moments = averaged(nets.opt_state["moments"], paid, batch.weight, axis_name)
+        paid = standard(moments, paid, cfg.centre)
+        reward, cost = paid[..., 0], paid[..., 1:].reshape(charged.shape)
+
+        # targets
+        found = edited(params["proposer"], params["editor"], rows.obs, target_key, cfg)
+        next_q = reward_value(targets, rows.obs, found.action, cfg)
+        next_c = reduced_costs(targets["critic_c"], rows.obs, found.action, names, cfg)
+
+        def returns(discount: jax.Array):
+            def of(reward: jax.Array, value: jax.Array) -> jax.Array:
+                return lambda_returns(batch, reward, value, discount=discount, decay=cfg.td_lambda)
+
+            return of
+
+        y_r = returns(cfg.discount)(reward, next_q)
+        y_c = each(returns(cfg.cost_discount), names)(cost, next_c)
+
+        def loss(own: dict[str, PyTree]) -> tuple[jax.Array, Metrics]:
+            obs, action = rows.obs[:-1], rows.action[:-1]
+            q = q_values(own["critic_r"], obs, action, cfg)
+            q_c = cost_values(own["critic_c"], obs, action, names, cfg)
+            loss_r = mean_step(((q - y_r) ** 2).sum(0))
+            loss_c = each(mean_step, names)(((q_c - y_c) ** 2).sum(0))
+
+            gain, log_prob = proposer_gain(own["proposer"], params, rows.obs, proposer_key, cfg)
+            gain_e, drawn, lost = editor_gain(own["editor"], params, at.dual, rows.obs, editor_key, cfg)
+            sure, sure_e = map(jax.lax.stop_gradient, (log_prob, drawn.log_prob_change))
+            aims = (size * jnp.log(2 * x) for x in (cfg.min_prob, cfg.editor_min_prob))
+            heat, heat_e = (-mean(x + aim) for x, aim in zip((sure, sure_e), aims, strict=True))
+            temperature = own["log_alpha"] * heat + own["log_alpha_editor"] * heat_e
+
+            metrics = {
+                "train/critic_loss": loss_r,
+                "train/critic_loss_c": loss_c,
+                "train/q": mean_step(q.mean(0)),
+                "train/q_c": each(mean_step, names)(q_c.mean(0)),
+                "train/actor_loss": -mean(gain),
+                "train/editor_loss": -mean(gain_e),
+                "train/entropy": -mean(sure),
+                "train/entropy_editor": -mean(sure_e),
+                "train/alpha": jnp.exp(params["log_alpha"]),
+                "train/alpha_editor": jnp.exp(params["log_alpha_editor"]),
+                "train/edit": mean(jnp.abs(drawn.action - drawn.proposal).mean(-1)),
+                "train/edit_loss": mean(lost),
+            }
+            total = loss_r + loss_c.sum() - mean(gain) - mean(gain_e) + temperature
+            return total, jax.lax.stop_gradient(metrics)
+
+        rules = optimisers(cfg, at.remaining if cfg.lr_decay else 1.0)
+        nets, metrics = descend_each(loss, nets, rules, axis_name)
+        nets = nets._replace(opt_state=nets.opt_state | {"moments": moments})
+        return follow(nets, cfg.tau), metrics_by_constraint(metrics, names)
+
+    return Learner(
+        init=init,
+        act=act,
+        step=step,
+        replayed=drawn_sequences,
+    )
+
+
+def make(env: Env, axis_name: str | None = None) -> Algorithm:
+    return off_policy(env, seditor_learner(env), soft_lagrangian, axis_name)
+
+
+# HorizonRobotics/alf @23aca49, examples/seditor_safety_gym_conf.py, without its DEBUG: 32 environments
+# take 5 steps each between two gradient steps of 1,024 sequences.
+PAPER: dict[str, Any] = {
+    "num_envs": 32,
+    "horizon": 5,
+    "learn_every": 5,
+    "stagger": False,
+    "replay_ratio": 51.2,
+    "batch_size": 8192,
+    "replay_size": 1_600_000,
+    "layer_norm": False,
+    "obs_normalize": False,
+    "max_grad_norm": float("inf"),
+    "dual_every": 160,
+}
+# the same for 1,024 environments: 32 gradient steps, and 32 moves of the price, for 5 of their steps
+PARALLEL: dict[str, Any] = PAPER | {"num_envs": 1024, "stagger": True}
+# for a problem of two levers
+LEVER: dict[str, Any] = {
+    "num_envs": 32, "horizon": 8, "learn_every": 2, "batch_size": 64, "replay_ratio": 2,
+    "replay_size": 20_000, "learning_starts": 256, "n_step": 3, "hidden": (32,), "discount": 0.5,
+    "cost_discount": 0.5, "lr": 1e-2, "critic_lr": 1e-2, "tau": 0.05, "alpha_init": 0.1,
+    "alpha_lr": 3e-3, "min_prob": 0.2, "editor_min_prob": 0.2, "lam_init": 0.3, "dual_lr": 0.05,
+    "dual_every": 256,
+}  # fmt: skip
+
+ROWS = {
+    "seditor": Row(
+        SEditorConfig,
+        make,
+        "a policy that seeks reward, and a safety editor of its actions",
+        {"paper": PAPER, "parallel": PARALLEL},
+        lever=LEVER,
+    ),
+}

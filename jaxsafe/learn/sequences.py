@@ -1,0 +1,116 @@
+"""Gradient steps on sequences from a replay: what is drawn, its TD(lambda) returns, its scale."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxsafe.learn.batch import pmean, psum
+from jaxsafe.learn.normalise import network_inputs
+from jaxsafe.learn.replay import Record, Source, draw, sequences
+from jaxsafe.learn.returns import ValuedSteps, gae
+
+
+class SequenceBatch(NamedTuple):
+    """B sequences of T rows from a replay, leaves [T, B, ...].
+
+    weight: float [B], 0 for what must not count. Weights sum to 1 over a device's share, on average
+        over devices.
+    """
+
+    rows: Record
+    weight: jax.Array
+
+    @property
+    def follows(self) -> jax.Array:
+        """Whether row t + 1 is what came of row t, bool [T - 1, B]. It is not at the end of an episode,
+        and where a sequence goes on with the oldest row of the replay after the newest."""
+        return ~(self.rows.last[:-1] | self.rows.first[1:])
+
+
+def drawn_sequences(
+    key: jax.Array, source: Source, cfg: Any, axis_name: str | None
+) -> tuple[SequenceBatch, jax.Array]:
+    """Sequences of `n_step` + 1 rows, `rows` in all, with normalised observations.
+
+    Returns:
+        The sequences, and how many weigh nothing, over all devices, for a number that is not finite.
+    """
+    length = source.n_step + 1
+    index = draw(key, source.ring, source.span, source.rows // length, ahead=0)
+    found = sequences(source.ring, source.span, index, length)
+    floats = [x for x in jax.tree.leaves(found) if jnp.issubdtype(x.dtype, jnp.floating)]
+    finite = jnp.isfinite(sum(x.sum((0, *range(2, x.ndim))) for x in floats))  # [B]
+
+    def kept(x: jax.Array) -> jax.Array:
+        return jnp.where(finite.reshape(1, -1, *(1,) * (x.ndim - 2)), x, jnp.zeros_like(x))
+
+    found = jax.tree.map(kept, found)
+    weight = finite / jnp.maximum(pmean(finite.sum(dtype=jnp.float32), axis_name), 1.0)
+    found = found.replace(obs=network_inputs(source.normaliser, found.obs))
+    return SequenceBatch(found, weight), psum((~finite).sum(), axis_name)
+
+
+def lambda_returns(
+    batch: SequenceBatch,
+    reward: jax.Array,
+    value: jax.Array,
+    *,
+    discount: jax.Array | float,
+    decay: jax.Array | float,
+) -> jax.Array:
+    """TD(lambda) returns of all rows but the last, float [T - 1, B].
+
+        G_t = r_{t+1} + discount ((1 - decay) V_{t+1} + decay G_{t+1})
+
+    where G_{t+1} is V_{t+1} if row t + 1 is the last of its episode or of the sequence, and both are 0
+    if it terminated. What stands where `follows` does not hold means nothing.
+
+    Args:
+        reward, value: float [T, B], of each row; `value` is that of its observation.
+    """
+    ends = jnp.concatenate([~batch.follows[1:], jnp.ones_like(batch.follows[:1])])
+    steps = ValuedSteps(reward[1:], value[:-1], value[1:], batch.rows.terminated[1:], ends)
+    return value[:-1] + gae(steps, discount, decay)
+
+
+class Moments(NamedTuple):
+    """Running means of S signals and of their squares, float [S], and the updates so far, float []."""
+
+    count: jax.Array
+    mean: jax.Array
+    square: jax.Array
+
+
+def no_moments(size: int) -> Moments:
+    return Moments(jnp.float32(0), jnp.zeros(size), jnp.zeros(size))
+
+
+def averaged(
+    past: Moments, x: jax.Array, weight: jax.Array, axis_name: str | None, memory: float = 8
+) -> Moments:
+    """`past` moved towards the means of `x` [..., B, S], whose entries of axis B have `weight`.
+
+    The k-th update, from 0 on, has the rate memory / (memory + k). With 1 that is the mean of all
+    batches; with more, old ones are slowly forgotten.
+    """
+    rate = memory / (memory + past.count)
+
+    def mean(x: jax.Array) -> jax.Array:
+        over_batch = (x * weight[:, None]).sum(-2)
+        return pmean(over_batch.reshape(-1, x.shape[-1]).mean(0), axis_name)
+
+    def moved(old: jax.Array, x: jax.Array) -> jax.Array:
+        return old + rate * (mean(x) - old)
+
+    return Moments(past.count + 1, moved(past.mean, x), moved(past.square, x**2))
+
+
+def standard(
+    moments: Moments, x: jax.Array, centre: bool, least: float = 1e-5, most: float = 10.0
+) -> jax.Array:
+    """`x` [..., S] in standard deviations, from the mean if `centre`, clipped to +-`most`. A standard
+    deviation counts as `least` at least."""
+    variance = jnp.maximum(moments.square - moments.mean**2, 0.0)
+    offset = moments.mean if centre else 0.0
+    return jnp.clip((x - offset) / jnp.maximum(jnp.sqrt(variance), least), -most, most)
