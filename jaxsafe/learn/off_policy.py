@@ -196,7 +196,7 @@ def off_policy(
 ) -> Algorithm:
     """The algorithm that `learner` makes of the loop, with a price on cost that `treatment` moves."""
     policy = policy_by(learner)
-    explore: Any = learner.explore or learner.act
+    explore = learner.explore or learner.act
     priced = treatment is not no_treatment
 
     def init(key: jax.Array, cfg: Any, shared: Shared) -> TrainState:
