@@ -205,7 +205,7 @@ def test_published_figures_stand_below_and_what_lies_beyond_their_spread_is_mark
         ["`ppo_lag`", "-", "30.00"],  # published with another limit; the cost is over ours
     ]
     cost = comparison_tables.results(compared(tmp_path), "cost", read_published(path))
-    assert cost.rows[0][2] == "15.00 [-48.53, 78.53]" and cost.rows[1][2] == "30.00 ± 20.00"
+    assert cost.rows[0][2] == "15.00 [0.00, 78.53]" and cost.rows[1][2] == "30.00 ± 20.00"
 
 
 def test_published_figures_stand_beside_runs_of_the_same_rules_alone(tmp_path):
