@@ -124,9 +124,14 @@ class SafetyGym:
         return cost
 
     @property
+    def substeps(self) -> int:
+        """Physics steps in a step, at most."""
+        return self.config.frameskip_binom_n
+
+    @property
     def step_seconds(self) -> float:
         """Simulated seconds in a step."""
-        return self.scene.model.opt.timestep * self.config.frameskip_binom_n
+        return self.scene.model.opt.timestep * self.substeps
 
     def robot_pose(self, world: World) -> tuple[jax.Array, jax.Array]:
         """Position [3] and rotation [3, 3] (columns are the body's axes) of the robot."""

@@ -93,9 +93,14 @@ class Velocity:
         return self.config.num_steps
 
     @property
+    def substeps(self) -> int:
+        """Physics steps in a step."""
+        return self.config.frame_skip
+
+    @property
     def step_seconds(self) -> float:
         """Simulated seconds in a step."""
-        return self.model.opt.timestep * self.config.frame_skip
+        return self.model.opt.timestep * self.substeps
 
     @property
     def ceiling(self) -> float:

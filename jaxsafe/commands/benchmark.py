@@ -117,7 +117,7 @@ def measure(name: str, num_envs: int, args: argparse.Namespace) -> dict:
         "horizon": horizon,
         "warmup": before * horizon,
         "env_steps_per_s": rate,
-        "physics_steps_per_s": rate * env.config.frameskip_binom_n,
+        "physics_steps_per_s": rate * env.substeps,
         "simulated_s_per_s": rate * env.step_seconds,
         "fastest": num_envs * horizon * args.seeds / min(runs),
         "slowest": num_envs * horizon * args.seeds / max(runs),
