@@ -117,7 +117,7 @@ ROWS = {
         "DDPG with an adaptive price on cost",
         td3.published(sac.LAG, sac.LAG_NAVIGATION),
         omnisafe="DDPGLag",
-        lever=td3.LEVER,
+        lever=td3.LEVER | sac.LEVER_LAG,
     ),
     "ddpg_pid": Row(
         DDPGPIDConfig,
@@ -125,6 +125,6 @@ ROWS = {
         "DDPG with a price on cost from a PID controller",
         td3.published(sac.PID, sac.PID_NAVIGATION),
         omnisafe="DDPGPID",
-        lever=td3.LEVER,
+        lever=td3.LEVER | sac.LEVER_PID,
     ),
 }

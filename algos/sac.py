@@ -180,6 +180,14 @@ LEVER: dict[str, Any] = {
     "learning_starts": 256, "hidden": (32,), "discount": 0.9, "lr": 3e-3, "critic_lr": 3e-3,
     "alpha_init": 0.1, "alpha_lr": 3e-3, "target_entropy": -2.0,
 }  # fmt: skip
+# Its states are all worth the same, so that Q_r has no deviation to measure prices in.
+LEVER_LAG: dict[str, Any] = {
+    "price_unit": "reward", "dual_every": 2560, "dual_lr": 0.015, "lam_init": 1.3,
+}  # fmt: skip
+LEVER_PID: dict[str, Any] = {
+    "price_unit": "reward", "dual_every": 2560, "lam_init": 1.2, "pid_kp": 0.2, "pid_ki": 0.03,
+    "pid_kd": 0.0, "pid_smoothing": 0.8,
+}  # fmt: skip
 
 ROWS = {
     "sac": Row(
@@ -201,7 +209,7 @@ ROWS = {
             "parallel": PARALLEL,
         },
         omnisafe="SACLag",
-        lever=LEVER,
+        lever=LEVER | LEVER_LAG,
     ),
     "sac_pid": Row(
         SACPIDConfig,
@@ -213,6 +221,6 @@ ROWS = {
             "parallel": PARALLEL,
         },
         omnisafe="SACPID",
-        lever=LEVER,
+        lever=LEVER | LEVER_PID,
     ),
 }

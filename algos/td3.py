@@ -227,7 +227,7 @@ ROWS = {
         "TD3 with an adaptive price on cost",
         published(sac.LAG, sac.LAG_NAVIGATION),
         omnisafe="TD3Lag",
-        lever=LEVER,
+        lever=LEVER | sac.LEVER_LAG,
     ),
     "td3_pid": Row(
         TD3PIDConfig,
@@ -235,6 +235,6 @@ ROWS = {
         "TD3 with a price on cost from a PID controller",
         published(sac.PID, sac.PID_NAVIGATION),
         omnisafe="TD3PID",
-        lever=LEVER,
+        lever=LEVER | sac.LEVER_PID,
     ),
 }

@@ -31,6 +31,10 @@ class GradientStep(NamedTuple):
     first_obs: PyTree = ()
 
 
+def by_policy(learned: Learned, obs: jax.Array, key: jax.Array | None) -> jax.Array:
+    raise TypeError("this learner acts by its policy")
+
+
 class Learner(NamedTuple):
     """What a method adds to the loop. Observations are normalised before they come here.
 
@@ -52,7 +56,7 @@ class Learner(NamedTuple):
 
     init: Callable[[jax.Array, int, int, Any], Trainable]
     step: Callable[[Trainable, Any, GradientStep, Any, str | None], tuple[Trainable, Metrics]]
-    act: Callable[[Learned, jax.Array, jax.Array | None], jax.Array] | None = None
+    act: Callable[[Learned, jax.Array, jax.Array | None], jax.Array] = by_policy
     explore: Callable[[Learned, jax.Array, jax.Array], jax.Array] | None = None
     policy: Policy | None = None
     refit: Callable[..., tuple[Trainable, Metrics]] | None = None
@@ -68,7 +72,6 @@ def policy_by(learner: Learner) -> Policy:
     def act(
         learned: Learned, carry: PyTree, obs: jax.Array, key: jax.Array | None
     ) -> tuple[jax.Array, PyTree, dict[str, Any]]:
-        assert learner.act is not None
         inputs = network_inputs(learned.normaliser, obs)
         return learner.act(learned, inputs, key), carry, {}
 

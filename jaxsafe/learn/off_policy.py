@@ -198,7 +198,7 @@ def off_policy(
 ) -> Algorithm:
     """The algorithm that `learner` makes of the loop, with a price on cost that `treatment` moves."""
     policy = policy_by(learner)
-    explore: Any = learner.explore or learner.act
+    explore = learner.explore or learner.act
     replayed = learner.replayed or drawn_transitions
     priced = treatment is not no_treatment
 

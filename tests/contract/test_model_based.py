@@ -103,7 +103,7 @@ def test_published_settings_build(name):
             return (jnp.abs(obs[..., 1]) > self.half_width).astype(jnp.float32)
 
     algo, before = ALGOS[name].make(Seen()), None
-    for settings in reversed(ALGOS[name].published.values()):
+    for settings in reversed([*ALGOS[name].published.values()]):
         cfg = ALGOS[name].config(**settings)
         before = jax.eval_shape(lambda key, cfg=cfg: algo.init(key, cfg, START), jax.random.key(0))
     after, _ = jax.eval_shape(algo.update, before, START)  # of the first
