@@ -311,10 +311,10 @@ def test_a_delayed_policy_and_its_targets_move_at_every_second_step():
         assert jnp.isfinite(metrics["train/actor_loss"]) == due  # a step that is not due has none
 
 
-@pytest.mark.parametrize("delay, count", [(1, 1), (2, 2)])
+@pytest.mark.parametrize("delay, count", [(1, 2), (2, 3)])
 def test_a_delayed_policy_is_computed_where_it_is_due_alone_by_members_too(delay, count):
-    """One cond for the warm-up and one for the delay. Under vmap one with a member axis would be none:
-    it computes both branches."""
+    """During the warm-up one cond takes random actions and one skips learning; the delay has one more.
+    Under vmap one with a member axis would be none: it computes both branches."""
     algo, cfg = ALGOS["td3_lag"].make(Lever()), ALGOS["td3_lag"].config(policy_delay=delay)
     init = jax.vmap(lambda key: algo.init(key, cfg, START))
     ts = jax.eval_shape(lambda: init(jax.random.split(jax.random.key(0), 2)))
