@@ -213,9 +213,9 @@ Drive a lap of a random track. Each new tile of the road pays 1000 / tiles, so t
 little less than 1000: the tiles under the wheels at the start pay nothing. The tasks are SEditor's
 `SafeCarRacing0-v0` and `SafeCarRacing1-v0`. These ids work, too.
 
-They are stand-ins. The original runs on Box2D, whose physics we do not have. Track, rewards, costs and
-sizes are its own; the car is a model with two axles. Returns and costs of the original do not carry
-over.
+They are stand-ins. The original runs on Box2D, whose physics we do not have. Rewards, costs and sizes
+are those of the original. The car and the shapes of tracks are ours, so returns and costs of the
+original do not carry over.
 
 ```sh
 python scripts/train.py env=car_racing1 algo=seditor video=false
@@ -234,6 +234,20 @@ them. The version that learns from pixels comes with vision.
   next touch costs again.
 - An episode ends when all tiles are visited. This is a success, and its value from there on is 0.
 - Beside the road the tyres hold 60% of what they hold on it.
+- Actions are in [-1, 1]: steering, positive to the right; gas and brake, from -1 (none) to 1 (all).
+
+## Observation
+
+| numbers | |
+|---:|---|
+| 4 | angular velocities of the wheels, rad/s: front left, front right, rear left, rear right |
+| 4 | their angles, rad, positive to the left; those of the rear wheels are 0 |
+| 3 | speed, m/s; yaw rate, rad/s; share of the tiles that is left |
+| 24 | centres of the nearest tile and of the 2nd, 4th, ..., 22nd after it: x and y, m |
+| 9 | with obstacles: x, y and half the width, m, of the next three |
+
+The original's agents have the first 11 beside their picture. There wheels can also spin and lock.
+Places are in the car's frame, x to the front and y to the left.
 
 ## The environment
 
@@ -552,7 +566,7 @@ def racing_page() -> str:
     for head, cells in {
         "action": [str(env.action_size) for env in made.values()],
         "observation": [str(env.obs_size) for env in made.values()],
-        "an obstacle on one tile of": [str(env.obstacle_every or "") for env in made.values()],
+        "tiles for each obstacle": [str(env.obstacle_every or "") for env in made.values()],
         "costs": [", ".join(f"`{name}`" for name in env.cost_names) for env in made.values()],
         "seconds of a step": [f"{racing_car.DT:g}"] * len(made),
     }.items():

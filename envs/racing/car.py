@@ -8,8 +8,8 @@
 
 Source: the single-track model with a circle of friction, as in Rajamani (2012), "Vehicle Dynamics and
 Control", chapters 2 and 4. Sizes, mass, inertia, grip, power and the speed of the steering are those
-of Gymnasium's car in Box2D, read in m, kg and s. So the tyres hold 22 g, as a toy's do, and a lap takes
-about as many steps as there.
+of Gymnasium's car in Box2D, read in m, kg and s. So the tyres hold 22 g, as a toy's do, and a lap fits
+into 1000 steps, as there.
 Differs from it: wheels roll without slip along their direction. The axles are at equal distances from
 the centre of mass. A drag limits the speed to 100 m/s.
 """

@@ -10,7 +10,7 @@ It is then drawn towards the circle of its mean radius, until it turns nowhere f
 
 A loop with one radius for each angle closes and cannot cross itself. The checkpoints, the sizes and the
 limit on turning are those of Gymnasium's CarRacing. There a curve is steered from checkpoint to
-checkpoint, and drawn again if it does not close; there tracks have 300 tiles or so, here 200.
+checkpoint, and drawn again if it does not close. Tracks have about 150 to 250 tiles here.
 """
 
 import flax.struct
