@@ -1,9 +1,9 @@
 """The racing tasks: the car against closed forms, the properties of many tracks, rewards and costs at
 known poses, and a lap of a driver written by hand."""
 
-import dataclasses
 import functools
 from collections.abc import Callable
+from dataclasses import fields, replace
 from typing import Any
 
 import jax
@@ -59,7 +59,7 @@ def driven(steps: int, car: Car, steer: Any, gas: Any, brake: Any, grip: Any) ->
 def rolling_at(speed: float, gas: float = 0.0) -> Car:
     """Along x."""
     car = cars.parked(jnp.zeros(2), jnp.zeros(()))
-    return car.replace(velocity=jnp.array([speed, 0.0]), gas=jnp.float32(gas))
+    return replace(car, velocity=jnp.array([speed, 0.0]), gas=jnp.float32(gas))
 
 
 def test_acceleration_and_braking_are_those_of_the_tyres_against_the_drag():
@@ -104,11 +104,11 @@ def test_steering_gas_and_wheels_are_those_of_the_car():
     np.testing.assert_allclose(car.steer[:6], 0.06 * np.arange(1, 7), rtol=1e-5)  # 3 rad/s
     assert car.steer[-1] == pytest.approx(MAX_STEER)
     np.testing.assert_allclose(car.gas, 0.1 * np.arange(1, 9), rtol=1e-5)
-    spun = rolling_at(10.0).replace(spin=jnp.float32(2.0), heading=jnp.float32(np.pi / 2))
+    spun = replace(rolling_at(10.0), spin=jnp.float32(2.0), heading=jnp.float32(np.pi / 2))
     np.testing.assert_allclose(  # front left, front right, rear left, rear right
         wheels(spun), [[-SIDE, AXLE], [SIDE, AXLE], [-SIDE, -AXLE], [SIDE, -AXLE]], atol=1e-6
     )
-    along_y = spun.replace(velocity=jnp.array([0.0, 10.0]))
+    along_y = replace(spun, velocity=jnp.array([0.0, 10.0]))
     expected = (10 + 2.0 * SIDE * np.array([-1, 1, -1, 1])) / cars.WHEEL
     np.testing.assert_allclose(cars.rolling(along_y), expected, rtol=1e-5)
 
@@ -171,12 +171,12 @@ def stadium(level: int) -> State:
     left = HALF_WIDTH / 2 * jnp.where(k == 0, 1.0, -1.0)
     obstacles = Obstacles(10 * (k + 1), left, jnp.where(k < 2, 1.5, -1.0))
     none = jnp.zeros_like(world.visited)
-    return state.replace(physics=world.replace(track=track, obstacles=obstacles, visited=none))
+    return replace(state, physics=replace(world, track=track, obstacles=obstacles, visited=none))
 
 
 def put(state: State, x: float, y: float, speed: float = 0.0) -> State:
-    car = rolling_at(speed).replace(position=jnp.array([x, y], jnp.float32))
-    return state.replace(physics=state.physics.replace(car=car))
+    car = replace(rolling_at(speed), position=jnp.array([x, y], jnp.float32))
+    return replace(state, physics=replace(state.physics, car=car))
 
 
 STILL = jnp.array([0.0, -1.0, 1.0])  # all brake
@@ -194,10 +194,10 @@ def test_a_tile_is_paid_once_and_the_last_one_ends_the_episode():
     between = step(put(again, 6.5 * length, 0.0), STILL)  # the rear wheels on tile 6, the front on 7
     assert between.reward == pytest.approx(2000 / n)
     all_but = jnp.arange(MOST_TILES) < n
-    world = between.physics.replace(visited=all_but.at[9].set(False))
-    done = step(put(state.replace(physics=world), 9 * length, 0.0), STILL)
+    world = replace(between.physics, visited=all_but.at[9].set(False))
+    done = step(put(replace(state, physics=world), 9 * length, 0.0), STILL)
     assert done.terminated and done.info["lap"] == 1 and done.obs[10] == 0 and not done.truncated
-    assert not step(put(state.replace(physics=world), 8 * length, 0.0), STILL).terminated
+    assert not step(put(replace(state, physics=world), 8 * length, 0.0), STILL).terminated
 
 
 def test_leaving_the_road_costs_once_and_only_without_obstacles():
@@ -307,4 +307,4 @@ def test_options_have_bounds():
         envs.make("car_racing1", obstacle_every=21)
     with pytest.raises(ConfigError, match="did you mean 'obstacle_every'"):
         envs.make("car_racing1", obstacles_every=2)
-    assert {f.name for f in dataclasses.fields(envs.CarRacing)} == {"obstacle_every", "num_steps"}
+    assert {f.name for f in fields(envs.CarRacing)} == {"obstacle_every", "num_steps"}
