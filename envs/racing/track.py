@@ -25,7 +25,7 @@ MAX_CURVATURE = 0.31 / TILE  # 1/m: 0.31 rad on a tile, a circle of 11.3 m
 MOST_TILES = 300  # a circle of the largest radius has 269
 BLUR = 0.22  # rad, over which checkpoints are smoothed; ours
 ANGLES = 720  # at which the loop is computed; ours
-SHARES = 33  # that are tried; ours
+SHARES = 17  # that are tried; ours
 
 
 @flax.struct.dataclass
@@ -65,18 +65,19 @@ def loop(alpha: jax.Array, radii: jax.Array) -> jax.Array:
     rho = (weights * radii).sum(1) / weights.sum(1)
     share = jnp.linspace(1.0, 0.0, SHARES)[:, None]
     r = rho.mean() + share * (rho - rho.mean())  # [SHARES, ANGLES]
-    points = r[..., None] * jnp.stack([jnp.cos(theta), jnp.sin(theta)], 1)
-    fits = jnp.abs(curvature(r)).max(1) <= MAX_CURVATURE
-    fits &= lengths(points).sum(1) < MOST_TILES * TILE
-    return points[jnp.argmax(fits)]  # the first that fits; the last is a circle, which does
+    curvature, length = shape(r)
+    fits = (jnp.abs(curvature).max(1) <= MAX_CURVATURE) & (length < MOST_TILES * TILE)
+    chosen = r[jnp.argmax(fits)]  # the first that fits; the last is a circle, which does
+    return chosen[:, None] * jnp.stack([jnp.cos(theta), jnp.sin(theta)], 1)
 
 
-def curvature(r: jax.Array) -> jax.Array:
-    """Of loops with radius r(theta) [..., ANGLES], 1/m; positive where they turn to the left."""
+def shape(r: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Of loops with radius r(theta) [..., n]: curvature (1/m, positive to the left) and length (m)."""
     h = 2 * jnp.pi / r.shape[-1]
     after, before = jnp.roll(r, -1, -1), jnp.roll(r, 1, -1)
     slope, bend = (after - before) / (2 * h), (after - 2 * r + before) / h**2
-    return (r**2 + 2 * slope**2 - r * bend) / (r**2 + slope**2) ** 1.5
+    speed = jnp.sqrt(r**2 + slope**2)  # length of an angle, m/rad
+    return (speed**2 + slope**2 - r * bend) / speed**3, h * speed.sum(-1)
 
 
 def lengths(points: jax.Array) -> jax.Array:

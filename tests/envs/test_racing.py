@@ -18,7 +18,7 @@ from jaxsafe.envs.check import check_env
 from jaxsafe.envs.racing import car as cars
 from jaxsafe.envs.racing.car import AXLE, DRAG, DT, GRIP, MASS, MAX_STEER, SIDE, Car, wheels
 from jaxsafe.envs.racing.task import Obstacles
-from jaxsafe.envs.racing.track import HALF_WIDTH, MAX_CURVATURE, MOST_TILES, TILE, paved
+from jaxsafe.envs.racing.track import HALF_WIDTH, MAX_CURVATURE, MOST_TILES, TILE, paved, shape
 from jaxsafe.types import State
 
 TRACKS = 256
@@ -114,6 +114,14 @@ def test_steering_gas_and_wheels_are_those_of_the_car():
 
 
 # ---- the track ---------------------------------------------------------------------------------
+
+
+def test_a_circle_has_its_curvature_wherever_it_is_seen_from():
+    theta = 2 * np.pi / 720 * np.arange(720)
+    r = 20 * np.cos(theta) + np.sqrt(80**2 - (20 * np.sin(theta)) ** 2)  # its centre at x = 20
+    curvature, length = shape(jnp.asarray(r, jnp.float32))
+    np.testing.assert_allclose(curvature, 1 / 80, rtol=0.02)
+    assert length == pytest.approx(2 * np.pi * 80, rel=1e-4)
 
 
 def test_every_track_closes_turns_gently_and_never_meets_itself():
