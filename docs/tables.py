@@ -43,21 +43,24 @@ NO_OPTION = {  # what OmniSafe does otherwise, and no option of ours brings back
 def omnisafe_algorithms() -> str:
     """Every algorithm of OmniSafe, ticked if it is here, with what it does otherwise."""
     ours = migrate.algorithms()
-    every = [(kind, name) for kind, names in migrate.THEIRS.items() for name in names.split()]
+    kinds = {theirs: migrate.family_of(algos.ALGOS[name]) for theirs, name in ours.items()}
+    kinds |= migrate.MISSING
+    order = [*reversed(migrate.FAMILIES)]
+    every = sorted(kinds, key=lambda theirs: (order.index(kinds[theirs]), theirs.lower()))
     lines = [
         f"{len(ours)} of OmniSafe's {len(every)} algorithms are here, all but "
-        f"{', '.join(migrate.missing())}.",
+        f"{', '.join(migrate.MISSING)}.",
         "",
         "| family | OmniSafe | here | what differs there |",
         "|---|---|---|---|",
     ]
-    for kind, theirs in every:
+    for theirs in every:
         name = ours.get(theirs)
         found = conventions(algos.ALGOS[name].config) if name else []
         differs = ", ".join(f"`{option}`" for c in found for option in c.options)
         differs = "; ".join(part for part in (differs, NO_OPTION.get(theirs)) if part)
         here = f"✓ [`{name}`](../algorithms/{name}.md)" if name else "not yet"
-        lines.append(f"| {kind} | `{theirs}` | {here} | {differs or 'nothing'} |")
+        lines.append(f"| {kinds[theirs]} | `{theirs}` | {here} | {differs or 'nothing'} |")
     return "\n".join(lines)
 
 

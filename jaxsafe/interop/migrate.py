@@ -36,16 +36,7 @@ from jaxsafe.learn.offline import OfflineConfig
 from jaxsafe.learn.row import Row
 from jaxsafe.run.settings import OFFLINE_UPDATES, TrainConfig, algo_options, as_text
 
-THEIRS = {  # all that OmniSafe has, by family
-    "on-policy": (
-        "PolicyGradient NaturalPG TRPO PPO PDO RCPO PPOLag TRPOLag CPPOPID TRPOPID CPO PCPO FOCOPS CUP "
-        "OnCRPO IPO P3O PPOSaute TRPOSaute PPOSimmerPID TRPOSimmerPID PPOEarlyTerminated "
-        "TRPOEarlyTerminated"
-    ),
-    "off-policy": "DDPG TD3 SAC DDPGLag TD3Lag SACLag DDPGPID TD3PID SACPID CRABS",
-    "model-based": "PETS CCEPETS RCEPETS CAPPETS LOOP SafeLOOP",
-    "offline": "VAEBC BCQ BCQLag CRR CCRR COptiDICE",
-}
+MISSING = {"CRABS": "off-policy"}  # OmniSafe's others, by family
 EPISODE = 1000  # steps
 
 
@@ -651,8 +642,8 @@ class Migrated(NamedTuple):
     lines: list[Line]
 
 
-def family_of(row: Row) -> Family:
-    return next(f for f in FAMILIES.values() if issubclass(row.config, f.config))
+def family_of(row: Row) -> str:
+    return next(name for name, family in FAMILIES.items() if issubclass(row.config, family.config))
 
 
 def only_of(key: str) -> Rule:
@@ -680,7 +671,7 @@ def omnisafe(config: dict[str, Any], algo: str = "", env: str = "") -> Migrated:
     name = find_algorithm(algo or values.get("algo"))
     target = find_environment(env or values.get("env_id"))
     row = algos.ALGOS[name]
-    family = family_of(row)
+    family = FAMILIES[family_of(row)]
     preset, target, repeat = set_up(row, target)
     start = {f"algo.{k}": v for k, v in algo_options(row, preset, "omnisafe").items()}
     start |= {"seed": 0, "eval_episodes": TrainConfig.eval_episodes}
@@ -746,16 +737,11 @@ def algorithms() -> dict[str, str]:
     return dict(sorted((row.omnisafe, name) for name, row in algos.ALGOS.items() if row.omnisafe))
 
 
-def missing() -> list[str]:
-    """OmniSafe's algorithms that are not here."""
-    return [name for names in THEIRS.values() for name in names.split() if name not in algorithms()]
-
-
 def find_algorithm(theirs: Any) -> str:
     known = algorithms()
     if not theirs:
         raise ConfigError(f"no algorithm in the file: add --algo, one of {', '.join(known)}")
-    if theirs in missing():
+    if theirs in MISSING:
         raise ConfigError(f"{theirs} is not here yet, so it cannot be migrated")
     if theirs not in known:
         raise ConfigError(f"unknown algorithm {theirs} of OmniSafe{nearest(str(theirs), known)}")
