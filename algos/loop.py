@@ -1,5 +1,6 @@
 """LOOP, which plans with a model and goes on with a critic; and SafeLOOP."""
 
+import math
 from functools import partial
 from typing import Annotated, Any
 
@@ -46,14 +47,15 @@ class LOOPConfig(ModelBasedConfig, sac.SACConfig):
     Source: Sikchi, Zhou and Held (2021), "Learning Off-Policy with Online Planning", arXiv:2008.10066.
     Differs from OmniSafe: there V is Q_1 of the last state and the action before it, the sum has no
     discount, and the actor's plans are one plan of the first model, copied. R is 1000 / H times as
-    large there; `preset=omnisafe_navigation` has a temperature as much larger. SAC's temperature decays
-    to 0 there within some hundred steps, and the actor's loss is of its mean action.
+    large there; `preset=omnisafe_navigation` has a temperature as much larger. In navigation,
+    SAC's temperature decays to 0 there within some hundred steps, and the actor's loss is of its mean
+    action.
     """
 
     # Environments side by side, of all devices together. OmniSafe has 1.
     num_envs: Amount = 64
-    horizon: Amount = 10  # Steps of each environment in an update.
-    # Transitions kept, rounded to whole updates. OmniSafe keeps all of a run.
+    horizon: Amount = 10  # Steps of each environment in an update. Two updates have those of a refit.
+    # Transitions kept, rounded to whole updates. OmniSafe keeps all of a run: 200,000 in navigation.
     replay_size: Annotated[int, Bounds(1, 2**31 - 1)] = 200_000
     # Environment steps with random actions and without learning, of the planner rounded up to whole
     # updates. OmniSafe has 10,000 raw steps.
@@ -64,7 +66,8 @@ class LOOPConfig(ModelBasedConfig, sac.SACConfig):
     # 256.
     model_batch: Amount = 1024
     max_epochs: Iterations = 1  # Epochs that end a refit anyway. OmniSafe has no bound.
-    # Steps of an epoch. 0 is as many as one pass over the data has, as in OmniSafe.
+    # Steps of an epoch. 0 is as many as one pass over the data has, as in OmniSafe. 1000 with 1024
+    # transitions are 5 passes over a full replay.
     epoch_steps: Annotated[int, Bounds(0, 2**24)] = 1000
     plans: Amount = 100  # S, plans that are drawn each time, as in OmniSafe.
     actor_plans: Amount = 1  # What the actor does in each model, so often. OmniSafe has one in all.
@@ -134,17 +137,17 @@ def make(env: Env, axis_name: str | None = None, **scores: Any) -> Algorithm:
 
 # OmniSafe @15603dd, configs/model-based/LOOP.yaml and SafeLOOP.yaml; of navigation with
 # env.wrap.action_repeat=5 and env.observation=coordinates, where 5 raw steps are one step here. SAC's
-# temperature is below 1e-3 there after 530 gradient steps.
+# temperature is below 1e-3 there after 530 gradient steps, but fixed in velocity tasks.
 NETS: dict[str, Any] = {
     "batch_size": 256, "replay_ratio": 256, "tau": 0.005, "layer_norm": False, "obs_normalize": False,
     "alpha_init": 1e-3, "alpha_lr": 0.0,
 }  # fmt: skip
 NAVIGATION: dict[str, Any] = pets.NAVIGATION | NETS | {
-    "horizon": 50, "learn_every": 50, "refit_every": 250, "hidden": (64, 64), "lr": 1e-3,
-    "critic_lr": 1e-3, "temperature": 10 * 1000 / 7,
+    "horizon": 50, "learn_every": 50, "hidden": (64, 64), "lr": 1e-3,
+    "critic_lr": 1e-3, "temperature": 10 * 1000 / 7, "max_grad_norm": math.inf,
 }  # fmt: skip
 VELOCITY: dict[str, Any] = pets.VELOCITY | NETS | {
-    "plan_steps": 3, "policy_delay": 2, "temperature": 1000 / 3,
+    "plan_steps": 3, "policy_delay": 2, "temperature": 1000 / 3, "alpha_init": 0.2,
 }  # fmt: skip
 SAFE: dict[str, Any] = {"cost_limit": 1.0}
 # the actor-critic's settings for a problem of two levers, and the planner's
@@ -159,6 +162,7 @@ ROWS = {
         make,
         "planning with an ensemble of models and a critic, no constraint",
         {"omnisafe_navigation": NAVIGATION, "omnisafe_velocity": VELOCITY},
+        omnisafe="LOOP",
         holds="nothing",
         lever=UNLIMITED,
     ),
@@ -167,6 +171,7 @@ ROWS = {
         partial(make, cost=worst_cost, weigh=by_return_within_limit),
         "LOOP among plans of a low cost in the worst case",
         {"omnisafe_navigation": NAVIGATION | SAFE, "omnisafe_velocity": VELOCITY | SAFE},
+        omnisafe="SafeLOOP",
         lever=LEVER,
     ),
 }

@@ -48,8 +48,8 @@ class PETSConfig(ModelBasedConfig, ReplayConfig):
 
     # Environments side by side, of all devices together. OmniSafe has 1.
     num_envs: Amount = 64
-    horizon: Amount = 10  # Steps of each environment in an update.
-    # Transitions kept, rounded to whole updates. OmniSafe keeps all of a run.
+    horizon: Amount = 10  # Steps of each environment in an update. Two updates have those of a refit.
+    # Transitions kept, rounded to whole updates. OmniSafe keeps all of a run: 200,000 in navigation.
     replay_size: Annotated[int, Bounds(1, 2**31 - 1)] = 200_000
     # Environment steps with random actions before the first fit, rounded up to whole updates. OmniSafe
     # has 10,000 raw steps.
@@ -60,7 +60,8 @@ class PETSConfig(ModelBasedConfig, ReplayConfig):
     # 256.
     model_batch: Amount = 1024
     max_epochs: Iterations = 1  # Epochs that end a refit anyway. OmniSafe has no bound.
-    # Steps of an epoch. 0 is as many as one pass over the data has, as in OmniSafe.
+    # Steps of an epoch. 0 is as many as one pass over the data has, as in OmniSafe. 1000 with 1024
+    # transitions are 5 passes over a full replay.
     epoch_steps: Annotated[int, Bounds(0, 2**24)] = 1000
 
 
@@ -107,14 +108,26 @@ class CAPConfig(PriceClockConfig, PETSConfig):
     Source: Ma et al. (2022), "Conservative and Adaptive Penalty for Model-Based Safe Reinforcement
     Learning", arXiv:2112.07701.
     Differs from OmniSafe: there a plan gets the uncertainty of other plans, because an array is
-    reshaped in the wrong order. J_c is over 50 episodes there.
+    reshaped in the wrong order. J_c is over 50 episodes there. kappa moves 100 times as fast there, and
+    may be 20 times as large.
+
+    A plan without cost is feasible as long as T kappa |sigma| <= cost_limit, with |sigma| the mean of
+    the penalty over its steps. With 30 outputs |sigma| begins at 0.04 or more, because no variance is
+    below e^-10 then. On PointGoal1 it was 2 after a short fit to 2,000 random steps. There T is 200.
+    With OmniSafe's limit of 1 no plan at all is feasible from kappa = 0.0025 on. The planner then takes
+    the plans of the smallest C, whatever they earn. OmniSafe's kappa is 1 after one move from J_c = 50
+    (`preset=published`), and falls by at most 0.1 a move. With a limit of 1, take `kappa_max=0.002`.
     """
 
     # Environment steps between two moves of kappa. OmniSafe has 20,000 raw steps.
     dual_every: Annotated[int, Bounds(1, 2**30)] = 4_000
     kappa_init: Weight = 0.0  # kappa at first, as in OmniSafe.
-    kappa_lr: Weight = 0.1  # The change of kappa for each unit of violation, as in OmniSafe.
-    kappa_max: Weight = 1.0  # The largest kappa, as in OmniSafe.
+    # The change of kappa for each unit of violation. It raises C by T kappa_lr |sigma|, which is 0.4 on
+    # PointGoal1. OmniSafe has 0.1, which raises it by 40.
+    kappa_lr: Weight = 1e-3
+    # The largest kappa. On PointGoal1 plans without cost are feasible up to cost_limit / (T |sigma|) =
+    # 0.0625. OmniSafe has 1, with a limit of 1.
+    kappa_max: Weight = 0.05
 
 
 def move_kappa(kappa: jax.Array, episode_cost: jax.Array, cfg: Any, iteration: Count) -> jax.Array:
@@ -168,6 +181,7 @@ ROWS = {
         make,
         "planning with an ensemble of models, no constraint",
         published({}),
+        omnisafe="PETS",
         holds="nothing",
         lever=LEVER,
     ),
@@ -176,6 +190,7 @@ ROWS = {
         partial(model_based, planner=CCE),
         "planning among plans of a low expected cost",
         published(LIMIT),
+        omnisafe="CCEPETS",
         lever=LEVER,
     ),
     "rce_pets": Row(
@@ -183,13 +198,15 @@ ROWS = {
         partial(model_based, planner=RCE),
         "planning among plans of a low cost in the worst case",
         published(LIMIT),
+        omnisafe="RCEPETS",
         lever=LEVER,
     ),
     "cap_pets": Row(
         CAPConfig,
         partial(model_based, planner=CAP, treatment=caution),
         "planning with a cost that the model's uncertainty raises",
-        published(LIMIT, dual_every=20_000),
+        published(LIMIT | {"kappa_lr": 0.1, "kappa_max": 1.0}, dual_every=20_000),
+        omnisafe="CAPPETS",
         lever=LEVER,
     ),
 }

@@ -22,10 +22,46 @@ def robots(task: str) -> dict[str, SafetyGym]:
     return {name: make(name, engine="c") for name in (f"{robot}_{task}" for robot in ROBOTS)}
 
 
+PRICE = "there the price moves at every gradient step"
+MODEL = "there the last weights of each model stay, not the best"
+LAST = f"{MODEL}; C is of 1000 steps of the planner"
+NO_OPTION = {  # what OmniSafe does otherwise, and no option of ours brings back
+    **dict.fromkeys(("DDPGLag", "TD3Lag", "SACLag", "DDPGPID", "TD3PID", "SACPID"), PRICE),
+    "PETS": MODEL,
+    "CCEPETS": LAST,
+    "RCEPETS": LAST,
+    "CAPPETS": f"{LAST}; a plan gets the uncertainty of other plans",
+    "LOOP": f"{MODEL}; a plan's value is that of the action before its end",
+    "SafeLOOP": f"{LAST}; a plan's value is that of the action before its end",
+    "VAEBC": "there evaluation draws latents",
+    "CCRR": "there the critic of cost learns nothing",
+    "COptiDICE": "there a reward is paired with the values of other transitions",
+    "CRABS": "SAC within a learned barrier, for one task of its own, from a checkpoint to download",
+}
+
+
 def omnisafe_algorithms() -> str:
-    lines = ["| OmniSafe | here |", "|---|---|"]
-    names = migrate.algorithms().items()
-    return "\n".join(lines + [f"| `{theirs}` | `{ours}` |" for theirs, ours in names])
+    """Every algorithm of OmniSafe, ticked if it is here, with what it does otherwise."""
+    ours = migrate.algorithms()
+    kinds = {theirs: migrate.family_of(algos.ALGOS[name]) for theirs, name in ours.items()}
+    kinds |= migrate.MISSING
+    order = [*reversed(migrate.FAMILIES)]
+    every = sorted(kinds, key=lambda theirs: (order.index(kinds[theirs]), theirs.lower()))
+    lines = [
+        f"{len(ours)} of OmniSafe's {len(every)} algorithms are here, all but "
+        f"{', '.join(migrate.MISSING)}.",
+        "",
+        "| family | OmniSafe | here | what differs there |",
+        "|---|---|---|---|",
+    ]
+    for theirs in every:
+        name = ours.get(theirs)
+        found = conventions(algos.ALGOS[name].config) if name else []
+        differs = ", ".join(f"`{option}`" for c in found for option in c.options)
+        differs = "; ".join(part for part in (differs, NO_OPTION.get(theirs)) if part)
+        here = f"✓ [`{name}`](../algorithms/{name}.md)" if name else "not yet"
+        lines.append(f"| {kinds[theirs]} | `{theirs}` | {here} | {differs or 'nothing'} |")
+    return "\n".join(lines)
 
 
 def omnisafe_conventions() -> str:
@@ -46,12 +82,15 @@ def omnisafe_conventions() -> str:
 
 
 def omnisafe_keys() -> str:
-    """What scripts/migrate.py makes of each key of OmniSafe's configs."""
-    lines = ["| OmniSafe | here | |", "|---|---|---|"]
-    offline = {key: rule for key, rule in migrate.OFFLINE.items() if key not in migrate.OMNISAFE}
-    for key, rule in (migrate.OMNISAFE | offline).items():
-        ours = ", ".join(f"`{option}`" for option in rule.ours.split()) or "no option"
-        lines.append(f"| `{key}` | {ours} | {rule.note} |")
+    """What scripts/migrate.py makes of each key of OmniSafe's configs. The other families' rows are the
+    keys with which they do otherwise than the on-policy algorithms, or which those do not have."""
+    lines = ["| algorithms | OmniSafe | here | |", "|---|---|---|---|"]
+    for kind, family in reversed(migrate.FAMILIES.items()):
+        common = {} if family.rules is migrate.OMNISAFE else migrate.OMNISAFE
+        for key, rule in family.rules.items():
+            if rule != common.get(key):
+                ours = ", ".join(f"`{option}`" for option in rule.ours.split()) or "no option"
+                lines.append(f"| {kind} | `{key}` | {ours} | {rule.note} |")
     return "\n".join(lines)
 
 

@@ -32,11 +32,12 @@ PLAIN = (type(None), bool, int, float, str, list, tuple, dict)
 ANY_ENV = "wrap"  # the option that every environment has
 OF_MAKE = ("engine", ANY_ENV)  # options of our environments that are no field of their config
 ALIASES: dict[str, str] = {suite.alias(name): name for name in SUITE}
-ALIASES |= {suite.their_id(name): name for name in suite.circles_and_runs()}
+ALIASES |= {suite.their_id(name): name for name in [*suite.circles_and_runs(), *suite.ruled()]}
 ALIASES |= {alias: name for alias, (name, _) in velocities.aliases().items()}
 ALIASES |= racing.ALIASES
 # options that an alias stands for, beside a name
 IMPLIED: dict[str, dict[str, Any]] = {a: options for a, (_, options) in velocities.aliases().items()}
+IMPLIED |= {suite.their_id(name): {"rules": "safety_gymnasium"} for name in suite.ruled()}
 
 
 def register(name: str, env: Any) -> None:
@@ -79,7 +80,7 @@ def load(address: str) -> None:
 
 
 def canonical(name: str) -> str:
-    """The registered name of an environment given by name or by Safety Gym's id.
+    """The registered name of an environment given by name, or by Safety Gym's or Safety-Gymnasium's id.
 
     Raises:
         ConfigError: no such environment; the message has the nearest name.
@@ -93,19 +94,17 @@ def canonical(name: str) -> str:
             f"{name} is code, which is not imported because a file names it; if you trust it, add "
             f"env={name}"
         )
-    if ours := suite.safety_gymnasium(name):
-        raise ConfigError(f"{name} is env={ours} env.rules=safety_gymnasium")
     raise ConfigError(f"unknown environment {name!r}{nearest(name, [*ENVS, *ALIASES])}")
 
 
 def env_defaults(name: str) -> dict[str, Any]:
     """Every option of an environment as a plain value. `wrap` is a dict: the fields of `WrapConfig`."""
-    entry = ENVS[canonical(name)]
+    entry, implied = ENVS[canonical(name)], IMPLIED.get(name, {})
     wrap = dataclasses.asdict(WrapConfig())
     if isinstance(entry, dict):
-        return {"engine": "auto"} | defaults(**entry) | {ANY_ENV: wrap | entry.get(ANY_ENV, {})}
+        wrap |= entry.get(ANY_ENV, {})
+        return {"engine": "auto"} | defaults(**entry) | implied | {ANY_ENV: wrap}
     if isinstance(entry, VelocityConfig):
-        implied = IMPLIED.get(name, {})
         return {"engine": "auto"} | dataclasses.asdict(entry) | implied | {ANY_ENV: wrap}
     return {p.name: p.default for p in arguments(entry, name)} | {ANY_ENV: wrap}
 
@@ -161,14 +160,14 @@ def planned(env: str | Config, overrides: dict[str, Any]) -> Callable[[], Env]:
         raise ConfigError(f"env={shown(env)}: expected a name, a SafetyGymConfig or a VelocityConfig")
     name, entry = ("custom", env) if isinstance(env, Config) else (canonical(env), ENVS[canonical(env)])
     options = dataclasses.asdict(entry) if isinstance(entry, SafetyGymConfig) else entry
-    given = {k: v for k, v in overrides.items() if k != ANY_ENV}
+    implied = IMPLIED.get(env, {}) if isinstance(env, str) else {}
+    given = implied | {k: v for k, v in overrides.items() if k != ANY_ENV}
     wrap = overrides.get(ANY_ENV, {})
     if isinstance(options, dict):
         wrap = {**options.get(ANY_ENV, {}), **wrap} if isinstance(wrap, dict) else wrap
         plan = safety_gym(name, {k: v for k, v in options.items() if k != ANY_ENV}, given)
     elif isinstance(options, VelocityConfig):
-        implied = IMPLIED.get(env, {}) if isinstance(env, str) else {}
-        plan = velocity_task(name, options, implied | given)
+        plan = velocity_task(name, options, given)
     else:
         plan = registered(name, options, given)
     wrappers = wrap_config(wrap)

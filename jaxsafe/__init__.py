@@ -5,7 +5,7 @@ import os
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from jaxsafe.api import Run, SweepResult, evaluate, make, render, sweep, train
+    from jaxsafe.api import Run, SweepResult, collect, evaluate, make, render, sweep, train
     from jaxsafe.config import ConfigError
 
 __version__ = "0.1.0"
@@ -15,7 +15,17 @@ __version__ = "0.1.0"
 # callbacks at once wait for ever. JAX reads this when it first uses the CPU.
 os.environ.setdefault("PJRT_NPROC", str(max(8, os.cpu_count() or 1)))
 
-__all__ = ["ConfigError", "Run", "SweepResult", "evaluate", "make", "render", "sweep", "train"]
+__all__ = [
+    "ConfigError",
+    "Run",
+    "SweepResult",
+    "collect",
+    "evaluate",
+    "make",
+    "render",
+    "sweep",
+    "train",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -1,4 +1,4 @@
-"""What a notebook or a program of yours imports: train, evaluate, render and sweep, in one line each.
+"""What a notebook or a program of yours imports: train, evaluate, render, sweep and collect.
 
     run = jaxsafe.train("point_goal1", "ppo_lag", cost_limit=10, num_seeds=4, total_steps=1e6)
     print(jaxsafe.evaluate(run))
@@ -9,6 +9,7 @@ loads this module when one of its names is first used.
 """
 
 import functools
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,9 +24,11 @@ from jaxsafe.report import evaluation, film, sweep_summary
 from jaxsafe.report.evaluation import Scores
 from jaxsafe.report.finish import finish
 from jaxsafe.report.group import Group
+from jaxsafe.run import collect as collecting
 from jaxsafe.run import distributed, files, run_folder, session
 from jaxsafe.run import sweep as sweeps
 from jaxsafe.run.choice import asked_for, chosen, full_names
+from jaxsafe.run.collect import Collected, Ingredient
 from jaxsafe.run.devices import use_compilation_cache
 from jaxsafe.run.loggers import Callback
 from jaxsafe.run.plain import to_plain
@@ -41,7 +44,17 @@ from jaxsafe.run.settings import (
 )
 from jaxsafe.types import Env, PyTree
 
-__all__ = ["ConfigError", "Run", "SweepResult", "evaluate", "make", "render", "sweep", "train"]
+__all__ = [
+    "ConfigError",
+    "Run",
+    "SweepResult",
+    "collect",
+    "evaluate",
+    "make",
+    "render",
+    "sweep",
+    "train",
+]
 
 
 def make(env: str | SafetyGymConfig | VelocityConfig, **options: Any) -> Any:
@@ -336,6 +349,44 @@ def sweep(env: Any = None, algo: Any = None, **options: Any) -> SweepResult:
     rows = sweep_summary.rows_of(asked.folder, choice.extras)
     folders = files.runs_in(asked.folder)
     return SweepResult(asked.folder, rows, [Run(folder, env, algo) for folder in folders])
+
+
+def collect(
+    runs: Mapping[Any, float],
+    path: str | Path = "data.hdf5",
+    size: float = 1_000_000,
+    seed: int = 1,
+    sampled: bool = True,
+) -> Collected:
+    """Record whole episodes of trained policies in a data set, scripts/collect.py as a function.
+
+        jaxsafe.collect({ppo: 0.5, ppo_lag: 0.5}, "mixed.hdf5", size=2e5)
+        jaxsafe.train("point_goal1", "bcq_lag", dataset="mixed.hdf5")
+
+    Args:
+        runs: a share of the transitions for each run, or for its folder. All are of the same task.
+        path: the file to write, .hdf5 or .npz.
+        size: transitions in all, rounded up to whole episodes.
+        seed: of the episodes.
+        sampled: whether actions are sampled, or the mean ones.
+
+    Returns:
+        What is in the file: `data`, of which `data.episodes` has returns and costs, and the number of
+        the run and of its policy for each transition.
+
+    Raises:
+        ConfigError: no run folder, no checkpoint yet, runs of different tasks, shares that do not sum
+            to 1, or another kind of file.
+
+    Source: Liu et al. (2023), "Datasets and Benchmarks for Offline Safe Reinforcement Learning",
+        arXiv:2306.09303, for the file's arrays.
+    """
+    out = collecting.data_file(path)
+    size, seed = convert(size, collecting.Size, "size"), convert(seed, Seed, "seed")
+    shares = [convert(share, float, "a share") for share in runs.values()]
+    collecting.check_shares(shares)
+    opened = [(run if isinstance(run, Run) else Run(run))._opened for run in runs]
+    return collecting.write(out, [*map(Ingredient, opened, shares)], size, seed, sampled)
 
 
 def evaluate(run: Run | str | Path, episodes: int = 100, seed: int = 1, setting: int = 0) -> Scores:

@@ -3,7 +3,6 @@
 Source: the authors' package `safety_gym`, `envs/suite.py`. `car_push1` is `Safexp-CarPush1-v0`.
 """
 
-import re
 from typing import Any
 
 Options = dict[str, Any]
@@ -224,8 +223,15 @@ def seditor() -> dict[str, Options]:
     }
 
 
+def ruled() -> list[str]:
+    """The names of tasks that are Safety-Gymnasium's with `rules="safety_gymnasium"`."""
+    tasks = [f"{task}{level}" for task in ("goal", "button", "push") for level in "012"]
+    return [f"{robot}_{task}" for robot in ("point", "car") for task in tasks]
+
+
 def their_id(name: str) -> str:
-    """Safety-Gymnasium's id of a name of `circles_and_runs`: SafetyPointCircle1-v0 of point_circle1."""
+    """Safety-Gymnasium's id of a name of `circles_and_runs` or `ruled`: SafetyPointCircle1-v0 of
+    point_circle1."""
     return f"Safety{''.join(part.capitalize() for part in name.split('_'))}-v0"
 
 
@@ -235,9 +241,3 @@ def alias(name: str) -> str:
     head = "Testing" if task.startswith("grid") else "Safexp"
     task = task.replace("gridwall", "GridWall").capitalize() if task != "gridwall" else "GridWall"
     return f"{head}-{robot.capitalize()}{task}-v0"
-
-
-def safety_gymnasium(name: str) -> str | None:
-    """Our name of Safety-Gymnasium's id, where `rules="safety_gymnasium"` makes our task that one."""
-    found = re.fullmatch(r"Safety(Point|Car)((?:Goal|Button|Push)[012])(?:Gymnasium)?-v0", name)
-    return f"{found[1]}_{found[2]}".lower() if found else None

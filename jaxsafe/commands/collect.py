@@ -5,21 +5,16 @@ import functools
 import sys
 import time
 from pathlib import Path
-from typing import Annotated, Any
-
-import jax
-import numpy as np
+from typing import Any
 
 from jaxsafe.commands.guard import guarded
-from jaxsafe.config import Bounds, ConfigError, Seed, convert, nearest
-from jaxsafe.run import dataset
+from jaxsafe.config import ConfigError, Seed, convert, nearest
 from jaxsafe.run.arguments import fail
-from jaxsafe.run.collect import Ingredient, attributes, collect, shares
+from jaxsafe.run.collect import Ingredient, Size, data_file, shares, write
 from jaxsafe.run.devices import use_compilation_cache
 from jaxsafe.run.interrupts import Interrupts
 from jaxsafe.run.policies import CODE, open_run
 
-Size = Annotated[int, Bounds(1, 10**9)]
 OPTIONS = {"size": 1e6, "out": "data.hdf5", "actions": "sampled", "seed": 1}
 
 EPILOG = f"""\
@@ -65,12 +60,7 @@ def command() -> int:
         runs = [Ingredient(open_run(folder, code), share) for folder, share in recipe]
         begun = time.perf_counter()
         print(f"playing episodes with {size:,} steps ...", file=sys.stderr, flush=True)
-        made = collect(runs, size, seed, sampled)
-        env = runs[0].run.settings.plain()["env"]
-        more = {"run": made.run, "policy": made.policy, "episode": made.data.episodes.number}
-        about = attributes(made, env, sampled)
-        out.parent.mkdir(parents=True, exist_ok=True)
-        dataset.write_dataset(out, jax.tree.map(np.asarray, made.data), more, about)
+        made = write(out, runs, size, seed, sampled)
     episodes = made.data.episodes
     print(
         f"{out}: {len(made.data.reward):,} transitions in {len(episodes.ret):,} episodes, return "
@@ -93,7 +83,4 @@ def settings(given: dict[str, Any]) -> tuple[int, Path, bool, int]:
             raise ConfigError(f"{name}={given[name]}: expected a number") from error
     if given["actions"] not in ("sampled", "mean"):
         raise ConfigError(f"actions={given['actions']}{nearest(given['actions'], ('sampled', 'mean'))}")
-    out = Path(given["out"]).expanduser()
-    if out.suffix not in (".hdf5", ".npz"):
-        raise ConfigError(f"out={out}: expected a name that ends in .hdf5 or .npz")
-    return numbers["size"], out, given["actions"] == "sampled", numbers["seed"]
+    return numbers["size"], data_file(given["out"]), given["actions"] == "sampled", numbers["seed"]

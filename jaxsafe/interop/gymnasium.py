@@ -24,7 +24,6 @@ import numpy as np
 from jaxsafe import envs
 from jaxsafe.config import ConfigError
 from jaxsafe.envs.registry import IMPLIED
-from jaxsafe.envs.safety_gym import suite
 from jaxsafe.envs.view.render import FPS, Renderer
 from jaxsafe.learn.rollout import RolloutState, init_rollout, restart
 from jaxsafe.types import Env, State
@@ -252,8 +251,6 @@ def ids() -> dict[str, dict[str, Any]]:
     for alias, name in envs.ALIASES.items():
         short = alias.removeprefix("Safexp-")
         found[short] = {"env": name, **IMPLIED.get(alias, {})}
-        if suite.safety_gymnasium(f"Safety{short}") == name:
-            found[f"Safety{short}"] = {"env": name, "rules": "safety_gymnasium"}
     return found
 
 

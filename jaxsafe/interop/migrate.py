@@ -15,8 +15,9 @@ Source: the configs of OmniSafe after 0.5.0 (2025), and Safety Gym's Engine.
 import dataclasses
 import json
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import yaml
@@ -27,16 +28,15 @@ from jaxsafe.envs.registry import IMPLIED
 from jaxsafe.envs.safety_gym import suite
 from jaxsafe.envs.safety_gym.config import config_from_plain as read_config
 from jaxsafe.envs.safety_gym.config import defaults
+from jaxsafe.envs.velocity.config import VelocityConfig
 from jaxsafe.learn.bill import PriceClockConfig
+from jaxsafe.learn.model_based import ModelBasedConfig
 from jaxsafe.learn.off_policy import OffPolicyConfig
 from jaxsafe.learn.offline import OfflineConfig
 from jaxsafe.learn.row import Row
 from jaxsafe.run.settings import OFFLINE_UPDATES, TrainConfig, algo_options, as_text
 
-MISSING = {  # OmniSafe's others
-    "off-policy": "CRABS",
-    "model-based": "PETS CAPPETS CCEPETS RCEPETS LOOP SafeLOOP",
-}
+MISSING = {"CRABS": "off-policy"}  # OmniSafe's others, by family
 EPISODE = 1000  # steps
 
 
@@ -44,7 +44,8 @@ class Facts(NamedTuple):
     """What the meaning of a key may depend on."""
 
     values: Mapping[str, Any]  # all keys of the file
-    options: Collection[str]  # of our algorithm: 'algo.epochs', ...
+    options: Mapping[str, Any]  # of our algorithm, with the preset's values: 'algo.epochs', ...
+    repeat: int = 1  # raw steps in a step of the planner
 
     @property
     def trust_region(self) -> bool:
@@ -120,7 +121,7 @@ def budget(value: Any, facts: Facts) -> dict[str, Any]:
     return {"algo.budget_init": convert(value, float, "algo_cfgs.safety_budget") / upper}
 
 
-DEFAULTS = "preset=published compat=omnisafe"  # OmniSafe's settings, and its conventions
+REPEAT = "env.wrap.action_repeat"
 NETWORK = "one option for policy and critics"
 OMNISAFE: dict[str, Rule] = {  # later keys win
     "algo": Rule("algo", "see the names"),
@@ -395,10 +396,230 @@ OFF_POLICY: dict[str, Rule] = OMNISAFE | {  # of its off-policy algorithms; what
     ),
     "lagrange_cfgs.pid_ki": Rule("algo.pid_ki", "at each gradient step there", per_move("algo.pid_ki")),
 }
-ONLY_OFFLINE = Rule("", "a key of offline algorithms")
-ONLY_OFF_POLICY = Rule("", "a key of off-policy algorithms")
 
-KNOWN = OFFLINE | OFF_POLICY
+
+def planner_steps(option: str) -> Translate:
+    """Of what OmniSafe counts in raw steps, and we in steps of the planner."""
+
+    def turn(value: Any, facts: Facts) -> dict[str, Any]:
+        steps = round(convert(value, int, option) / facts.repeat)
+        return {option: steps} if option in facts.options else {}
+
+    return turn
+
+
+def if_there(names: str) -> Translate:
+    """For a key that OmniSafe's algorithm does not read, where ours lacks the option."""
+    return lambda value, facts: {k: value for k in names.split() if k in facts.options}
+
+
+def ensemble(names: str) -> Translate:
+    """Of num_ensemble and num_particles. PETS and its kin share the particles among the models, in LOOP
+    each model has as many."""
+
+    def turn(value: Any, facts: Facts) -> dict[str, Any] | None:
+        models = facts.whole("dynamics_cfgs.num_ensemble", 5)
+        each = facts.options["algo.particles"]
+        if LOOPS in facts.options:
+            each = facts.whole("planner_cfgs.num_particles", each)
+        else:
+            total = facts.whole("planner_cfgs.num_particles", 5 * each)
+            if total % models:
+                return None
+            each = total // models
+        both = {"algo.models": models, "algo.particles": each}
+        return {k: v for k, v in both.items() if k in names.split()}
+
+    return turn
+
+
+def plan(names: str) -> Translate:
+    """Of plan_horizon, H, and temperature, which weighs a return that is 1000 / H as large there."""
+
+    def turn(value: Any, facts: Facts) -> dict[str, Any]:
+        steps = facts.whole("planner_cfgs.plan_horizon", facts.options["algo.plan_steps"])
+        found = {"algo.plan_steps": steps}
+        if LOOPS in facts.options:
+            preset = facts.options["algo.temperature"] * facts.options["algo.plan_steps"] / 1000
+            asked = facts.values.get("planner_cfgs.temperature", round(preset, 9))
+            found["algo.temperature"] = convert(asked, float, "planner_cfgs.temperature") * 1000 / steps
+        return {k: v for k, v in found.items() if k in names.split()}
+
+    return turn
+
+
+def actor_plans(value: Any, facts: Facts) -> dict[str, Any]:
+    share = convert(value, float, "planner_cfgs.mixture_coefficient")
+    plans, models = (
+        facts.whole("planner_cfgs.num_samples", 100),
+        facts.whole("dynamics_cfgs.num_ensemble", 5),
+    )
+    return {"algo.actor_plans": max(1, round(share * plans / models))}
+
+
+def beside(value: Any, facts: Facts) -> dict[str, Any] | None:
+    """Of LOOP's update_policy_cycle, update_policy_iters and policy_batch_size."""
+    every = max(1, facts.whole("algo_cfgs.update_policy_cycle", 250) // facts.repeat)
+    batch = facts.whole("algo_cfgs.policy_batch_size", 256)
+    replayed = facts.whole("algo_cfgs.update_policy_iters", 50) * batch
+    if replayed % every:
+        return None
+    return {
+        "algo.learn_every": every,
+        "algo.horizon": every * max(1, round(UPDATE / every)),
+        "algo.replay_ratio": replayed // every,
+        "algo.batch_size": batch,
+    }
+
+
+def cooling(value: Any, facts: Facts) -> dict[str, Any]:
+    """LOOP's temperature. Multiplied by alpha_gamma at each gradient step it is soon next to 0."""
+    falls = facts.values.get("algo_cfgs.alpha_discount", facts.options["algo.alpha_init"] == COLD)
+    fixed = convert(facts.values.get("algo_cfgs.alpha", 0.2), float, "algo_cfgs.alpha")
+    return {"algo.alpha_init": COLD if falls else fixed}
+
+
+LOOPS = "algo.actor_plans"  # an option of LOOP and its kin alone
+UPDATE = 40  # steps of the planner in an update of the presets
+COLD = 1e-3  # what a temperature that falls is in the presets of LOOP
+POLICY = "algo.learn_every algo.horizon algo.replay_ratio algo.batch_size"
+DECIDES = "the algorithm decides"
+MODEL_BASED: dict[str, Rule] = OMNISAFE | {  # of its model-based algorithms; what differs
+    **{
+        key: OFF_POLICY[key]
+        for key in (
+            "algo_cfgs.policy_delay",
+            "algo_cfgs.polyak",
+            "algo_cfgs.reward_normalize",
+            "algo_cfgs.use_critic_norm",
+            "model_cfgs.actor_type",
+            "model_cfgs.critic.num_critics",
+            "model_cfgs.linear_lr_decay",
+            "model_cfgs.actor.lr",
+        )
+    },
+    "train_cfgs.vector_env_nums": Rule("num_envs"),
+    "algo_cfgs.action_repeat": Rule(
+        "env.wrap.action_repeat", "a step of the planner; all settings of the algorithm count these"
+    ),
+    "algo_cfgs.steps_per_epoch": Rule(
+        "algo.dual_every",
+        "of CAP-PETS, whose kappa moves once an epoch",
+        planner_steps("algo.dual_every"),
+    ),
+    "algo_cfgs.update_dynamics_cycle": Rule(
+        "algo.refit_every", "in steps of the planner", planner_steps("algo.refit_every")
+    ),
+    "algo_cfgs.start_learning_steps": Rule(
+        "algo.learning_starts", "in steps of the planner", planner_steps("algo.learning_starts")
+    ),
+    "algo_cfgs.cost_limit": Rule(
+        "algo.cost_limit", "of an episode; of 1000 steps of the planner there"
+    ),
+    "algo_cfgs.cost_normalize": Rule("", "costs are as they are", same=(False,)),
+    "algo_cfgs.obs_normalize": Rule("", "the model scales its inputs", same=(False,)),
+    "algo_cfgs.policy_store_done": Rule("", "ends are always kept", same=None),
+    "algo_cfgs.policy_batch_size": Rule(POLICY, "", beside),
+    "algo_cfgs.update_policy_cycle": Rule(POLICY, "in steps of the planner", beside),
+    "algo_cfgs.update_policy_iters": Rule(POLICY, "gradient steps of a round", beside),
+    "algo_cfgs.use_grad_norm": Rule(
+        "algo.max_grad_norm", "false is inf", unless_on("algo.max_grad_norm", math.inf)
+    ),
+    "algo_cfgs.critic_norm_coeff": Rule("", "only read with use_critic_norm", same=None),
+    "algo_cfgs.alpha": Rule("algo.alpha_init", "with alpha_discount 0.001", cooling),
+    "algo_cfgs.alpha_discount": Rule("algo.alpha_init", "true is 0.001", cooling),
+    "algo_cfgs.alpha_gamma": Rule("", "the temperature is low from the beginning", same=None),
+    "algo_cfgs.auto_alpha": Rule("", "OmniSafe does not read it", same=None),
+    "algo_cfgs.loss_pi_deterministic": Rule(
+        "", "the actor's loss is of an action that is drawn", same=(False,)
+    ),
+    "dynamics_cfgs.num_ensemble": Rule(
+        "algo.models algo.particles", "", ensemble("algo.models algo.particles")
+    ),
+    "dynamics_cfgs.elite_size": Rule("", "it only changes plots of OmniSafe's evaluation", same=None),
+    "dynamics_cfgs.hidden_size": Rule(
+        "algo.model_hidden", "of four layers", lambda value, facts: {"algo.model_hidden": (value,) * 4}
+    ),
+    "dynamics_cfgs.use_decay": Rule(
+        "algo.weight_decay", "false is 0", unless_on("algo.weight_decay", 0.0)
+    ),
+    "dynamics_cfgs.predict_reward": Rule("", "the model always predicts the reward", same=(True,)),
+    "dynamics_cfgs.predict_cost": Rule(
+        "algo.learn_cost",
+        "false only where the observation tells the cost",
+        lambda on, facts: {"algo.learn_cost": True} if on else {},
+    ),
+    "dynamics_cfgs.batch_size": Rule("algo.model_batch"),
+    "dynamics_cfgs.max_epoch": Rule("", "OmniSafe does not read it", same=None),
+    "dynamics_cfgs.reward_size": Rule("", "there is one", same=(1,)),
+    "dynamics_cfgs.cost_size": Rule("", "there is one", same=(1,)),
+    "dynamics_cfgs.use_cost": Rule("", DECIDES, same=None),
+    "dynamics_cfgs.use_terminal": Rule("", "the model foresees no end", same=(False,)),
+    "dynamics_cfgs.use_var": Rule("", DECIDES, same=None),
+    "dynamics_cfgs.use_reward_critic": Rule("", DECIDES, same=None),
+    "dynamics_cfgs.use_cost_critic": Rule("", "there is none in a plan", same=(False,)),
+    "planner_cfgs.plan_horizon": Rule(
+        "algo.plan_steps algo.temperature", "", plan("algo.plan_steps algo.temperature")
+    ),
+    "planner_cfgs.num_iterations": Rule("algo.cem_iterations"),
+    "planner_cfgs.num_particles": Rule(
+        "algo.particles", "of each model; of PETS and its kin in all there", ensemble("algo.particles")
+    ),
+    "planner_cfgs.num_samples": Rule("algo.plans"),
+    "planner_cfgs.num_elites": Rule("algo.elites", "LOOP does not read it", if_there("algo.elites")),
+    "planner_cfgs.mixture_coefficient": Rule("algo.actor_plans", "plans of each model", actor_plans),
+    "planner_cfgs.temperature": Rule("algo.temperature", "times 1000 / H", plan("algo.temperature")),
+    "planner_cfgs.cost_temperature": Rule("algo.cost_temperature"),
+    "planner_cfgs.momentum": Rule(
+        "algo.mean_momentum algo.var_momentum",
+        "of SafeLOOP for the variance alone",
+        lambda value, facts: (
+            {"algo.var_momentum": value}
+            if "algo.cost_temperature" in facts.options
+            else {"algo.mean_momentum": value, "algo.var_momentum": value}
+        ),
+    ),
+    "planner_cfgs.epsilon": Rule(
+        "algo.var_stop",
+        "only LOOP and SafeLOOP read it",
+        lambda value, facts: {"algo.var_stop": value} if LOOPS in facts.options else {},
+    ),
+    "planner_cfgs.init_var": Rule("algo.plan_var"),
+    **{
+        key: Rule("", "OmniSafe does not read it there", same=None)
+        for key in (
+            "algo_cfgs.plan_horizon",
+            "algo_cfgs.init_var",
+            "algo_cfgs.temperature",
+            "planner_cfgs.alpha",
+        )
+    },
+    "evaluation_cfgs.eval_cycle": Rule("eval_every"),
+    "evaluation_cfgs.num_episode": Rule("eval_episodes"),
+    "evaluation_cfgs.use_eval": Rule("eval_every", "false is 0", unless_on("eval_every", 0)),
+    "logger_cfgs.window_lens": Rule("", "kappa sees all episodes since it last moved", same=None),
+    "lagrange_cfgs.lagrangian_multiplier_init": Rule("algo.kappa_init"),
+    "lagrange_cfgs.lambda_lr": Rule("algo.kappa_lr"),
+    "lagrange_cfgs.lambda_optimizer": Rule("", "always plain gradient steps", same=("SGD",)),
+    "lagrange_cfgs.lagrangian_upper_bound": Rule("algo.kappa_max"),
+}
+
+
+class Family(NamedTuple):
+    """config: what our configs of the family are. defaults: OmniSafe's that are not in the preset."""
+
+    config: type
+    rules: dict[str, Rule]
+    defaults: Mapping[str, Any] = MappingProxyType({})
+
+
+FAMILIES = {  # the first that an algorithm's config is one of
+    "model-based": Family(ModelBasedConfig, MODEL_BASED, {"total_steps": 1_000_000}),
+    "offline": Family(OfflineConfig, OFFLINE, {"total_updates": 1_000_000, "eval_episodes": 10}),
+    "off-policy": Family(OffPolicyConfig, OFF_POLICY, {"total_steps": 1_000_000}),
+    "on-policy": Family(object, OMNISAFE),
+}
+KNOWN = OFFLINE | OFF_POLICY | MODEL_BASED
 # Options that Engine does not have.
 OURS_ALONE = (
     "rules", "observation", "awake", "contact_room", "bounds_num", "bounds", "bounds_cost",
@@ -421,18 +642,14 @@ class Migrated(NamedTuple):
     lines: list[Line]
 
 
-def rules_of(row: Row) -> dict[str, Rule]:
-    """Of the row's family."""
-    if issubclass(row.config, OfflineConfig):
-        return OFFLINE
-    return OFF_POLICY if issubclass(row.config, OffPolicyConfig) else OMNISAFE
+def family_of(row: Row) -> str:
+    return next(name for name, family in FAMILIES.items() if issubclass(row.config, family.config))
 
 
-def defaults_of(row: Row) -> dict[str, Any]:
-    """OmniSafe's, where they are not in the preset."""
-    if issubclass(row.config, OfflineConfig):
-        return {"total_updates": 1_000_000, "eval_episodes": 10}
-    return {"total_steps": 1_000_000} if issubclass(row.config, OffPolicyConfig) else {}
+def only_of(key: str) -> Rule:
+    """For a key of another family's algorithms."""
+    families = [name for name, family in FAMILIES.items() if key in family.rules]
+    return Rule("", f"a key of {' and '.join(families)} algorithms")
 
 
 def omnisafe(config: dict[str, Any], algo: str = "", env: str = "") -> Migrated:
@@ -454,27 +671,24 @@ def omnisafe(config: dict[str, Any], algo: str = "", env: str = "") -> Migrated:
     name = find_algorithm(algo or values.get("algo"))
     target = find_environment(env or values.get("env_id"))
     row = algos.ALGOS[name]
-    preset = algo_options(row, "published", "omnisafe")
-    start = {f"algo.{k}": v for k, v in preset.items()}
-    offline = issubclass(row.config, OfflineConfig)
-    rules, found = rules_of(row), defaults_of(row)
-    ours = {
-        "total_updates": OFFLINE_UPDATES,
-        "eval_episodes": TrainConfig.eval_episodes,
-        "dataset": None,
-    }
-    of_steps = {
-        "num_envs": preset.get("num_envs"),
-        "total_steps": 10_000_000,
-        "eval_episodes": TrainConfig.eval_episodes,
-    }
-    start |= {"seed": 0, **(ours if offline else of_steps)}
-    facts = Facts(values, start)
-    lines = [Line("algo", algo or values.get("algo"), f"algo={name} {DEFAULTS}")]
+    family = FAMILIES[family_of(row)]
+    preset, target, repeat = set_up(row, target)
+    start = {f"algo.{k}": v for k, v in algo_options(row, preset, "omnisafe").items()}
+    start |= {"seed": 0, "eval_episodes": TrainConfig.eval_episodes}
+    if family.config is OfflineConfig:
+        start |= {"total_updates": OFFLINE_UPDATES, "dataset": None}
+    else:
+        start |= {"num_envs": start["algo.num_envs"], "total_steps": TrainConfig.total_steps}
+    found = {**family.defaults}
+    if family.config is ModelBasedConfig:
+        start |= {"eval_every": 0, REPEAT: 1}
+        found[REPEAT] = repeat = convert(values.get("algo_cfgs.action_repeat", repeat), Amount, REPEAT)
+    facts = Facts(values, start, repeat)
+    defaults = f"preset={preset} compat=omnisafe"
+    lines = [Line("algo", algo or values.get("algo"), f"algo={name} {defaults}")]
     lines.append(Line("env_id", env or values.get("env_id"), " ".join(target)))
     for key in [k for k in KNOWN if k in values and k not in ("algo", "env_id")]:
-        other = ONLY_OFFLINE if key in OFFLINE else ONLY_OFF_POLICY
-        rule, value = rules.get(key, other), values[key]
+        rule, value = family.rules.get(key) or only_of(key), values[key]
         if not rule.ours:
             lost = rule.same is not None and value not in rule.same
             lines.append(Line(key, value, rule.note, lost))
@@ -499,7 +713,23 @@ def omnisafe(config: dict[str, Any], algo: str = "", env: str = "") -> Migrated:
         kind = str if key == "dataset" else int
         found[key] = getattr(checked, key[5:]) if key.startswith("algo.") else convert(value, kind, key)
     changed = [as_option(k, v) for k, v in found.items() if v != start[k]]
-    return Migrated([*target, f"algo={name}", *DEFAULTS.split(), *changed], lines)
+    return Migrated([*target, f"algo={name}", *defaults.split(), *changed], lines)
+
+
+def set_up(row: Row, target: list[str]) -> tuple[str, list[str], int]:
+    """The preset, all options of the environment, and OmniSafe's raw steps in a step.
+
+    Raises:
+        ConfigError: OmniSafe's planners do not take the environment.
+    """
+    if not issubclass(row.config, ModelBasedConfig):
+        return "published", target, 1
+    task = target[0].removeprefix("env=")
+    if isinstance(envs.ENVS[task], VelocityConfig):
+        return "omnisafe_velocity", target, 1
+    if "_goal" not in task:
+        raise ConfigError(f"{target[0]}: OmniSafe plans in Goal and in the velocity tasks alone")
+    return "published", [*target, "env.observation=coordinates"], 5
 
 
 def algorithms() -> dict[str, str]:
@@ -511,9 +741,8 @@ def find_algorithm(theirs: Any) -> str:
     known = algorithms()
     if not theirs:
         raise ConfigError(f"no algorithm in the file: add --algo, one of {', '.join(known)}")
-    for kind, names in MISSING.items():
-        if theirs in names.split():
-            raise ConfigError(f"{theirs} cannot be migrated yet: it is {kind}")
+    if theirs in MISSING:
+        raise ConfigError(f"{theirs} is not here yet, so it cannot be migrated")
     if theirs not in known:
         raise ConfigError(f"unknown algorithm {theirs} of OmniSafe{nearest(str(theirs), known)}")
     return known[theirs]
@@ -523,8 +752,7 @@ def find_environment(theirs: Any) -> list[str]:
     """Options for the environment that OmniSafe calls `theirs`, or that is called so here."""
     if not theirs:
         raise ConfigError("no env_id in the file: add --env, as in --env SafetyPointGoal1-v0")
-    if ours := suite.safety_gymnasium(theirs):
-        return [f"env={ours}", "env.rules=safety_gymnasium"]
+    theirs = theirs.removesuffix("-modelbased")  # of the tasks of its planners
     if (alias := theirs.replace("Gymnasium-", "-")) in envs.ALIASES:
         implied = (as_option(f"env.{k}", v) for k, v in IMPLIED.get(alias, {}).items())
         return [f"env={envs.canonical(alias)}", *implied]

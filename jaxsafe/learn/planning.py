@@ -14,6 +14,8 @@ Source: Chua et al. (2018), "Deep Reinforcement Learning in a Handful of Trials 
 Differs from it: there and in OmniSafe the variance of n elites is divided by n - 1.
 """
 
+import itertools
+import math
 from collections.abc import Callable
 from typing import Annotated, Any, NamedTuple
 
@@ -228,6 +230,17 @@ def cem(
 
     start = Belief(mean, jnp.full(mean.shape, cfg.plan_var))
     return jax.lax.scan(improve, start, jax.random.split(key, cfg.cem_iterations))[0].mean
+
+
+def planning_bytes(env: Env, cfg: Any) -> int:
+    """The least that planning for one environment holds at once: what is kept of each step of all
+    courses of events, and two neighbouring layers of the networks that predict one step of them."""
+    model = simulator(env) if cfg.true_model else learned_model(env)
+    courses = cfg.plans * math.prod(model.particles(cfg))
+    outputs = 2 * (1 + cfg.learn_cost + env.obs_size)  # means and variances
+    layers = (env.obs_size + env.action_size, *cfg.model_hidden, outputs)
+    network = 0 if cfg.true_model else max(a + b for a, b in itertools.pairwise(layers))
+    return 4 * courses * (3 * cfg.plan_steps + env.obs_size + network)
 
 
 def planning_policy(env: Env, planner: Planner) -> Policy:

@@ -4,21 +4,22 @@ import json
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import jaxsafe
-from jaxsafe.config import ConfigError, flat
+from jaxsafe.config import Bounds, ConfigError, flat
 from jaxsafe.learn.acting import Player, Playing
 from jaxsafe.learn.offline import DataSet, data_set
-from jaxsafe.run import run_folder
+from jaxsafe.run import dataset, run_folder
 from jaxsafe.run.policies import RunPolicies
 from jaxsafe.types import PyTree
 
 AT_ONCE = 1000  # episodes that one call of the compiled program plays, at most
+Size = Annotated[int, Bounds(1, 10**9)]  # transitions
 
 
 class Ingredient(NamedTuple):
@@ -62,6 +63,26 @@ def shares(texts: Sequence[str]) -> list[tuple[Path, float]]:
     if rest > 1 or (rest and given >= 1) or (not rest and abs(given - 1) > 1e-6):
         raise ConfigError(f"the shares sum to {given:g}; expected 1, or one run without a share")
     return [(folder, 1 - given if share is None else share) for folder, share in found]
+
+
+def check_shares(given: Sequence[float]) -> None:
+    """Raise ConfigError unless these are shares of one whole."""
+    if not all(0 < share <= 1 for share in given) or abs(sum(given) - 1) > 1e-6:
+        raise ConfigError(
+            f"shares {', '.join(f'{x:g}' for x in given)}: expected numbers that sum to 1"
+        )
+
+
+def data_file(path: str | Path) -> Path:
+    """The path, of a file that can be written.
+
+    Raises:
+        ConfigError: another kind of file.
+    """
+    out = Path(path).expanduser()
+    if out.suffix not in (".hdf5", ".npz"):
+        raise ConfigError(f"out={out}: expected a name that ends in .hdf5 or .npz")
+    return out
 
 
 def check_same_task(runs: Sequence[RunPolicies]) -> None:
@@ -179,6 +200,19 @@ def collect(
     names = ingredients[0].run.env.cost_names
     data = data_set(**whole, costs={name: costs[:, k] for k, name in enumerate(names)})
     return Collected(data, run, policy, {"runs": recipe, "seed": seed, "size": size})
+
+
+def write(
+    out: Path, ingredients: Sequence[Ingredient], size: int, seed: int = 0, sampled: bool = True
+) -> Collected:
+    """As `collect`, and the file `out` of it, with what it was made of."""
+    made = collect(ingredients, size, seed, sampled)
+    env = ingredients[0].run.settings.plain()["env"]
+    more = {"run": made.run, "policy": made.policy, "episode": made.data.episodes.number}
+    out.parent.mkdir(parents=True, exist_ok=True)
+    data = jax.tree.map(np.asarray, made.data)
+    dataset.write_dataset(out, data, more, attributes(made, env, sampled))
+    return made
 
 
 def arrays(steps: Steps) -> dict[str, Any]:

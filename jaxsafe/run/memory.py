@@ -7,6 +7,8 @@ from typing import Any
 import jax
 
 from jaxsafe.config import ConfigError
+from jaxsafe.learn.model_based import ModelBasedConfig
+from jaxsafe.learn.planning import planning_bytes
 from jaxsafe.run import checkpoint, programs
 from jaxsafe.run.programs import Program
 from jaxsafe.run.settings import Settings, TrainConfig
@@ -34,7 +36,23 @@ def check_memory(env: Env, settings: Settings) -> None:
             f"{steps:,} environment steps an update x {members} seeds needs at least "
             f"{need / 2**30:,.1f} GiB a device, {what} has {limit / 2**30:,.1f}; use fewer num_envs"
         )
+    if isinstance(settings.algo, ModelBasedConfig):
+        check_plans(env, settings, members)
     check_episodes(env, settings.train.eval_episodes, members)
+
+
+def check_plans(env: Env, settings: Settings, members: int) -> None:
+    """Refuse plans that cannot fit the device, for the environments of training or, if they are more,
+    for the episodes of an evaluation."""
+    limit, what = device_memory()
+    train = settings.train
+    worlds = members * max(settings.algo.num_envs // train.devices, train.eval_episodes)
+    need = worlds * planning_bytes(env, settings.algo)
+    if need > limit:
+        raise TooLarge(
+            f"planning in {worlds:,} environments at once needs at least {need / 2**30:,.1f} GiB a "
+            f"device, {what} has {limit / 2**30:,.1f}; use fewer num_envs, eval_episodes or algo.plans"
+        )
 
 
 def check_episodes(env: Env, episodes: int, policies: int) -> None:

@@ -3,7 +3,10 @@
 import numpy as np
 import pytest
 from shell import TOY, assert_same_run, start, typed, wait_for
+from toys import Corridor
 
+from jaxsafe.algos import ALGOS
+from jaxsafe.learn.planning import planning_bytes
 from jaxsafe.run import checkpoint, memory, run_folder
 from jaxsafe.run.run_folder import read_metrics
 
@@ -84,3 +87,17 @@ def test_what_cannot_work_is_one_line(tmp_path, capsys, monkeypatch, options, me
     assert typed("train", *SAC, f"run_dir={tmp_path / 'run'}", *options) == 2
     said = capsys.readouterr()
     assert message in said.out + said.err and len((said.out + said.err).strip().splitlines()) == 1
+
+
+def test_plans_that_do_not_fit_are_one_line(tmp_path, capsys, monkeypatch):
+    """1000 plans of 20 particles: 7 steps of 3 numbers, 4 observed, and 2 layers of 200."""
+    each = 4 * 1000 * 20 * (7 * 3 + 4 + 2 * 200)
+    config = ALGOS["pets"].config
+    assert planning_bytes(Corridor(), config(plans=1000)) == each
+    assert planning_bytes(Corridor(), config(plans=1000, true_model=True)) == 4 * 1000 * (7 * 3 + 4)
+    planning = (TOY, "algo=pets", "algo.plans=1000", "num_envs=4", "eval_episodes=9", "num_seeds=2")
+    monkeypatch.setattr(memory, "device_memory", lambda: (18 * each - 1, "this machine"))
+    assert typed("train", *planning, f"run_dir={tmp_path / 'run'}") == 2
+    said = capsys.readouterr()
+    assert "planning in 18 environments at once needs at least 0.6 GiB" in said.out + said.err
+    assert len((said.out + said.err).strip().splitlines()) == 1

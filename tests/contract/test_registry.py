@@ -73,7 +73,7 @@ def test_a_file_with_a_row_is_known_to_whatever_is_made_from_rows(halved):
 
     assert halved in on_policy_names() and halved in on_policy_names(holds="nothing")
     pages, tables = importlib.import_module("pages"), importlib.import_module("tables")
-    assert f"| `PPOHalved` | `{halved}` |" in tables.omnisafe_algorithms()
+    assert f"| on-policy | `PPOHalved` | ✓ [`{halved}`](" in tables.omnisafe_algorithms()
     assert f"`{halved}`" in tables.omnisafe_conventions()
     page = pages.page(halved)
     assert page.startswith("# PPO-Halved: PPO that pays half\n") and "A = A_r - A_c / 2" in page

@@ -25,6 +25,12 @@ SMALL = {  # what the settings of each become
     "own_environment": TINY,
     "own_algorithm": TINY,
     "comparison": TINY | {"num_seeds": 2},
+    "offline": TINY,
+}
+MORE = {  # other lines of its parameters
+    "offline": """\
+size = 80
+learning = {"total_updates": 20, "updates": 10, "batch_size": 8, "hidden": (4,), "eval_episodes": 4}""",
 }
 TASK = "toys:Corridor"  # of tests/, where a notebook has a `task`: compiles in seconds, and is cached
 FAST_XLA = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
@@ -48,6 +54,7 @@ def test_a_notebook_runs_from_top_to_bottom(path, tmp_path, monkeypatch):
         tags = cell.metadata.get("tags", ())
         if "parameters" in tags:
             cell.source += f"\ntask, settings = {TASK!r}, settings | {SMALL[path.stem]!r}"
+            cell.source += f"\n{MORE.get(path.stem, '')}"
     nbclient.NotebookClient(
         notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": str(tmp_path)}}
     ).execute()

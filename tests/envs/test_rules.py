@@ -108,9 +108,12 @@ def test_what_is_not_theirs_or_not_followed_is_refused(name, options):
 
 
 def test_their_ids_lead_to_the_rules():
-    with pytest.raises(ConfigError, match=r"is env=car_push2 env.rules=safety_gymnasium$"):
-        envs.make("SafetyCarPush2-v0")
-    with pytest.raises(ConfigError, match="did you mean 'Safexp-DoggoGoal1-v0'"):
+    env = envs.make("SafetyCarPush2-v0", engine="c")
+    assert env.config == envs.make("car_push2", engine="c", **THEIRS).config
+    assert envs.env_defaults("SafetyCarPush2-v0")["rules"] == "safety_gymnasium"
+    own = envs.make("SafetyCarPush2-v0", engine="c", rules="safety_gym")
+    assert own.config == envs.make("car_push2", engine="c").config
+    with pytest.raises(ConfigError, match="did you mean"):
         envs.make("SafetyDoggoGoal1-v0")
 
 

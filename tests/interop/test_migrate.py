@@ -185,6 +185,148 @@ def test_an_off_policy_key_becomes_its_options(theirs, keys, options):
     assert len(found.argv) == 5 + 1 + len(options.split())
 
 
+# configs/model-based/SafeLOOP.yaml, and what is other of the PETS family and of CAPPETS
+SAFE_LOOP: dict[str, Any] = {
+    "seed": 0,
+    "train_cfgs": {
+        "device": "cpu", "torch_threads": 16, "total_steps": 1000000, "vector_env_nums": 1,
+        "parallel": 1,
+    },
+    "dynamics_cfgs": {
+        "num_ensemble": 5, "elite_size": 5, "hidden_size": 200, "use_decay": True,
+        "predict_reward": True, "predict_cost": False, "batch_size": 256, "max_epoch": 5,
+        "reward_size": 1, "cost_size": 1, "use_cost": True, "use_terminal": False, "use_var": False,
+        "use_reward_critic": True, "use_cost_critic": False,
+    },
+    "planner_cfgs": {
+        "plan_horizon": 7, "num_iterations": 5, "num_particles": 4, "num_samples": 100,
+        "mixture_coefficient": 0.05, "num_elites": 20, "temperature": 10.0, "cost_temperature": 100.0,
+        "momentum": 0.1, "epsilon": 0.001, "init_var": 0.075,
+    },
+    "evaluation_cfgs": {"use_eval": True, "eval_cycle": 10000, "num_episode": 1},
+    "algo_cfgs": {
+        "steps_per_epoch": 20000, "cost_limit": 1.0, "action_repeat": 5, "update_dynamics_cycle": 1200,
+        "start_learning_steps": 10000, "reward_normalize": False, "cost_normalize": False,
+        "obs_normalize": False, "policy_store_done": False, "gamma": 0.99, "cost_gamma": 0.99,
+        "policy_batch_size": 256, "update_policy_cycle": 250, "update_policy_iters": 50,
+        "max_grad_norm": 40, "use_critic_norm": False, "critic_norm_coeff": 0.001, "polyak": 0.005,
+        "alpha": 0.2, "alpha_discount": True, "loss_pi_deterministic": True, "use_grad_norm": False,
+        "alpha_gamma": 0.99, "auto_alpha": False, "policy_delay": 1, "use_cost": False,
+    },
+    "logger_cfgs": {"use_wandb": False, "save_model_freq": 5, "window_lens": 10},
+    "model_cfgs": {
+        "weight_initialization_mode": "kaiming_uniform", "actor_type": "gaussian_sac",
+        "linear_lr_decay": False,
+        "actor": {"hidden_sizes": [64, 64], "activation": "relu", "lr": 0.001},
+        "critic": {"num_critics": 2, "hidden_sizes": [64, 64], "activation": "relu", "lr": 0.001},
+    },
+}  # fmt: skip
+LOOP: dict[str, Any] = SAFE_LOOP | {
+    "planner_cfgs": {
+        k: v for k, v in SAFE_LOOP["planner_cfgs"].items() if k != "cost_temperature"
+    } | {"init_var": 0.01},
+    "algo_cfgs": {k: v for k, v in SAFE_LOOP["algo_cfgs"].items() if k != "cost_limit"},
+}  # fmt: skip
+PETS: dict[str, Any] = {k: v for k, v in SAFE_LOOP.items() if k != "model_cfgs"} | {
+    "planner_cfgs": {
+        "plan_horizon": 7, "num_iterations": 5, "num_particles": 20, "num_samples": 512,
+        "num_elites": 64, "momentum": 0.1, "epsilon": 0.001, "init_var": 4,
+    },
+    "algo_cfgs": {
+        "steps_per_epoch": 20000, "action_repeat": 5, "update_dynamics_cycle": 1200,
+        "start_learning_steps": 10000, "reward_normalize": False, "cost_normalize": False,
+        "obs_normalize": False, "gamma": 0.99, "cost_gamma": 1.0,
+    },
+}  # fmt: skip
+CCE: dict[str, Any] = PETS | {"algo_cfgs": PETS["algo_cfgs"] | {"cost_limit": 1.0}}
+CAP: dict[str, Any] = PETS | {
+    "lagrange_cfgs": {
+        "cost_limit": 1.0, "lagrangian_multiplier_init": 0.0, "lambda_lr": 0.1,
+        "lambda_optimizer": "SGD", "lagrangian_upper_bound": 1.0,
+    },
+}  # fmt: skip
+ANT = {  # the section of the velocity tasks, of LOOP and of PETS
+    "LOOP": {
+        "algo_cfgs": {
+            "action_repeat": 1, "update_policy_cycle": 1, "update_policy_iters": 1, "policy_delay": 2,
+            "loss_pi_deterministic": False, "use_grad_norm": True, "alpha_discount": False,
+            "policy_store_done": True,
+        },
+        "planner_cfgs": {"plan_horizon": 3, "init_var": 0.1, "temperature": 0.1, "alpha": 0.2},
+        "model_cfgs": {
+            "actor": {"hidden_sizes": [256, 256], "lr": 0.0003},
+            "critic": {"hidden_sizes": [256, 256], "lr": 0.0003},
+        },
+    },
+    "PETS": {
+        "algo_cfgs": {"action_repeat": 1},
+        "planner_cfgs": {"plan_horizon": 16, "init_var": 0.1},
+        "dynamics_cfgs": {"predict_cost": True},
+    },
+}  # fmt: skip
+EVALUATED = ["total_steps=1000000", "eval_episodes=1", "eval_every=10000"]
+
+
+@pytest.mark.parametrize(
+    "theirs, config",
+    {"PETS": PETS, "CCEPETS": CCE, "RCEPETS": CCE, "CAPPETS": CAP, "LOOP": LOOP,
+     "SafeLOOP": SAFE_LOOP}.items(),
+)  # fmt: skip
+def test_the_defaults_of_planning_are_the_published_preset_on_coordinates(theirs, config):
+    found = migrate.omnisafe(config, theirs, "SafetyPointGoal1-v0-modelbased")
+    arguments.check_arguments(found.argv)
+    own = f"algo={migrate.algorithms()[theirs]}"
+    start = [*PLAIN, "env.observation=coordinates", own, "preset=published", "compat=omnisafe"]
+    assert found.argv[:6] == start
+    assert sorted(found.argv[6:]) == sorted([*EVALUATED, "env.wrap.action_repeat=5"])
+    drawn = ["algo_cfgs.loss_pi_deterministic"] if theirs in ("LOOP", "SafeLOOP") else []
+    assert lost(found) == drawn
+    assert {line.key for line in found.lines} == {"algo", "env_id", *migrate.flatten(config)}
+
+
+@pytest.mark.parametrize(
+    "theirs, changed", [("LOOP", ["algo.temperature=33.333333333333336"]), ("PETS", [])]
+)
+def test_planning_in_velocity_tasks_has_their_preset(theirs, changed):
+    config = {"defaults": {"LOOP": LOOP, "PETS": PETS}[theirs], "SafetyAntVelocity-v1": ANT[theirs]}
+    found = migrate.omnisafe(config, theirs, "SafetyAntVelocity-v1")
+    arguments.check_arguments(found.argv)
+    start = [
+        "env=ant_velocity",
+        f"algo={theirs.lower()}",
+        "preset=omnisafe_velocity",
+        "compat=omnisafe",
+    ]
+    assert found.argv[:4] == start and not lost(found)
+    assert sorted(found.argv[4:]) == sorted([*EVALUATED, *changed])
+
+
+@pytest.mark.parametrize(
+    "theirs, keys, options",
+    [
+        ("PETS", {"algo_cfgs": {"action_repeat": 2, "update_dynamics_cycle": 600}},
+         "env.wrap.action_repeat=2 algo.refit_every=300"),
+        ("PETS", {"dynamics_cfgs": {"num_ensemble": 4, "hidden_size": 32, "use_decay": False}},
+         "algo.models=4 algo.particles=5 algo.model_hidden=[32,32,32,32] algo.weight_decay=0.0"),
+        ("CCEPETS", {"planner_cfgs": {"num_elites": 8, "momentum": 0.2, "epsilon": 0.1}},
+         "algo.elites=8 algo.mean_momentum=0.2 algo.var_momentum=0.2"),
+        ("CAPPETS", {"lagrange_cfgs": {"lambda_lr": 0.01}, "algo_cfgs": {"steps_per_epoch": 10000}},
+         "algo.kappa_lr=0.01 algo.dual_every=2000"),
+        ("LOOP", {"planner_cfgs": {"plan_horizon": 5, "num_particles": 8, "epsilon": 0.1}},
+         "algo.plan_steps=5 algo.temperature=2000.0 algo.particles=8 algo.var_stop=0.1"),
+        ("SafeLOOP", {"algo_cfgs": {"update_policy_cycle": 100, "update_policy_iters": 40}},
+         "algo.learn_every=20 algo.horizon=40 algo.replay_ratio=512"),
+        ("LOOP", {"algo_cfgs": {"alpha_discount": False, "use_grad_norm": True, "max_grad_norm": 10}},
+         "algo.alpha_init=0.2 algo.max_grad_norm=10.0"),
+    ],
+)  # fmt: skip
+def test_a_key_of_planning_becomes_its_options(theirs, keys, options):
+    found = migrated(keys, theirs)
+    expected = {"env.wrap.action_repeat=5"} if "repeat" not in options else set()
+    assert set(found.argv[6:]) == {"total_steps=1000000", *options.split(), *expected}
+    assert not lost(found)
+
+
 CHANGES = [  # algorithm, key, value, options
     ("PPOLag", "seed", 5, "seed=5"),
     ("PPOLag", "train_cfgs.total_steps", 1000000, "total_steps=1000000"),
@@ -259,13 +401,33 @@ def test_sections_of_environments_count_for_theirs():
     assert migrated(config, "PPOLag").argv[5:] == ["algo.discount=0.9", "algo.cost_discount=0.9"]
 
 
-def test_every_option_that_a_key_becomes_exists():
-    fields = {f"algo.{f.name}" for e in algos.ALGOS.values() for f in dataclasses.fields(e.config)}
-    fields |= {"algo", "env", "env.rules", "seed", "total_steps", "num_envs"}
-    fields |= {"dataset", "total_updates", "eval_episodes"}
-    assert {o for rule in migrate.OFFLINE.values() for o in rule.ours.split()} <= fields
-    assert set(migrate.algorithms().values()) == {n for n, e in algos.ALGOS.items() if e.omnisafe}
-    assert {"BCQ", "BCQLag", "CCRR", "CRR", "COptiDICE", "VAEBC"} <= set(migrate.algorithms())
+THEIRS = {  # all that OmniSafe @15603dd has
+    "on-policy": (
+        "PolicyGradient NaturalPG TRPO PPO PDO RCPO PPOLag TRPOLag CPPOPID TRPOPID CPO PCPO FOCOPS CUP "
+        "OnCRPO IPO P3O PPOSaute TRPOSaute PPOSimmerPID TRPOSimmerPID PPOEarlyTerminated "
+        "TRPOEarlyTerminated"
+    ),
+    "off-policy": "DDPG TD3 SAC DDPGLag TD3Lag SACLag DDPGPID TD3PID SACPID CRABS",
+    "model-based": "PETS CCEPETS RCEPETS CAPPETS LOOP SafeLOOP",
+    "offline": "VAEBC BCQ BCQLag CRR CCRR COptiDICE",
+}
+
+
+def test_every_option_that_a_key_becomes_exists_in_its_family():
+    for name, family in migrate.FAMILIES.items():
+        rows = [row for row in algos.ALGOS.values() if migrate.family_of(row) == name]
+        fields = {f"algo.{f.name}" for row in rows for f in dataclasses.fields(row.config)}
+        fields |= {"algo", "env", "env.rules", "seed", "total_steps", "num_envs", migrate.REPEAT}
+        fields |= {"dataset", "total_updates", "eval_episodes", "eval_every"}
+        own = {k: r for k, r in family.rules.items() if r != migrate.OMNISAFE.get(k)} or family.rules
+        assert {o for rule in own.values() for o in rule.ours.split()} <= fields
+
+
+def test_all_of_omnisafe_but_crabs_is_here_and_no_row_has_a_name_that_is_not_there():
+    ours = {theirs: migrate.family_of(algos.ALGOS[n]) for theirs, n in migrate.algorithms().items()}
+    assert list(migrate.MISSING) == ["CRABS"]
+    assert ours | migrate.MISSING == {n: kind for kind, names in THEIRS.items() for n in names.split()}
+    assert len(ours) == sum(bool(row.omnisafe) for row in algos.ALGOS.values()) == 44
 
 
 BCQ_LAG = {  # of OmniSafe's BCQLag.yaml
@@ -284,7 +446,8 @@ def test_offline_configs_count_gradient_steps_and_keep_a_path():
     found = migrated(BCQ_LAG, "BCQLag")
     assert not lost(found)
     assert found.argv[2:] == [
-        "algo=bcq_lag", *migrate.DEFAULTS.split(), "total_updates=1000000", "eval_episodes=10",
+        "algo=bcq_lag", "preset=published", "compat=omnisafe", "total_updates=1000000",
+        "eval_episodes=10",
         "dataset=mixed.npz",
     ]  # fmt: skip
     named = {"train_cfgs": {"dataset": "SafetyPointCircle1-v0_mixed_0.5"}}
@@ -307,11 +470,13 @@ def test_offline_configs_count_gradient_steps_and_keep_a_path():
             "batch_size=0: expected a whole number between 1 and",
         ),
         ({}, "PPOlag", "point_goal1", "did you mean 'PPOLag'"),
-        ({}, "CRABS", "point_goal1", "off-policy"),
+        ({}, "CRABS", "point_goal1", "CRABS is not here yet"),
         ({}, "", "point_goal1", "add --algo"),
         ({}, "CPO", "", "add --env"),
         ({}, "CPO", "SafetyRacecarGoal1-v0", "no counterpart"),
         ({}, "CPO", "point_gaol1", "did you mean 'point_goal1'"),
+        ({}, "PETS", "SafetyPointPush1-v0", "plans in Goal and in the velocity tasks alone"),
+        ({}, "PETS", "SafetyAntGoal1-v0-modelbased", "no counterpart"),
     ],
 )
 def test_bad_input_is_one_line(config, algo, env, message):
