@@ -31,16 +31,10 @@ from jaxsafe.learn.constraints import (
 )
 from jaxsafe.learn.critics import cost_values, init_cost_critics, reduced_costs
 from jaxsafe.learn.learner import GradientStep, Learner
+from jaxsafe.learn.normalise import averaged, no_moments, standard
 from jaxsafe.learn.off_policy import OffPolicyConfig, off_policy
 from jaxsafe.learn.row import Row
-from jaxsafe.learn.sequences import (
-    SequenceBatch,
-    averaged,
-    drawn_sequences,
-    lambda_returns,
-    no_moments,
-    standard,
-)
+from jaxsafe.learn.sequences import SequenceBatch, drawn_sequences, lambda_returns
 from jaxsafe.learn.steps import Trainable, adam, descend_each, follow
 from jaxsafe.learn.treatments import LagrangianConfig, Treatment, initial_price, lagrangian
 from jaxsafe.nn.beta import beta_mode, beta_policy, beta_sample, init_beta

@@ -34,10 +34,9 @@ from jaxsafe.learn.critics import (
     targets_of,
 )
 from jaxsafe.learn.learner import GradientStep, Learner
-from jaxsafe.learn.normalise import CLIP, MIN_STD
+from jaxsafe.learn.normalise import CLIP, MIN_STD, averaged, no_moments, standard
 from jaxsafe.learn.off_policy import OffPolicyConfig
 from jaxsafe.learn.replay import Transitions
-from jaxsafe.learn.sequences import averaged, no_moments, standard
 from jaxsafe.learn.steps import Trainable, adam, descend_each, follow
 from jaxsafe.learn.treatments import LagrangianConfig, PIDConfig, Treatment, no_treatment
 from jaxsafe.nn.critics import q_values
