@@ -23,13 +23,7 @@ from jaxsafe.config import (
 from jaxsafe.learn.acting import Learned
 from jaxsafe.learn.batch import device_count, pmean
 from jaxsafe.learn.bill import PriceClockConfig
-from jaxsafe.learn.constraints import (
-    constrained_costs,
-    each,
-    limit,
-    metrics_by_constraint,
-    signal,
-)
+from jaxsafe.learn.constraints import constrained_costs, each, limit, metrics_by_constraint, signal
 from jaxsafe.learn.critics import cost_values, init_cost_critics, reduced_costs
 from jaxsafe.learn.learner import GradientStep, Learner
 from jaxsafe.learn.normalise import averaged, no_moments, standard

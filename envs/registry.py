@@ -77,7 +77,8 @@ def load(address: str) -> None:
 
 
 def canonical(name: str) -> str:
-    """The registered name of an environment given by name or by Safety Gym's id.
+    """The registered name of an environment given by name, or by an id of Safety Gym's or
+    Safety-Gymnasium's.
 
     Raises:
         ConfigError: no such environment; the message has the nearest name.

@@ -12,14 +12,7 @@ import jax.numpy as jnp
 
 from jaxsafe.config import config
 from jaxsafe.learn.learner import GradientStep, Learner
-from jaxsafe.learn.models import (
-    ModelConfig,
-    init_model,
-    model_of,
-    record_by,
-    refit,
-    with_model,
-)
+from jaxsafe.learn.models import ModelConfig, init_model, model_of, record_by, refit, with_model
 from jaxsafe.learn.off_policy import off_policy
 from jaxsafe.learn.planning import PlanConfig, Planner, planning_policy
 from jaxsafe.learn.replay import Transitions

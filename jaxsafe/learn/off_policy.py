@@ -40,7 +40,7 @@ from jaxsafe.learn.batch import all_finite, device_count, device_key, masked_mea
 from jaxsafe.learn.bill import charge, empty_bill, settle
 from jaxsafe.learn.constraints import Names, check_cost_names, metrics_by_constraint, signal
 from jaxsafe.learn.learner import GradientStep, Learner, policy_by
-from jaxsafe.learn.metrics import episode_metrics, world_metrics
+from jaxsafe.learn.metrics import step_metrics
 from jaxsafe.learn.next_step_rollout import Stepping, StepRecord, collect_records, started
 from jaxsafe.learn.normalise import init_normaliser, merge, network_inputs
 from jaxsafe.learn.replay import (
@@ -263,7 +263,8 @@ def off_policy(
         length, lost_time = expected_length(ts.lost_time, env.episode_length, steps, taken, axis_name)
         after = pay(ts, steps, length, shared.iteration)
         metrics = means_of_gradient_steps(rounds.metrics, rounds.ready) | after.metrics
-        metrics |= step_metrics(env, steps, length, treatment.constrained_costs(ts.config), axis_name)
+        names = treatment.constrained_costs(ts.config)
+        metrics |= metrics_of_steps(env, steps, length, names, axis_name)
         lost = rounds.metrics["train/nonfinite"].sum() + rounds.skipped.sum() + after.failed
         lost += refitted.pop("train/nonfinite", 0)
         metrics |= refitted | {"train/nonfinite": lost}
@@ -391,21 +392,17 @@ def means_of_gradient_steps(metrics: Metrics, ready: jax.Array) -> Metrics:
     return jax.tree.map(mean, metrics)
 
 
-def step_metrics(
+def metrics_of_steps(
     env: Env, steps: StepRecord, length: jax.Array, names: Names, axis_name: str | None
 ) -> Metrics:
-    """What steps earned and cost. `length` is of an episode, in steps."""
+    """What real steps earned and cost. `length` is of an episode, in steps."""
 
     def rate(x: jax.Array) -> jax.Array:
         return masked_mean(x, steps.real, axis_name)
 
     charged = signal(env, steps, names)
     return {
-        **episode_metrics(env, steps, axis_name),
-        **world_metrics(steps.bad, axis_name),
-        "train/cost_rate": rate(steps.cost),  # per environment step
-        "train/cost_estimate": rate(steps.cost) * length,  # of an episode
-        "train/return_estimate": rate(steps.reward) * length,  # likewise
+        **step_metrics(env, steps, rate, length, axis_name),
         **{f"train/cost_estimate_{n}": rate(charged[..., k]) * length for k, n in enumerate(names)},
     }
 
