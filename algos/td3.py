@@ -38,7 +38,7 @@ class DeterministicConfig(ActorCriticConfig):
     # Standard deviation of the noise on actions in training, in the calmest environment. The others
     # lie evenly between this and `noise_max`. OmniSafe has 0.1 in all.
     noise_min: Noise = 0.05
-    # The same in the boldest environment.
+    # Standard deviation of the noise on actions in training, in the boldest environment.
     noise_max: Noise = 0.5
 
 

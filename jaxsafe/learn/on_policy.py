@@ -113,7 +113,7 @@ class OnPolicyConfig:
     obs_normalize: bool = True
     # Whether the learner sees rewards scaled by their running mean and variance.
     reward_normalize: bool = False
-    # The same for costs. Limits and metrics keep the costs as they are.
+    # Whether the learner sees costs scaled likewise. Limits and metrics keep the costs as they are.
     cost_normalize: bool = False
     # Weight of the policy's entropy, which is added to what the policy maximises.
     entropy_coef: Weight = 0.0

@@ -61,6 +61,10 @@ class Imagined(NamedTuple):
     alive: jax.Array
 
 
+PlanCost = Callable[[Imagined, Learned], jax.Array]  # -> float [S]
+Weigh = Callable[[jax.Array, jax.Array, Any], jax.Array]  # (return [S], cost [S], cfg) -> weights [S]
+
+
 class Planner(NamedTuple):
     """What one method adds to the planning.
 
@@ -72,8 +76,8 @@ class Planner(NamedTuple):
     """
 
     ret: Callable[[Imagined, Learned, jax.Array], jax.Array]
-    cost: Callable[[Imagined, Learned], jax.Array]
-    weigh: Callable[[jax.Array, jax.Array, Any], jax.Array]
+    cost: PlanCost
+    weigh: Weigh
     propose: Callable[[Model, Learned, PyTree, jax.Array], tuple[jax.Array, ...]] = lambda *_: ()
 
 
@@ -201,7 +205,7 @@ class Belief(NamedTuple):
 
 def cem(
     score: Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]],
-    weigh: Callable[[jax.Array, jax.Array, Any], jax.Array],
+    weigh: Weigh,
     mean: jax.Array,
     proposals: tuple[jax.Array, ...],
     key: jax.Array,
@@ -211,7 +215,7 @@ def cem(
 
     Args:
         score: (plans [S, H, A], key) -> return and cost, float [S] each.
-        weigh: (return, cost, cfg) -> weights, float [S].
+        weigh: see `Planner`.
         mean: where to begin, float [H, A].
         proposals: plans [.., H, A] that are tried each time, too.
     """
