@@ -109,8 +109,9 @@ def imagine(model: Model, learned: Learned, seen: PyTree, plans: jax.Array, key:
 
     start = particles_of(seen, shape), jnp.ones(shape, bool)
     keys = jax.random.split(key, plans.shape[1])
-    (latent, alive), of_steps = jax.lax.scan(step, start, (jnp.moveaxis(plans, 1, 0), keys))
-    return Imagined(*of_steps, model.observe(latent), alive)
+    (latent, alive), made = jax.lax.scan(step, start, (jnp.moveaxis(plans, 1, 0), keys))
+    reward, cost, spread = made
+    return Imagined(reward, cost, spread, model.observe(latent), alive)
 
 
 # ---- scores ------------------------------------------------------------------------------------
