@@ -380,7 +380,9 @@ def split(fn, devices=2):
 
 def training(name, axis_name, num_envs, updates):
     algo = ALGOS[name].make(Lever(), axis_name)
-    sizes = dict(num_envs=num_envs, learn_every=4, cost_limit=1e3)  # the price stays near 0
+    sizes = dict(num_envs=num_envs, learn_every=4)
+    if name != "sac":
+        sizes |= dict(cost_limit=1e3, lam_init=0.0)  # the price stays 0
     cfg = ALGOS[name].config(**{**ALGOS[name].lever, **sizes})
     def train(key):
         ts = algo.init(key, cfg, START)
