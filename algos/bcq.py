@@ -87,8 +87,8 @@ class BCQLagConfig(OfflineCostConfig, BCQConfig):
 
     Acts with the a_i that earns most at the price, out of as many as the target has: out of more it
     would find cheaper ones, and J_c would not be its cost. J_c is of drawn z_i, so `eval/cost_sampled`
-    is what to compare it with. The rest is as in BCQ. Values go on after the time
-    limit, so J_c is the undiscounted cost of an episode at the rate that Q_c says.
+    is what to compare it with. Values go on after the time limit, so J_c is the undiscounted cost of an
+    episode at the rate that Q_c says. The rest is as in BCQ.
 
     Source: Liu et al. (2023), "Datasets and Benchmarks for Offline Safe Reinforcement Learning",
     arXiv:2306.09303, for BCQ with a multiplier.

@@ -61,7 +61,8 @@ class COptiDICEConfig(OfflinePriceConfig, OfflineValueConfig):
 
     # How much it costs to depart from the data's visits, in units of reward, as in the paper's code.
     alpha: Annotated[float, Bounds(1e-8, 1e6)] = 0.01
-    cost_divergence: Weight = 0.01  # The KL within which costs are weighted, in nats, as there.
+    # The KL within which costs are weighted, in nats, as in the paper's code.
+    cost_divergence: Weight = 0.01
     tau_init: Annotated[float, Bounds(TAU_MIN, 1e6)] = 1.0  # As in the paper's code.
     tau_lr: Rate = 3e-4  # The learning rate of tau, by Adam, as in the paper's code.
     lr: Rate = 3e-4  # The policy's learning rate, by Adam, as in the paper's code.

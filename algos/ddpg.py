@@ -12,12 +12,7 @@ from jaxsafe.learn.actor_critic import ControllerConfig, MultiplierConfig, actor
 from jaxsafe.learn.conventions import Convention
 from jaxsafe.learn.off_policy import off_policy
 from jaxsafe.learn.row import Row
-from jaxsafe.learn.treatments import (
-    Treatment,
-    lagrangian,
-    no_treatment,
-    pid,
-)
+from jaxsafe.learn.treatments import Treatment, lagrangian, no_treatment, pid
 from jaxsafe.types import Algorithm, Env, PyTree
 
 

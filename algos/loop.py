@@ -16,7 +16,9 @@ from jaxsafe.learn.models import Model
 from jaxsafe.learn.normalise import network_inputs
 from jaxsafe.learn.planning import (
     Imagined,
+    PlanCost,
     Planner,
+    Weigh,
     by_return,
     by_return_within_limit,
     no_cost,
@@ -70,7 +72,7 @@ class LOOPConfig(ModelBasedConfig, sac.SACConfig):
     # transitions are 5 passes over a full replay.
     epoch_steps: Annotated[int, Bounds(0, 2**24)] = 1000
     plans: Amount = 100  # S, plans that are drawn each time, as in OmniSafe.
-    actor_plans: Amount = 1  # What the actor does in each model, so often. OmniSafe has one in all.
+    actor_plans: Amount = 1  # Plans that the actor makes in each model. OmniSafe has one plan in all.
     plan_var: Annotated[float, Bounds(0, 100)] = 0.01  # The variance at first, as in OmniSafe.
     # A plan of no larger variance is not improved any further, as in OmniSafe.
     var_stop: Weight = 1e-3
@@ -101,7 +103,7 @@ class SafeLOOPConfig(LOOPConfig):
     cost_temperature: Weight = 100.0
 
 
-def planner(env: Env, cost: Any = no_cost, weigh: Any = by_return) -> Planner:
+def planner(env: Env, cost: PlanCost = no_cost, weigh: Weigh = by_return) -> Planner:
     actor = sac.soft_actor(env.action_size)
 
     def ret(imagined: Imagined, learned: Learned, key: jax.Array) -> jax.Array:
@@ -115,6 +117,7 @@ def planner(env: Env, cost: Any = no_cost, weigh: Any = by_return) -> Planner:
         return ((weights * imagined.reward).sum(0) + later).mean((0, 1))
 
     def propose(model: Model, learned: Learned, seen: PyTree, key: jax.Array) -> tuple[jax.Array, ...]:
+        """What the actor does in each model, `actor_plans` times: one array [M actor_plans, H, A]."""
         cfg, params = learned.config, learned.params
 
         def step(latent: PyTree, key: jax.Array) -> tuple[PyTree, jax.Array]:

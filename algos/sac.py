@@ -19,12 +19,7 @@ from jaxsafe.learn.actor_critic import (
 from jaxsafe.learn.off_policy import off_policy
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.steps import adam
-from jaxsafe.learn.treatments import (
-    Treatment,
-    lagrangian,
-    no_treatment,
-    pid,
-)
+from jaxsafe.learn.treatments import Treatment, lagrangian, no_treatment, pid
 from jaxsafe.nn.squashed import init_squashed, squashed_mean, squashed_policy, squashed_sample
 from jaxsafe.types import Algorithm, Env, PyTree
 
@@ -73,8 +68,8 @@ class SACLagConfig(MultiplierConfig, SACConfig):
     Learning", for the multiplier; Ha et al. (2020), "Learning to Walk in the Real World with Minimal
     Human Effort", arXiv:2002.08550, for SAC with one.
     Differs from OmniSafe: there lam moves at every gradient step, so that its speed depends on
-    `replay_ratio`. There is one critic of cost, whose target takes the policy's mean
-    action, and unit is 1.
+    `replay_ratio`. There is one critic of cost, whose target takes the policy's mean action, and unit
+    is 1.
     """
 
 
@@ -105,7 +100,10 @@ def optimisers(cfg: Any, share: jax.Array | float) -> dict[str, optax.GradientTr
 
 
 def soft_actor(action_size: int) -> Actor:
-    def drawn(params: dict[str, PyTree], obs: jax.Array, key: jax.Array, cfg: Any):
+    def drawn(
+        params: dict[str, PyTree], obs: jax.Array, key: jax.Array, cfg: Any
+    ) -> tuple[jax.Array, jax.Array]:
+        """An action [..., A] and its log probability [...]."""
         return squashed_sample(squashed_policy(params["actor"], obs, action_size, cfg), key)
 
     def act(params: dict[str, PyTree], obs: jax.Array, key: jax.Array | None, cfg: Any) -> jax.Array:

@@ -1,6 +1,7 @@
 """SEditor: a policy that seeks reward, and one that edits its actions to keep them safe."""
 
 import dataclasses
+from functools import partial
 from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
@@ -20,30 +21,18 @@ from jaxsafe.config import (
     config,
 )
 from jaxsafe.learn.acting import Learned
-from jaxsafe.learn.batch import pmean
+from jaxsafe.learn.batch import device_count, pmean
 from jaxsafe.learn.bill import PriceClockConfig
-from jaxsafe.learn.constraints import (
-    constrained_costs,
-    each,
-    limit,
-    metrics_by_constraint,
-    signal,
-)
+from jaxsafe.learn.constraints import constrained_costs, each, limit, metrics_by_constraint, signal
 from jaxsafe.learn.critics import cost_values, init_cost_critics, reduced_costs
 from jaxsafe.learn.learner import GradientStep, Learner
+from jaxsafe.learn.normalise import averaged, no_moments, standard
 from jaxsafe.learn.off_policy import OffPolicyConfig, off_policy
 from jaxsafe.learn.row import Row
-from jaxsafe.learn.sequences import (
-    SequenceBatch,
-    averaged,
-    drawn_sequences,
-    lambda_returns,
-    no_moments,
-    standard,
-)
+from jaxsafe.learn.sequences import SequenceBatch, drawn_sequences, lambda_returns
 from jaxsafe.learn.steps import Trainable, adam, descend_each, follow
 from jaxsafe.learn.treatments import LagrangianConfig, Treatment, initial_price, lagrangian
-from jaxsafe.nn.beta import beta_mode, beta_policy, beta_sample, init_beta
+from jaxsafe.nn.beta import Beta, beta_mode, beta_policy, beta_sample, init_beta
 from jaxsafe.nn.critics import init_critics, q_values
 from jaxsafe.types import Algorithm, Count, Env, Metrics, PyTree
 
@@ -80,7 +69,7 @@ class SEditorConfig(LagrangianConfig, PriceClockConfig, OffPolicyConfig):
     # Rows replayed for each environment step. The authors have 51.2.
     replay_ratio: Amount | Annotated[float, Bounds(1e-6, 1e6)] = 16
     # Rows of a gradient step, of all devices together: 256 sequences of 8. The authors have 1,024. With
-    # 16 rows replayed for each environment step, there are about as many gradient steps as theirs.
+    # `replay_ratio` 16 a gradient step comes every 128 environment steps. The authors have 160.
     batch_size: Amount = 2048
     # Steps of a replayed sequence. It has a row more: 8, as the authors have.
     n_step: Iterations = 7
@@ -98,9 +87,8 @@ class SEditorConfig(LagrangianConfig, PriceClockConfig, OffPolicyConfig):
     lam_init: Positive = 1.0  # The price on cost at the start, as in the authors' code.
     # The highest price. The authors have no bound.
     lam_max: Annotated[float, Bounds(1e-6, 1e6, inf="no bound")] = float("inf")
-    dual_lr: Rate = (
-        0.01  # Adam's step of l, whatever the size of the violation, as in the authors' code.
-    )
+    # Adam's step of l, whatever the size of the violation, as in the authors' code.
+    dual_lr: Rate = 0.01
     # Environment steps between two moves of the price. The authors have 160.
     dual_every: Annotated[int, Bounds(1, 2**30)] = 1000
     # The share of the critics that their targets take on at each step, as in the authors' code.
@@ -110,7 +98,7 @@ class SEditorConfig(LagrangianConfig, PriceClockConfig, OffPolicyConfig):
     # The proposals' target entropy is that of a uniform density this high, in each dimension, as in
     # the authors' code.
     min_prob: Chance = 0.1
-    # The same of the editor. The authors have 0.1 on Safety Gym, and 0.2 in racing.
+    # The same for the editor's changes. The authors have 0.1 on Safety Gym, and 0.2 in racing.
     editor_min_prob: Chance = 0.1
     # The longest gradient of one sample's concentrations, as in the authors' code.
     concentration_clip: Norm = 0.01
@@ -184,7 +172,8 @@ def edit(proposal: jax.Array, change: jax.Array, cfg: Any) -> jax.Array:
     return jnp.clip(proposal + 2 * change, -1.0, 1.0) if cfg.edit == "add" else change
 
 
-def editor_of(editor: PyTree, obs: jax.Array, proposal: jax.Array, cfg: Any) -> Any:
+def editor_of(editor: PyTree, obs: jax.Array, proposal: jax.Array, cfg: Any) -> Beta:
+    """The editor's distribution of changes [..., A], given `obs` [..., O] and `proposal` [..., A]."""
     return beta_policy(editor, jnp.concatenate([obs, proposal], -1), cfg)
 
 
@@ -307,9 +296,10 @@ def seditor_learner(env: Env) -> Learner:
         params, targets = nets.params, nets.params["targets"]
         rows, names = batch.rows, constrained_costs(cfg)
         target_key, proposer_key, editor_key = jax.random.split(at.key, 3)
-        devices = 1 if axis_name is None else jax.lax.axis_size(axis_name)
-        # a device's sum over its share is as many times the whole's
-        cfg = dataclasses.replace(cfg, concentration_clip=cfg.concentration_clip * devices)
+        # On d devices a sample weighs d times as much in the loss of its device. There its gradient is
+        # d times as long, so the clip has to be, too.
+        longest = cfg.concentration_clip * device_count(axis_name)
+        cfg = dataclasses.replace(cfg, concentration_clip=longest)
 
         def mean(x: jax.Array) -> jax.Array:
             return (batch.weight * x.mean(0)).sum()  # this device's share
@@ -332,28 +322,27 @@ def seditor_learner(env: Env) -> Learner:
         next_q = reward_value(targets, rows.obs, found.action, cfg)
         next_c = reduced_costs(targets["critic_c"], rows.obs, found.action, names, cfg)
 
-        def returns(discount: jax.Array):
-            def of(reward: jax.Array, value: jax.Array) -> jax.Array:
-                return lambda_returns(batch, reward, value, discount=discount, decay=cfg.td_lambda)
+        def returns(earned: jax.Array, value: jax.Array, discount: jax.Array) -> jax.Array:
+            return lambda_returns(batch, earned, value, discount=discount, decay=cfg.td_lambda)
 
-            return of
+        y_r = returns(reward, next_q, cfg.discount)
+        y_c = each(partial(returns, discount=cfg.cost_discount), names)(cost, next_c)
 
-        y_r = returns(cfg.discount)(reward, next_q)
-        y_c = each(returns(cfg.cost_discount), names)(cost, next_c)
-
-        def loss(own: dict[str, PyTree]) -> tuple[jax.Array, Metrics]:
+        def loss(trained: dict[str, PyTree]) -> tuple[jax.Array, Metrics]:
             obs, action = rows.obs[:-1], rows.action[:-1]
-            q = q_values(own["critic_r"], obs, action, cfg)
-            q_c = cost_values(own["critic_c"], obs, action, names, cfg)
+            q = q_values(trained["critic_r"], obs, action, cfg)
+            q_c = cost_values(trained["critic_c"], obs, action, names, cfg)
             loss_r = mean_step(((q - y_r) ** 2).sum(0))
             loss_c = each(mean_step, names)(((q_c - y_c) ** 2).sum(0))
 
-            gain, log_prob = proposer_gain(own["proposer"], params, rows.obs, proposer_key, cfg)
-            gain_e, drawn, lost = editor_gain(own["editor"], params, at.dual, rows.obs, editor_key, cfg)
+            gain, log_prob = proposer_gain(trained["proposer"], params, rows.obs, proposer_key, cfg)
+            gain_e, drawn, lost = editor_gain(
+                trained["editor"], params, at.dual, rows.obs, editor_key, cfg
+            )
             sure, sure_e = map(jax.lax.stop_gradient, (log_prob, drawn.log_prob_change))
             aims = (size * jnp.log(2 * x) for x in (cfg.min_prob, cfg.editor_min_prob))
             heat, heat_e = (-mean(x + aim) for x, aim in zip((sure, sure_e), aims, strict=True))
-            temperature = own["log_alpha"] * heat + own["log_alpha_editor"] * heat_e
+            temperature = trained["log_alpha"] * heat + trained["log_alpha_editor"] * heat_e
 
             metrics = {
                 "train/critic_loss": loss_r,
@@ -377,12 +366,7 @@ def seditor_learner(env: Env) -> Learner:
         nets = nets._replace(opt_state=nets.opt_state | {"moments": moments})
         return follow(nets, cfg.tau), metrics_by_constraint(metrics, names)
 
-    return Learner(
-        init=init,
-        act=act,
-        step=step,
-        replayed=drawn_sequences,
-    )
+    return Learner(init=init, act=act, step=step, replayed=drawn_sequences)
 
 
 def make(env: Env, axis_name: str | None = None) -> Algorithm:

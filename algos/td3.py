@@ -24,12 +24,7 @@ from jaxsafe.learn.actor_critic import (
 from jaxsafe.learn.off_policy import off_policy
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.steps import adam
-from jaxsafe.learn.treatments import (
-    Treatment,
-    lagrangian,
-    no_treatment,
-    pid,
-)
+from jaxsafe.learn.treatments import Treatment, lagrangian, no_treatment, pid
 from jaxsafe.nn.networks import coarse_mlp
 from jaxsafe.types import Algorithm, Env, PyTree
 
@@ -43,7 +38,7 @@ class DeterministicConfig(ActorCriticConfig):
     # Standard deviation of the noise on actions in training, in the calmest environment. The others
     # lie evenly between this and `noise_max`. OmniSafe has 0.1 in all.
     noise_min: Noise = 0.05
-    # The same in the boldest environment.
+    # Standard deviation of the noise on actions in training, in the boldest environment.
     noise_max: Noise = 0.5
 
 
@@ -88,8 +83,7 @@ class TD3LagConfig(MultiplierConfig, TD3Config):
     Source: Ray, Achiam and Amodei (2019), "Benchmarking Safe Exploration in Deep Reinforcement
     Learning", for the multiplier.
     Differs from OmniSafe: there lam moves at every gradient step, so that its speed depends on
-    `replay_ratio`. There is one critic of cost, whose target takes mu(s') without noise,
-    and unit is 1.
+    `replay_ratio`. There is one critic of cost, whose target takes mu(s') without noise, and unit is 1.
     """
 
 

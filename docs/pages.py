@@ -92,8 +92,9 @@ Adam's, such as `ppo_lag` and `focops`. They go best with `reward_normalize` and
 
 ## Letters
 
-All pages use the same letters, and the code has the same names. An iteration collects a batch with the
-policy pi_old and then improves it.
+All pages use the same letters, and the code has the same names. An iteration of an on-policy algorithm
+collects a batch with the policy pi_old and then improves it. Off-policy algorithms have values of
+actions, Q_r and Q_c, where on-policy ones have advantages.
 
 | letter | what it is | setting or metric |
 |---|---|---|
@@ -104,8 +105,9 @@ policy pi_old and then improves it.
 | A_c | advantage of cost, in units of cost, with a mean of 0 in a batch | `algo.cost_gae_lambda` |
 | A | the advantage that the policy's step maximises | |
 | E | mean over the batch | |
-| J_c | undiscounted cost of an episode, as this batch estimates it | `train/cost_estimate` |
-| lam | price on cost: how many standard deviations of A_r one unit of A_c is worth | `train/lam` |
+| Q_r, Q_c | values of an action in reward and in cost, discounted | `train/q`, `train/q_c` |
+| J_c | undiscounted cost of an episode, as the learner estimates it | `train/cost_estimate` |
+| lam | price on cost: standard deviations of A_r or Q_r that a unit of cost is worth | `train/lam` |
 | KL(old \\|\\| new) | divergence of the new policy from pi_old, in nats | `train/kl` |
 | delta | the largest KL of a step | `algo.target_kl` |
 | eps | how far w may move from 1 before it is clipped | `algo.clip` |

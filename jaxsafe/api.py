@@ -35,13 +35,7 @@ from jaxsafe.run.plain import to_plain
 from jaxsafe.run.policies import ROBOT, RunPolicies, open_run
 from jaxsafe.run.progress import Reporter
 from jaxsafe.run.session import Session
-from jaxsafe.run.settings import (
-    load,
-    nested,
-    settings_from_config,
-    settings_from_options,
-    yours,
-)
+from jaxsafe.run.settings import load, nested, settings_from_config, settings_from_options, yours
 from jaxsafe.types import Env, PyTree
 
 __all__ = [
@@ -67,7 +61,7 @@ def make(env: str | SafetyGymConfig | VelocityConfig, **options: Any) -> Any:
     and the cost of the step and, in `costs`, those of each of `env.cost_names`.
 
     Args:
-        env: a name ('car_push1'), Safety Gym's id ('Safexp-CarPush1-v0'), 'module:name' for code of
+        env: a name ('car_push1'), an id ('Safexp-CarPush1-v0'), 'module:name' for code of
             yours, which is imported, or a config.
         options: Safety Gym's (`hazards_num`, ...; lengths in m, angles in rad) or a velocity task's
             (`velocity_threshold`, ...), and `engine`: 'auto', 'c', 'warp' or 'jax'.
@@ -157,7 +151,8 @@ class Run:
 
         Args:
             obs: float [..., obs_size] of `run.env(index)`, as the environment gives it.
-            key: a random key to sample with; None is the mean, which `evaluate` uses too.
+            key: a random key to sample with, anew for each row of a batch; None is the mean, which
+                `evaluate` uses too.
             index: which policy.
 
         Returns:
@@ -435,7 +430,7 @@ def render(
 
     Raises:
         ConfigError: no run folder, no checkpoint yet, no such policy, another kind of file, or an
-            environment that is none of Safety Gym's.
+            environment that cannot be drawn: neither Safety Gym's nor a velocity task.
         jaxsafe.report.film.NoVideo: this machine can draw nothing: no EGL, OSMesa or display.
     """
     run = run if isinstance(run, Run) else Run(run)

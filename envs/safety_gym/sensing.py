@@ -82,11 +82,12 @@ def natural_lidar(
 ) -> jax.Array:
     """exp(-distance) at which `bins` level rays from the robot's centre meet geoms of a group.
 
-    Nothing of body `robot` itself is met, its wheels and legs are, and groups are shared (goal and
-    floor, box and buttons, pillars and walls), all as in the original; group 6 does not exist there,
-    so the circle is never seen. `slack` (m) thickens every shape, or thins it if negative: a reading
-    that depends on its sign hangs on rounding (Car's ball is tangent to its rays, Doggo's start on a
-    surface of its own).
+    As in the original, nothing of body `robot` itself is met, but its wheels and legs are. Some kinds
+    share a group: goal and floor, box and buttons, pillars and walls. Group 6 does not exist in the
+    original, so the circle is never seen.
+
+    `slack` (m) thickens every shape, or thins it if negative. A reading that depends on its sign hangs
+    on rounding: Car's ball is tangent to its rays, and Doggo's rays start on a surface of its own.
     """
     angles = 2 * jnp.pi * jnp.arange(bins) / bins
     level = jnp.stack([jnp.cos(angles), jnp.sin(angles), jnp.zeros(bins)], -1)

@@ -67,10 +67,12 @@ def mend_brax() -> None:
 class BraxEnv(brax.envs.Env):
     """An `Env` with the interface of Brax: one environment, no time limit.
 
-    `done` is 1 where the episode has ended for good; the trainer is told the time limit
-    (`episode_length=env.episode_length`) and tells truncation apart. `info['cost']` is the cost of the
-    step. `metrics`, which Brax sums over episodes, has 'cost', 'cost_<name>' for each of
-    `env.cost_names`, and the environment's own info.
+    `done` is 1 where the environment ends the episode. Brax cannot be told that the value goes on
+    there, so an end by `State.truncated` looks like termination. The trainer is told the time limit
+    (`episode_length=env.episode_length`) and keeps it.
+
+    `info['cost']` is the cost of the step. `metrics`, which Brax sums over episodes, has 'cost',
+    'cost_<name>' for each of `env.cost_names`, and the environment's own info.
 
     Args:
         env: any `Env`.

@@ -34,10 +34,9 @@ from jaxsafe.learn.critics import (
     targets_of,
 )
 from jaxsafe.learn.learner import GradientStep, Learner
-from jaxsafe.learn.normalise import CLIP, MIN_STD
+from jaxsafe.learn.normalise import CLIP, MIN_STD, averaged, no_moments, standard
 from jaxsafe.learn.off_policy import OffPolicyConfig
 from jaxsafe.learn.replay import Transitions
-from jaxsafe.learn.sequences import averaged, no_moments, standard
 from jaxsafe.learn.steps import Trainable, adam, descend_each, follow
 from jaxsafe.learn.treatments import LagrangianConfig, PIDConfig, Treatment, no_treatment
 from jaxsafe.nn.critics import q_values
@@ -107,14 +106,17 @@ class ControllerConfig(PIDConfig, CostCriticConfig):
     """For `pid`."""
 
     pid_kp: Weight = 0.004  # Price for each unit of the smoothed violation.
-    # Price that each unit of violation adds a move. 25 units add as much as the multiplier's step.
+    # Price that each unit of violation adds at each move. 25 units add as much as a step of `dual_lr`.
     pid_ki: Weight = 4e-4
     pid_kd: Weight = 0.004  # Price for each unit that the smoothed cost rose.
 
 
 class Proposal(NamedTuple):
-    """Actions [B, A] of the policy that is trained; bonus [B], what Q_r earns besides; extra [B], a
-    loss of the method's own that is added; metrics, [B] each."""
+    """What the policy that is trained would do.
+
+    action: float [B, A]. bonus: float [B], what is added to Q_r, such as an entropy. extra: float [B],
+    a further loss of the method, such as that of a temperature. metrics: float [B] each.
+    """
 
     action: jax.Array
     bonus: jax.Array
@@ -143,7 +145,9 @@ class Actor(NamedTuple):
     init: Callable[[jax.Array, int, int, Any], dict[str, PyTree]]
     optimisers: Callable[[Any, jax.Array | float], dict[str, optax.GradientTransformation]]
     act: Callable[[dict[str, PyTree], jax.Array, jax.Array | None, Any], jax.Array]
-    next_action: Callable[..., tuple[jax.Array, jax.Array]]
+    next_action: Callable[
+        [dict[str, PyTree], dict[str, PyTree], jax.Array, jax.Array, Any], tuple[jax.Array, jax.Array]
+    ]
     propose: Callable[[dict[str, PyTree], jax.Array, jax.Array, Any], Proposal]
     pick: Callable[[jax.Array], jax.Array]
     explore: Callable[[PyTree, jax.Array, jax.Array, Any], jax.Array] | None = None

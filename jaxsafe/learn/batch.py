@@ -12,6 +12,11 @@ def pmean(tree: PyTree, axis_name: str | None) -> PyTree:
     return tree if axis_name is None else jax.lax.pmean(tree, axis_name)
 
 
+def device_count(axis_name: str | None) -> int:
+    """How many devices share the batch."""
+    return 1 if axis_name is None else jax.lax.axis_size(axis_name)
+
+
 def psum(tree: PyTree, axis_name: str | None) -> PyTree:
     return tree if axis_name is None else jax.lax.psum(tree, axis_name)
 

@@ -22,15 +22,16 @@ class PriceClockConfig:
 
     # Environment steps between two moves of the price. OmniSafe moves it at every gradient step.
     dual_every: Annotated[int, Bounds(1, 2**30)] = 20_000
-    # Environment steps before its first move. OmniSafe's 100 epochs are 200,000.
+    # Environment steps before the price first moves. OmniSafe has 100 epochs, which are 200,000 steps.
     dual_starts: Annotated[int, Bounds(0, 2**31 - 1)] = 0
 
 
 class Bill(NamedTuple):
     """What the environments of all devices were charged since the price last moved.
 
-    cost: float [], or [K] of several constraints, summed over `steps`, float []. age: int32 [],
-    environment steps of the run since then, resets included; below 0 before `dual_starts`.
+    cost: float [], or [K] of several constraints: the sum over the real steps. steps: float [], how
+    many these are. age: int32 [], all environment steps since then, resets included; below 0 before
+    `dual_starts`.
     """
 
     cost: jax.Array

@@ -10,7 +10,7 @@ from jaxsafe.learn.next_step_rollout import Stepping, arrival_record
 from jaxsafe.learn.normalise import network_inputs
 from jaxsafe.learn.replay import Record, Source
 from jaxsafe.learn.steps import Trainable
-from jaxsafe.types import Metrics, Policy, PyTree
+from jaxsafe.types import Metrics, Policy, PyTree, Shared
 
 
 class GradientStep(NamedTuple):
@@ -36,7 +36,8 @@ def by_policy(learned: Learned, obs: jax.Array, key: jax.Array | None) -> jax.Ar
 
 
 class Learner(NamedTuple):
-    """What a method adds to the loop. Observations are normalised before they come here.
+    """What a method adds to the loop. Observations are normalised before they come here, except those
+    of `policy`.
 
     init(key, obs_size, action_size, cfg) -> Trainable.
     step(nets, batch, at, cfg, axis_name) -> (Trainable, metrics), one gradient step on Transitions or
@@ -45,12 +46,12 @@ class Learner(NamedTuple):
     act(learned, obs [..., O], key) -> action [..., A], the mean one where key is None. `learned` holds
         networks, `params`, the treatment's state, `dual`, and `config`.
     explore(learned, obs [N, O], key) -> action [N, A], how training acts; None: as `act`.
-    policy: how a method acts that remembers, or that looks into the simulator. Such a method explores
-        as its policy does, and its `act` and `explore` are not used.
+    policy: for methods that remember something, or that look into the simulator. They act and explore
+        by this policy. `act` and `explore` are then not used.
     refit(nets, replay, shared, key, cfg, axis_name) -> (Trainable, metrics), after the rounds of an
         update; None where there is nothing to refit.
     record(cfg) -> what makes a row of the replay: (stepping, action [N, A]) -> Record.
-    replayed(key, source, cfg, axis_name) -> (batch, number dropped), what a gradient step takes of a
+    replayed(key, source, cfg, axis_name) -> (batch, number dropped), what a gradient step draws from a
         replay. None: Transitions.
     """
 
@@ -59,7 +60,9 @@ class Learner(NamedTuple):
     act: Callable[[Learned, jax.Array, jax.Array | None], jax.Array] = by_policy
     explore: Callable[[Learned, jax.Array, jax.Array], jax.Array] | None = None
     policy: Policy | None = None
-    refit: Callable[..., tuple[Trainable, Metrics]] | None = None
+    refit: (
+        Callable[[Trainable, Any, Shared, jax.Array, Any, str | None], tuple[Trainable, Metrics]] | None
+    ) = None
     record: Callable[[Any], Callable[[Stepping, jax.Array], Record]] = lambda cfg: arrival_record
     replayed: Callable[[jax.Array, Source, Any, str | None], tuple[Any, jax.Array]] | None = None
 

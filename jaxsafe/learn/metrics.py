@@ -1,5 +1,6 @@
-"""Metrics of a batch that all loops report."""
+"""Metrics of environment steps, which all loops that take some report."""
 
+from collections.abc import Callable
 from functools import partial
 from typing import Protocol
 
@@ -25,6 +26,42 @@ class Ends(Protocol):
 
     @property
     def length(self) -> jax.Array: ...
+
+
+class Steps(Ends, Protocol):
+    """What steps earned and cost, float [T, N], and which were bad."""
+
+    @property
+    def reward(self) -> jax.Array: ...
+
+    @property
+    def cost(self) -> jax.Array: ...
+
+    @property
+    def bad(self) -> Bad: ...
+
+
+def step_metrics(
+    env: Env,
+    steps: Steps,
+    rate: Callable[[jax.Array], jax.Array],
+    length: jax.Array,
+    axis_name: str | None,
+) -> Metrics:
+    """What steps earned and cost.
+
+    Args:
+        rate: x [T, N] -> the mean of x over the steps that count, on all devices, float [].
+        length: mean length of an episode, in steps.
+    """
+    cost_rate = rate(steps.cost)
+    return {
+        **episode_metrics(env, steps, axis_name),
+        **world_metrics(steps.bad, axis_name),
+        "train/cost_rate": cost_rate,  # per environment step
+        "train/cost_estimate": cost_rate * length,  # of an episode, this iteration's
+        "train/return_estimate": rate(steps.reward) * length,  # likewise
+    }
 
 
 def explained_variance(error: jax.Array, target: jax.Array, axis_name: str | None) -> jax.Array:

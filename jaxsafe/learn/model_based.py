@@ -1,8 +1,8 @@
 """Planning algorithms as learners of the off-policy loop: a model that is refitted, and a planner.
 
-The loop takes the environment steps and writes the replay. The plan is the policy's carry. At the end
-of an update the model is refitted, if that is due by the loop's clock. A method may learn an actor and
-critics besides, by gradient steps on the same replay.
+The loop takes the environment steps and writes the replay. What the policy remembers is its plan. At
+the end of an update the model is refitted, if that is due by the loop's clock. A method may also learn
+an actor and critics, by gradient steps on the same replay.
 """
 
 from typing import Any
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from jaxsafe.config import config
 from jaxsafe.learn.learner import GradientStep, Learner
-from jaxsafe.learn.models import ModelConfig, init_model, record_by, refit
+from jaxsafe.learn.models import ModelConfig, init_model, model_of, record_by, refit, with_model
 from jaxsafe.learn.off_policy import off_policy
 from jaxsafe.learn.planning import PlanConfig, Planner, planning_policy
 from jaxsafe.learn.replay import Transitions
@@ -27,7 +27,7 @@ class ModelBasedConfig(PlanConfig, ModelConfig):
 
 
 def no_learner() -> Learner:
-    """Of a method that learns nothing but the model."""
+    """The learner of a method that learns nothing but the model."""
 
     def step(nets: Trainable, *_: Any) -> tuple[Trainable, Metrics]:
         return nets, {}
@@ -46,9 +46,10 @@ def model_based(
     """The algorithm that plans by `planner`.
 
     Args:
-        planner: by which scores and weights.
-        treatment: what moves with the cost of episodes; the planner has it as `learned.dual`.
-        beside: learns an actor and critics for the planner.
+        planner: the scores and weights of plans.
+        treatment: a price on cost, or another number that moves with the cost of episodes. The planner
+            has it as `learned.dual`.
+        beside: learns an actor and critics for the planner, on the same replay.
     """
     other = beside or no_learner()
 
@@ -56,17 +57,15 @@ def model_based(
         scores = jnp.zeros(cfg.plans)
         planner.weigh(scores, scores, cfg)  # refuses settings that it cannot serve
         model_key, key = jax.random.split(key)
-        model, state = init_model(model_key, env, cfg)
-        nets = other.init(key, obs_size, action_size, cfg)
-        return Trainable(nets.params | {"model": model}, nets.opt_state | {"model": state})
+        model = init_model(model_key, env, cfg)
+        return with_model(other.init(key, obs_size, action_size, cfg), model)
 
     def step(
         nets: Trainable, batch: Transitions, at: GradientStep, cfg: Any, axis_name: str | None
     ) -> tuple[Trainable, Metrics]:
-        models = [{"model": x["model"]} for x in nets]
         rest = Trainable(*({k: x for k, x in part.items() if k != "model"} for part in nets))
         new, metrics = other.step(rest, batch, at, cfg, axis_name)
-        return Trainable(new.params | models[0], new.opt_state | models[1]), metrics
+        return with_model(new, model_of(nets)), metrics
 
     learner = Learner(
         init=init, step=step, policy=planning_policy(env, planner), refit=refit, record=record_by

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import optax
 
 from jaxsafe.config import Amount, Bounds, ConfigError, Iterations, Rate, Units, Weight, config
-from jaxsafe.learn.batch import device_key, pmean, psum, select_rows
+from jaxsafe.learn.batch import device_count, device_key, pmean, psum, select_rows
 from jaxsafe.learn.next_step_rollout import Stepping, arrival_record
 from jaxsafe.learn.replay import Record, Span, held
 from jaxsafe.learn.steps import Trainable, descend
@@ -31,7 +31,7 @@ from jaxsafe.types import Env, Metrics, PyTree, Shared, State
 FARTHEST = 100.0  # no predicted observation is larger, as in OmniSafe
 HOLDOUT_BATCH = 512  # rows of each model at once
 BETTER = 0.99  # times the best hold-out error is an improvement, as in the code of Janner et al.
-LEAST_SPREAD = 1e-12  # of an input, as in the code of Chua et al.
+LEAST_STD = 1e-12  # of an input; a smaller one counts as 1, as in the code of Chua et al.
 
 
 @config
@@ -51,13 +51,14 @@ class ModelConfig:
     # Units of the hidden layers of each, as in the paper.
     model_hidden: tuple[Units, ...] = (200, 200, 200, 200)
     # Environment steps between two refits of the model, of all environments together; rounded to whole
-    # updates. OmniSafe has 1,200 raw steps of its one.
+    # updates. OmniSafe refits every 1,200 raw steps of its only environment.
     refit_every: Annotated[int, Bounds(1, 2**30)] = 1280
     model_lr: Rate = 1e-3  # Adam's step of the model, as in the paper.
     # Transitions of a step of each model, of all devices together, drawn with replacement. As in
     # OmniSafe.
     model_batch: Amount = 256
-    weight_decay: Weight = 1e-4  # Of the last layer; the others have a part of it. As in the paper.
+    # The decay of the last layer's weights. The other layers have 1/4 to 3/4 of it. As in the paper.
+    weight_decay: Weight = 1e-4
     # Transitions are kept from training with this probability, to measure the error. As in OmniSafe.
     holdout: Annotated[float, Bounds(0.01, 0.99)] = 0.2
     # Epochs without an improvement by 1% that end a refit, as in OmniSafe.
@@ -102,7 +103,9 @@ def simulator(env: Env) -> Model:
     """The environment as its own model. The latent is its State."""
     step = jax.vmap(jax.vmap(jax.vmap(env.step)))
 
-    def predict(fitted: PyTree, latent: State, action: jax.Array, key: jax.Array, cfg: Any):
+    def predict(
+        fitted: PyTree, latent: State, action: jax.Array, key: jax.Array, cfg: Any
+    ) -> Prediction:
         after = step(latent, action)
         return Prediction(
             after, after.reward, after.cost, jnp.zeros_like(after.reward), after.terminated
@@ -125,7 +128,9 @@ class Fitted:
 def learned_model(env: Env) -> Model:
     """The ensemble as a model. The latent is an observation. It foresees no end of an episode."""
 
-    def predict(fitted: Fitted, latent: jax.Array, action: jax.Array, key: jax.Array, cfg: Any):
+    def predict(
+        fitted: Fitted, latent: jax.Array, action: jax.Array, key: jax.Array, cfg: Any
+    ) -> Prediction:
         inputs = jnp.concatenate([latent, jnp.clip(action, -1.0, 1.0)], -1)
         dist = outputs_of(fitted.ensemble, fitted.scale, inputs)
         out = sample(dist, key)
@@ -152,15 +157,24 @@ def observed_cost(env: Env) -> Callable[[jax.Array], jax.Array]:
     return cost
 
 
-def init_model(key: jax.Array, env: Env, cfg: Any) -> tuple[PyTree, PyTree]:
-    """What is fitted of a model, and its optimiser's state; () of the simulator."""
+def init_model(key: jax.Array, env: Env, cfg: Any) -> Trainable:
+    """What is fitted of a model, `Fitted`, and its optimiser's state; () of the simulator."""
     if cfg.true_model:
-        return (), ()
+        return Trainable((), ())
     if not cfg.learn_cost:
         observed_cost(env)
     inputs, outputs = env.obs_size + env.action_size, 1 + cfg.learn_cost + env.obs_size
     ensemble: PyTree = init_ensemble(key, cfg.models, inputs, cfg.model_hidden, outputs)
-    return Fitted(ensemble, unscaled(inputs)), optax.adam(cfg.model_lr).init(ensemble)
+    return Trainable(Fitted(ensemble, unscaled(inputs)), optax.adam(cfg.model_lr).init(ensemble))
+
+
+def model_of(nets: Trainable) -> Trainable:
+    """The model among what a learner trains."""
+    return Trainable(nets.params["model"], nets.opt_state["model"])
+
+
+def with_model(nets: Trainable, model: Trainable) -> Trainable:
+    return Trainable(nets.params | {"model": model.params}, nets.opt_state | {"model": model.opt_state})
 
 
 # ---- data --------------------------------------------------------------------------------------
@@ -189,9 +203,9 @@ def learnable(ring: ModelRecord, span: Span) -> jax.Array:
     next row, within an episode, without a jump and to something finite."""
     rows = ring.reward.shape[0]
     position = (jnp.arange(rows) - span.oldest) % rows
-    held = (position < span.count - 1)[:, None]
+    has_next = (position < span.count - 1)[:, None]
     arrives = ~ring.jump & jnp.isfinite(ring.reward) & jnp.isfinite(ring.cost)
-    return held & ~ring.last & jnp.roll(arrives, -1, axis=0)
+    return has_next & ~ring.last & jnp.roll(arrives, -1, axis=0)
 
 
 def transitions_at(ring: ModelRecord, flat: jax.Array, cfg: Any) -> tuple[jax.Array, jax.Array]:
@@ -214,20 +228,20 @@ def scale_of(ring: ModelRecord, mask: jax.Array, axis_name: str | None) -> Scale
     def mean(x: jax.Array) -> jax.Array:
         return psum(jnp.where(mask[..., None], x, 0.0).sum((0, 1)), axis_name) / count
 
-    def moments(x: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def mean_and_std(x: jax.Array) -> tuple[jax.Array, jax.Array]:
         centre = mean(x)
         return centre, jnp.sqrt(mean((x - centre) ** 2))
 
-    parts = moments(ring.obs), moments(jnp.clip(ring.action, -1.0, 1.0))
-    centre, spread = (jnp.concatenate(x) for x in zip(*parts, strict=True))
-    return Scale(centre, jnp.where(spread < LEAST_SPREAD, 1.0, spread))
+    parts = mean_and_std(ring.obs), mean_and_std(jnp.clip(ring.action, -1.0, 1.0))
+    centre, std = (jnp.concatenate(x) for x in zip(*parts, strict=True))
+    return Scale(centre, jnp.where(std < LEAST_STD, 1.0, std))
 
 
 # ---- fitting -----------------------------------------------------------------------------------
 
 
 class Rows(NamedTuple):
-    """Some entries of a ring: `flat` int32 [R N], of which the first `count` [] are meant."""
+    """Some entries of a ring: the first `count` [] of `flat`, int32 [R N]. What follows is padding."""
 
     flat: jax.Array
     count: jax.Array
@@ -252,15 +266,14 @@ class Fit(NamedTuple):
 
 
 def fit(
-    fitted: Fitted,
-    opt_state: PyTree,
+    model: Trainable,
     ring: ModelRecord,
     span: Span,
     key: jax.Array,
     cfg: Any,
     axis_name: str | None = None,
-) -> tuple[Fitted, PyTree, Metrics]:
-    """The ensemble after training on all that the ring holds, from where it is.
+) -> tuple[Trainable, Metrics]:
+    """`model`, as of `init_model`, after training on all that the ring holds, from where it is.
 
     Epoch by epoch, until for `patience` epochs no model's hold-out error has fallen below 99% of its
     least. Each model is then put back to where its error was least.
@@ -270,8 +283,7 @@ def fit(
     kept = jax.random.uniform(split_key, usable.shape) < cfg.holdout
     train, held_out = rows_where(usable & ~kept), rows_where(usable & kept)
     scale = scale_of(ring, usable & ~kept, axis_name)
-    devices = 1 if axis_name is None else jax.lax.axis_size(axis_name)
-    batch = (cfg.models, cfg.model_batch // devices)
+    batch = (cfg.models, cfg.model_batch // device_count(axis_name))
     steps = jnp.maximum(psum(train.count, axis_name) // cfg.model_batch, 1)
     steps = jnp.int32(cfg.epoch_steps) if cfg.epoch_steps else steps
     optimiser = optax.adam(cfg.model_lr)
@@ -317,8 +329,8 @@ def fit(
             skipped=skipped,
         )
 
-    none, old = jnp.int32(0), fitted.ensemble
-    begin = Fit(old, opt_state, old, jnp.full(cfg.models, jnp.inf), none, none, none)
+    none, old = jnp.int32(0), model.params.ensemble
+    begin = Fit(old, model.opt_state, old, jnp.full(cfg.models, jnp.inf), none, none, none)
     end = jax.lax.while_loop(
         lambda now: (now.stale < cfg.patience) & (now.epochs < cfg.max_epochs), epoch, begin
     )
@@ -328,7 +340,7 @@ def fit(
         "train/model_steps": (end.epochs * steps).astype(jnp.float32),
         "train/nonfinite": end.skipped.astype(jnp.float32),
     }
-    return Fitted(end.best, scale), end.opt_state, metrics
+    return Trainable(Fitted(end.best, scale), end.opt_state), metrics
 
 
 def refit(
@@ -346,7 +358,7 @@ def refit(
     """
     if cfg.true_model:
         return nets, {"train/nonfinite": jnp.zeros(())}
-    devices = 1 if axis_name is None else jax.lax.axis_size(axis_name)
+    devices = device_count(axis_name)
     if cfg.model_batch % devices:
         raise ConfigError(f"model_batch={cfg.model_batch} does not split over {devices} devices")
     steps = cfg.num_envs * devices * cfg.horizon  # of an update
@@ -356,16 +368,15 @@ def refit(
     rows = replay.reward.shape[0]
     span = held(rows, cfg.horizon, cfg.horizon, jnp.asarray(shared.iteration), shared.since)
 
-    def learn(fitted: Fitted, opt_state: PyTree) -> tuple[Fitted, PyTree, Metrics]:
-        return fit(fitted, opt_state, replay, span, key, cfg, axis_name)
+    def learn(model: Trainable) -> tuple[Trainable, Metrics]:
+        return fit(model, replay, span, key, cfg, axis_name)
 
-    given = nets.params["model"], nets.opt_state["model"]
-    like = jax.eval_shape(learn, *given)[2]
+    old = model_of(nets)
+    like = jax.eval_shape(learn, old)[1]
 
-    def leave(fitted: Fitted, opt_state: PyTree) -> tuple[Fitted, PyTree, Metrics]:
+    def leave(model: Trainable) -> tuple[Trainable, Metrics]:
         none = {k: jnp.full(x.shape, jnp.nan) for k, x in like.items()}
-        return fitted, opt_state, none | {"train/nonfinite": jnp.zeros(())}
+        return model, none | {"train/nonfinite": jnp.zeros(())}
 
-    model, state, metrics = jax.lax.cond(due, learn, leave, *given)
-    params = nets.params | {"model": model}
-    return Trainable(params, nets.opt_state | {"model": state}), metrics
+    new, metrics = jax.lax.cond(due, learn, leave, old)
+    return with_model(nets, new), metrics

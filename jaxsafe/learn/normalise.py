@@ -1,4 +1,6 @@
-"""Running mean and variance of observations, rewards and costs, merged over batches and devices.
+"""Running statistics that bring observations, rewards and costs to about the same size.
+
+A `Normaliser` has the mean and variance of all samples so far, merged over batches and devices:
 
     w = n / (count + n);  d = mean_batch - mean
     mean <- mean + w d;   var <- var + w (var_batch - var) + w (1 - w) d^2
@@ -7,13 +9,18 @@ Source: Chan, Golub and LeVeque (1983), "Algorithms for Computing the Sample Var
 variance rather than the sum of squares, and the merge as a weighted mean, needs only the relative
 precision of `count`, so float32 serves beyond 1e9 samples. Floor and clip are OmniSafe's; it uses
 the unbiased variance, which differs by 1 / count.
+
+`Moments` are for rewards and costs that a replay gives again and again: running means of replayed
+batches, in which recent batches may count more.
 """
+
+from typing import NamedTuple
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 
-from jaxsafe.learn.batch import batch_mean, psum
+from jaxsafe.learn.batch import batch_mean, pmean, psum
 
 MIN_STD = 0.01  # in units of what is normalised
 CLIP = 5.0  # standard deviations
@@ -69,3 +76,45 @@ def network_inputs(normaliser: Normaliser | tuple[()], obs: jax.Array) -> jax.Ar
     if obs.shape[-1] == size:
         return normalise(normaliser, obs)
     return jnp.concatenate([normalise(normaliser, obs[..., :size]), obs[..., size:]], -1)
+
+
+class Moments(NamedTuple):
+    """Running means of S signals and of their squares, float [S], and the updates so far, float []."""
+
+    count: jax.Array
+    mean: jax.Array
+    square: jax.Array
+
+
+def no_moments(size: int) -> Moments:
+    return Moments(jnp.float32(0), jnp.zeros(size), jnp.zeros(size))
+
+
+def averaged(
+    past: Moments, x: jax.Array, weight: jax.Array, axis_name: str | None, memory: float = 8
+) -> Moments:
+    """`past` moved towards the means of `x` [..., B, S], whose entries of axis B have `weight`.
+
+    The k-th update, from 0 on, has the rate memory / (memory + k). With 1 that is the mean of all
+    batches; with more, old ones are slowly forgotten.
+    """
+    rate = memory / (memory + past.count)
+
+    def mean(x: jax.Array) -> jax.Array:
+        over_batch = (x * weight[:, None]).sum(-2)
+        return pmean(over_batch.reshape(-1, x.shape[-1]).mean(0), axis_name)
+
+    def moved(old: jax.Array, x: jax.Array) -> jax.Array:
+        return old + rate * (mean(x) - old)
+
+    return Moments(past.count + 1, moved(past.mean, x), moved(past.square, x**2))
+
+
+def standard(
+    moments: Moments, x: jax.Array, centre: bool, least: float = 1e-5, most: float = 10.0
+) -> jax.Array:
+    """`x` [..., S] in standard deviations, from the mean if `centre`, clipped to +-`most`. A standard
+    deviation counts as `least` at least."""
+    variance = jnp.maximum(moments.square - moments.mean**2, 0.0)
+    offset = moments.mean if centre else 0.0
+    return jnp.clip((x - offset) / jnp.maximum(jnp.sqrt(variance), least), -most, most)

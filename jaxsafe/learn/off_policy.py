@@ -1,13 +1,15 @@
 """The off-policy loop: rollout, replay, gradient steps, as one pure update.
 
-An update is `horizon` steps of every environment. They go in rounds: `learn_every` steps, whose rows
-are written into the replay, and then the gradient steps that `replay_ratio` asks for. What a method
-adds to this is a `Learner`, and a `Treatment` of the constraint, whose price moves on a clock of
-environment steps: see `jaxsafe.learn.bill`.
+An update is `horizon` steps of every environment. They go in rounds. A round is `learn_every` steps,
+whose rows are written into the replay, and then the gradient steps that `replay_ratio` asks for. After
+the rounds a method may refit a model, and the price on cost moves if it is due.
 
-`jit(update)` compiles an iteration, `vmap(update, in_axes=(0, None))` runs seeds or floats of the
-config side by side, and `shard_map(update)` with `axis_name` set splits environments, replay and batch
-over devices: each device then holds `cfg.num_envs` of its own, and the same parameters.
+What a method adds to this is a `Learner`, and a `Treatment` of the constraint, whose price moves on a
+clock of environment steps: see `jaxsafe.learn.bill`.
+
+`jit(update)` compiles an iteration. `vmap(update, in_axes=(0, None))` runs seeds or floats of the
+config side by side. `shard_map(update)` with `axis_name` set splits environments, replay and batch over
+devices. Each device then holds `cfg.num_envs` environments of its own, and the same parameters.
 """
 
 import dataclasses
@@ -33,18 +35,13 @@ from jaxsafe.config import (
     check_values,
     config,
 )
-from jaxsafe.learn.acting import Learned, learned_of, reset_carry
-from jaxsafe.learn.batch import all_finite, device_key, masked_mean, psum, select
+from jaxsafe.learn.acting import Learned, Player, learned_of, reset_carry
+from jaxsafe.learn.batch import all_finite, device_count, device_key, masked_mean, psum, select
 from jaxsafe.learn.bill import charge, empty_bill, settle
 from jaxsafe.learn.constraints import Names, check_cost_names, metrics_by_constraint, signal
 from jaxsafe.learn.learner import GradientStep, Learner, policy_by
-from jaxsafe.learn.metrics import episode_metrics, world_metrics
-from jaxsafe.learn.next_step_rollout import (
-    Stepping,
-    StepRecord,
-    collect_records,
-    started,
-)
+from jaxsafe.learn.metrics import step_metrics
+from jaxsafe.learn.next_step_rollout import Stepping, StepRecord, collect_records, started
 from jaxsafe.learn.normalise import init_normaliser, merge, network_inputs
 from jaxsafe.learn.replay import (
     Record,
@@ -63,7 +60,7 @@ from jaxsafe.learn.returns import LostTime, expected_length, no_lost_time
 from jaxsafe.learn.rollout import check_steps, init_rollout
 from jaxsafe.learn.steps import Trainable, remaining
 from jaxsafe.learn.treatments import Treatment, no_treatment
-from jaxsafe.types import Algorithm, Clocks, Count, Env, Metrics, Policy, PyTree, Shared, State
+from jaxsafe.types import Algorithm, Clocks, Count, Env, Metrics, PyTree, Shared, State
 
 
 @config
@@ -149,8 +146,8 @@ class RoundCarry(NamedTuple):
     replay: Record
 
 
-class Moment(NamedTuple):
-    """The round that the loop's clock is at. All but `remaining` is the same for all members.
+class RoundClock(NamedTuple):
+    """Where a round stands in the run. All but `remaining` is the same for all members.
 
     before, after: Span, what the ring holds before and after the rows of the round are written.
     warming_up: bool [], whether actions are random.
@@ -170,8 +167,10 @@ class Moment(NamedTuple):
 class RoundReport(NamedTuple):
     """What a round came to.
 
-    steps: StepRecord [learn_every, N]. metrics: of its gradient steps, [updates] each. ready: see
-    `Moment`. skipped: bool [], whether its observations would have spoilt the normaliser.
+    steps: StepRecord [learn_every, N].
+    metrics: of its gradient steps, [updates] each.
+    ready: see `RoundClock`.
+    skipped: bool [], whether the normaliser left out its observations because they are not finite.
     """
 
     steps: StepRecord
@@ -181,8 +180,11 @@ class RoundReport(NamedTuple):
 
 
 class Priced(NamedTuple):
-    """The price on cost after an update, the bill since it last moved, metrics, and whether a move of
-    the price failed, bool []."""
+    """The price on cost after an update.
+
+    dual: the treatment's state. bill: Bill since the price last moved. failed: bool [], whether a move
+    was left out because the new price is not finite.
+    """
 
     dual: PyTree
     bill: PyTree
@@ -238,7 +240,7 @@ def off_policy(
         ) -> tuple[RoundCarry, RoundReport]:
             number, key = x
             gather_key, learn_key = jax.random.split(key)
-            at = moment(number, shared, sizes, ts.config, learner.refit is not None)
+            at = round_clock(number, shared, sizes, ts.config, learner.refit is not None)
             now, steps, skipped = gather(ts, now, at, gather_key)
 
             def learn(nets: Trainable) -> tuple[Trainable, Metrics]:
@@ -257,11 +259,12 @@ def off_policy(
         nets, refitted = refit(ts, now, shared, refit_key)
 
         steps = jax.tree.map(lambda x: x.reshape(ts.config.horizon, *x.shape[2:]), rounds.steps)
-        taken, limit = steps.real.sum(), env.episode_length
-        length, lost_time = expected_length(ts.lost_time, limit, steps, taken, axis_name)
+        taken = steps.real.sum()
+        length, lost_time = expected_length(ts.lost_time, env.episode_length, steps, taken, axis_name)
         after = pay(ts, steps, length, shared.iteration)
         metrics = means_of_gradient_steps(rounds.metrics, rounds.ready) | after.metrics
-        metrics |= step_metrics(env, steps, length, treatment.constrained_costs(ts.config), axis_name)
+        names = treatment.constrained_costs(ts.config)
+        metrics |= metrics_of_steps(env, steps, length, names, axis_name)
         lost = rounds.metrics["train/nonfinite"].sum() + rounds.skipped.sum() + after.failed
         lost += refitted.pop("train/nonfinite", 0)
         metrics |= refitted | {"train/nonfinite": lost}
@@ -280,7 +283,7 @@ def off_policy(
         return ts, jax.tree.map(jnp.float32, metrics)
 
     def gather(
-        ts: TrainState, now: RoundCarry, at: Moment, key: jax.Array
+        ts: TrainState, now: RoundCarry, at: RoundClock, key: jax.Array
     ) -> tuple[RoundCarry, StepRecord, jax.Array]:
         """The environment steps of a round, and whether the normaliser had to skip them."""
         cfg, sizes = ts.config, sizes_of(ts.config, axis_name)
@@ -297,7 +300,8 @@ def off_policy(
 
             def chosen(carry: PyTree) -> tuple[jax.Array, PyTree]:
                 if learner.policy is not None:
-                    return act_in_all(policy, learned, carry, state, first, explore_key)
+                    player = Player(policy, learned, env)
+                    return act_in_all(player, carry, state, first, explore_key)
                 return explore(learned, network_inputs(now.normaliser, state.obs), explore_key), carry
 
             return jax.lax.cond(at.warming_up, at_random, chosen, carry)
@@ -313,9 +317,9 @@ def off_policy(
         return RoundCarry(now.nets, normaliser, stepping, replay), steps, skipped
 
     def gradient_steps(
-        ts: TrainState, now: RoundCarry, at: Moment, key: jax.Array
+        ts: TrainState, now: RoundCarry, at: RoundClock, key: jax.Array
     ) -> tuple[Trainable, Metrics]:
-        """Those of a round, each on a batch of its own; metrics are [updates]."""
+        """The gradient steps of a round, each on a batch of its own. Metrics are [updates]."""
         cfg, sizes = ts.config, sizes_of(ts.config, axis_name)
         source = Source(now.replay, at.after, now.normaliser, sizes.batch, sizes.n_step)
 
@@ -357,14 +361,11 @@ def off_policy(
 
 
 def act_in_all(
-    policy: Policy, learned: Learned, carry: PyTree, state: State, first: jax.Array, key: jax.Array
+    player: Player, carry: PyTree, state: State, first: jax.Array, key: jax.Array
 ) -> tuple[jax.Array, PyTree]:
     """The actions [N, A] of a policy in N environments, and its carries, begun anew at `first` [N]."""
-    carry = reset_carry(policy, learned, carry, first)
-    seen = state if policy.privileged(learned) else state.obs
-    keys = jax.random.split(key, len(first))
-    action, carry, _ = jax.vmap(policy.act, in_axes=(None, 0, 0, 0))(learned, carry, seen, keys)
-    return action, carry
+    carry = reset_carry(player.policy, player.learned, carry, first)
+    return jax.vmap(player.act)(carry, state, jax.random.split(key, len(first)))
 
 
 def drawn_transitions(
@@ -391,21 +392,17 @@ def means_of_gradient_steps(metrics: Metrics, ready: jax.Array) -> Metrics:
     return jax.tree.map(mean, metrics)
 
 
-def step_metrics(
+def metrics_of_steps(
     env: Env, steps: StepRecord, length: jax.Array, names: Names, axis_name: str | None
 ) -> Metrics:
-    """What steps earned and cost. `length` is of an episode, in steps."""
+    """What real steps earned and cost. `length` is of an episode, in steps."""
 
     def rate(x: jax.Array) -> jax.Array:
         return masked_mean(x, steps.real, axis_name)
 
     charged = signal(env, steps, names)
     return {
-        **episode_metrics(env, steps, axis_name),
-        **world_metrics(steps.bad, axis_name),
-        "train/cost_rate": rate(steps.cost),  # per environment step
-        "train/cost_estimate": rate(steps.cost) * length,  # of an episode
-        "train/return_estimate": rate(steps.reward) * length,  # likewise
+        **step_metrics(env, steps, rate, length, axis_name),
         **{f"train/cost_estimate_{n}": rate(charged[..., k]) * length for k, n in enumerate(names)},
     }
 
@@ -414,9 +411,16 @@ def step_metrics(
 
 
 class Sizes(NamedTuple):
-    """What follows from the config: rounds of an update; rows of a round; gradient steps of a round;
-    transitions of a device's share of a batch, and steps of each; rows of the replay; rows of warm-up;
-    whether observations are normalised."""
+    """What follows from the config.
+
+    rounds: of an update.
+    every, updates: steps of each environment, and gradient steps, in a round.
+    batch: rows of a device's share of a batch.
+    n_step: steps of a transition, at most.
+    rows: of the replay.
+    warm_up: rows, of each environment, that are taken with random actions.
+    normalises: whether observations are normalised.
+    """
 
     rounds: int
     every: int
@@ -436,7 +440,7 @@ def sizes_of(cfg: Any, axis_name: str | None) -> Sizes:
     """
     check_values(cfg)
     check_steps(cfg.num_envs, cfg.horizon)
-    devices = 1 if axis_name is None else jax.lax.axis_size(axis_name)
+    devices = device_count(axis_name)
     num_envs = cfg.num_envs * devices
     rows = ring_rows(cfg.replay_size, num_envs, cfg.horizon)
     warm_up = -(-cfg.learning_starts // num_envs)
@@ -477,14 +481,14 @@ def sizes_of(cfg: Any, axis_name: str | None) -> Sizes:
     )
 
 
-def moment(number: jax.Array, shared: Shared, sizes: Sizes, cfg: Any, refits: bool) -> Moment:
-    """The moment of round `number` of an iteration. A learner that refits something does so at the end
+def round_clock(number: jax.Array, shared: Shared, sizes: Sizes, cfg: Any, refits: bool) -> RoundClock:
+    """The clock at round `number` of an iteration. A learner that refits something does so at the end
     of an iteration, so its warm-up lasts until then."""
     iteration, since = jnp.asarray(shared.iteration), shared.since
     written = number * sizes.every  # rows of this iteration, before the round
     filled = (iteration - since) * cfg.horizon + written + sizes.every
     acted = iteration * cfg.horizon + (0 if refits else written)  # rows of the whole run
-    return Moment(
+    return RoundClock(
         before=held(sizes.rows, cfg.horizon, written, iteration, since),
         after=held(sizes.rows, cfg.horizon, written + sizes.every, iteration, since),
         warming_up=acted < sizes.warm_up,

@@ -52,7 +52,7 @@ from jaxsafe.learn.estimates import (
     weights,
 )
 from jaxsafe.learn.gaussian_policy import decide, gaussian_policy, init_nets
-from jaxsafe.learn.metrics import episode_metrics, world_metrics
+from jaxsafe.learn.metrics import step_metrics
 from jaxsafe.learn.normalise import init_normaliser, merge
 from jaxsafe.learn.returns import (
     Estimator,
@@ -68,11 +68,7 @@ from jaxsafe.learn.steps import Context, Pair, PolicyStep, Trainable, fit_critic
 from jaxsafe.learn.surrogates import Surrogate, with_entropy
 from jaxsafe.learn.treatments import Treatment
 from jaxsafe.nn.gaussian import entropy, log_prob, sample
-from jaxsafe.nn.networks import (
-    action_dist,
-    stack,
-    stack_critics,
-)
+from jaxsafe.nn.networks import action_dist, stack, stack_critics
 from jaxsafe.types import Algorithm, Clocks, Env, Metrics, PyTree, Shared
 
 
@@ -117,7 +113,7 @@ class OnPolicyConfig:
     obs_normalize: bool = True
     # Whether the learner sees rewards scaled by their running mean and variance.
     reward_normalize: bool = False
-    # The same for costs. Limits and metrics keep the costs as they are.
+    # Whether the learner sees costs scaled likewise. Limits and metrics keep the costs as they are.
     cost_normalize: bool = False
     # Weight of the policy's entropy, which is added to what the policy maximises.
     entropy_coef: Weight = 0.0
@@ -389,10 +385,13 @@ def on_policy_loop(env: Env, method: Method, axis_name: str | None) -> Algorithm
         computed = (batch, normaliser, signals.normaliser, cost.of_iteration)
         after, finite = guarded(ts, after, computed, axis_name)
 
+        def rate(x: jax.Array) -> jax.Array:
+            return batch_mean(x, axis_name) * weight
+
         metrics = metrics_by_constraint(improved.metrics | fitted.metrics | explained, names)
         metrics["train/nonfinite"] += fitted.skipped + ~finite
         metrics |= {f"train/cost_estimate_{name}": cost.of_iteration[k] for k, name in enumerate(names)}
-        metrics |= rollout_metrics(env, traj, weight, length, axis_name)
+        metrics |= step_metrics(env, traj, rate, length, axis_name)
         dist = action_dist(improved.actor, batch.obs, cfg)
         metrics["train/entropy"] = batch_mean(entropy(dist), axis_name)
         return after, jax.tree.map(jnp.float32, metrics)
@@ -416,20 +415,6 @@ def guarded(
     names = ("dual", "normaliser", "signal_normaliser", "lost_time", "past_costs")
     kept = {name: select(finite, getattr(after, name), getattr(before, name)) for name in names}
     return dataclasses.replace(after, **kept), finite
-
-
-def rollout_metrics(
-    env: Env, traj: Trajectory, weight: jax.Array, length: jax.Array, axis_name: str | None
-) -> Metrics:
-    """What a rollout earned and cost. `weight` is of a good step, `length` of an episode (steps)."""
-    cost_rate = batch_mean(traj.cost, axis_name) * weight
-    return {
-        **episode_metrics(env, traj, axis_name),
-        **world_metrics(traj.bad, axis_name),
-        "train/cost_rate": cost_rate,  # per environment step
-        "train/cost_estimate": cost_rate * length,  # of an episode, this iteration's
-        "train/return_estimate": batch_mean(traj.reward, axis_name) * weight * length,  # likewise
-    }
 
 
 class FittedCritics(NamedTuple):

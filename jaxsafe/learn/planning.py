@@ -4,10 +4,12 @@
     R_s, C_s = scores of what the model's particles do with plan s
     w = weigh(R, C),   mean <- sum_s w_s a_s,   var <- sum_s w_s (a_s - mean)^2
 
-some times over; both keep a share of what they were. The first action of the last mean is executed. The
-next step begins with the mean moved on by one step, and with the variance that there was at first.
+This is repeated `cem_iterations` times; mean and var keep a share of what they were. The first action
+of the last mean is executed. The next step begins with the mean moved on by one step, and with the
+variance that there was at first.
 
-A planner is a policy whose carry is this mean. What the algorithms differ in is a `Planner`.
+The mean is all that the policy remembers: its carry. The algorithms differ in scores and weights. These
+make a `Planner`.
 
 Source: Chua et al. (2018), "Deep Reinforcement Learning in a Handful of Trials using Probabilistic
     Dynamics Models", arXiv:1805.12114.
@@ -49,8 +51,9 @@ class PlanConfig:
 class Imagined(NamedTuple):
     """What a model thinks of S plans over H steps, for P particles of each of M models.
 
-    reward, cost, spread: float [H, M, P, S]; rewards and costs are 0 after an end. obs: what is seen at
-    last, [M, P, S, O]. alive: bool [M, P, S], the episode still goes on there.
+    reward, cost, spread: float [H, M, P, S], see `models.Prediction`; rewards and costs are 0 after the
+    end of an episode. obs: what is seen after the last step, [M, P, S, O]. alive: bool [M, P, S],
+    whether the episode still goes on then.
     """
 
     reward: jax.Array
@@ -60,19 +63,23 @@ class Imagined(NamedTuple):
     alive: jax.Array
 
 
+PlanCost = Callable[[Imagined, Learned], jax.Array]  # -> float [S]
+Weigh = Callable[[jax.Array, jax.Array, Any], jax.Array]  # (return [S], cost [S], cfg) -> weights [S]
+
+
 class Planner(NamedTuple):
     """What one method adds to the planning.
 
-    ret(imagined, learned, key) -> float [S].
-    cost(imagined, learned) -> float [S], summed over the plan. The loop makes it the cost of a whole
-        episode, which `weigh` compares with the limit.
-    weigh(ret, cost, cfg) -> float [S], which sum to 1.
-    propose(model, learned, seen, key) -> a tuple of plans [.., H, A] that are tried, too; () is none.
+    ret(imagined, learned, key) -> float [S], the return of each plan.
+    cost(imagined, learned) -> float [S], the cost of each plan, summed over its steps. The policy
+        scales it to a whole episode, whose cost `weigh` compares with the limit.
+    weigh(ret, cost, cfg) -> weights, float [S], whose sum is 1.
+    propose(model, learned, seen, key) -> further plans to try: arrays [.., H, A], or () for none.
     """
 
     ret: Callable[[Imagined, Learned, jax.Array], jax.Array]
-    cost: Callable[[Imagined, Learned], jax.Array]
-    weigh: Callable[[jax.Array, jax.Array, Any], jax.Array]
+    cost: PlanCost
+    weigh: Weigh
     propose: Callable[[Model, Learned, PyTree, jax.Array], tuple[jax.Array, ...]] = lambda *_: ()
 
 
@@ -80,7 +87,7 @@ class Planner(NamedTuple):
 
 
 def particles_of(seen: PyTree, shape: tuple[int, ...]) -> PyTree:
-    """What is seen of one environment, for particles of some shape."""
+    """`seen` of one environment, repeated for each particle: leaves [*shape, ...]."""
     return jax.tree.map(lambda x: jnp.broadcast_to(x, (*shape, *x.shape)), seen)
 
 
@@ -93,17 +100,19 @@ def imagine(model: Model, learned: Learned, seen: PyTree, plans: jax.Array, key:
     cfg, fitted = learned.config, learned.params["model"]
     shape = (*model.particles(cfg), len(plans))
 
-    def step(now: tuple[PyTree, jax.Array], x: tuple[jax.Array, jax.Array]):
+    def step(
+        now: tuple[PyTree, jax.Array], x: tuple[jax.Array, jax.Array]
+    ) -> tuple[tuple[PyTree, jax.Array], tuple[jax.Array, ...]]:
         (latent, alive), (action, key) = now, x
         action = jnp.broadcast_to(action, (*shape, action.shape[-1]))
         after = model.predict(fitted, latent, action, key, cfg)
-        told = [jnp.where(alive, x, 0.0) for x in (after.reward, after.cost)]
-        return (after.latent, alive & ~after.end), (*told, after.spread)
+        reward, cost = (jnp.where(alive, x, 0.0) for x in (after.reward, after.cost))
+        return (after.latent, alive & ~after.end), (reward, cost, after.spread)
 
     start = particles_of(seen, shape), jnp.ones(shape, bool)
     keys = jax.random.split(key, plans.shape[1])
-    (latent, alive), told = jax.lax.scan(step, start, (jnp.moveaxis(plans, 1, 0), keys))
-    reward, cost, spread = told
+    (latent, alive), made = jax.lax.scan(step, start, (jnp.moveaxis(plans, 1, 0), keys))
+    reward, cost, spread = made
     return Imagined(reward, cost, spread, model.observe(latent), alive)
 
 
@@ -130,8 +139,8 @@ def worst_cost(imagined: Imagined, learned: Learned) -> jax.Array:
 
 
 def cautious_cost(imagined: Imagined, learned: Learned) -> jax.Array:
-    """As `mean_cost`, of c + kappa max_m |sigma_m|: the largest spread that a model has, at its own
-    particle of the same number, for the same plan and step. kappa is `learned.dual`."""
+    """As `mean_cost`, float [S], but each step costs c + kappa max_m |sigma_m|. The maximum is over the
+    models, at the same plan, step and number of the particle. kappa is `learned.dual`."""
     penalty = imagined.spread.max(1, keepdims=True)  # [H, 1, P, S]
     return (imagined.cost + learned.dual * penalty).mean((1, 2)).sum(0)
 
@@ -149,7 +158,7 @@ def standing(ret: jax.Array, cost: jax.Array, cfg: Any) -> tuple[jax.Array, jax.
     limit is feasible.
 
     Raises:
-        ConfigError: there are fewer plans than that.
+        ConfigError: there are fewer than `elites` plans.
     """
     if cfg.elites > len(ret):
         raise ConfigError(f"elites={cfg.elites}: expected at most plans={len(ret)}")
@@ -158,8 +167,8 @@ def standing(ret: jax.Array, cost: jax.Array, cfg: Any) -> tuple[jax.Array, jax.
 
 
 def elites(ret: jax.Array, cost: jax.Array, cfg: Any) -> jax.Array:
-    """Equal weights for the `elites` plans that earn most among the feasible ones; if there are fewer,
-    for those that cost least of all."""
+    """Equal weights for the `elites` feasible plans that earn most. If fewer are feasible, for the
+    `elites` plans that cost least."""
     enough, feasible = standing(ret, cost, cfg)
     value = jnp.where(enough, jnp.where(feasible, ret, -jnp.inf), -cost)
     value = jnp.where(sound(ret, cost), value, -jnp.inf)
@@ -180,8 +189,8 @@ def by_return(ret: jax.Array, cost: jax.Array, cfg: Any) -> jax.Array:
 
 
 def by_return_within_limit(ret: jax.Array, cost: jax.Array, cfg: Any) -> jax.Array:
-    """Weights in proportion to exp(temperature R) among the feasible plans; if fewer than `elites` are,
-    to exp(-cost_temperature C) among all."""
+    """Weights in proportion to exp(temperature R) among the feasible plans. If fewer than `elites` are
+    feasible, in proportion to exp(-cost_temperature C) among all."""
     enough, feasible = standing(ret, cost, cfg)
     exponent = jnp.where(enough, cfg.temperature * ret, -cfg.cost_temperature * cost)
     return exponential(exponent, jnp.where(enough, feasible, sound(ret, cost)))
@@ -191,7 +200,7 @@ def by_return_within_limit(ret: jax.Array, cost: jax.Array, cfg: Any) -> jax.Arr
 
 
 class Belief(NamedTuple):
-    """Of the best plan: mean and variance, float [H, A]."""
+    """Mean and variance of the plans that are drawn, float [H, A]."""
 
     mean: jax.Array
     var: jax.Array
@@ -199,7 +208,7 @@ class Belief(NamedTuple):
 
 def cem(
     score: Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]],
-    weigh: Callable[[jax.Array, jax.Array, Any], jax.Array],
+    weigh: Weigh,
     mean: jax.Array,
     proposals: tuple[jax.Array, ...],
     key: jax.Array,
@@ -209,7 +218,7 @@ def cem(
 
     Args:
         score: (plans [S, H, A], key) -> return and cost, float [S] each.
-        weigh: (return, cost, cfg) -> weights, float [S].
+        weigh: see `Planner`.
         mean: where to begin, float [H, A].
         proposals: plans [.., H, A] that are tried each time, too.
     """
@@ -245,14 +254,16 @@ def planning_bytes(env: Env, cfg: Any) -> int:
 
 def planning_policy(env: Env, planner: Planner) -> Policy:
     """The policy that plans anew at each step. Its carry is the mean of the plan, [H, A]."""
-    known, fitted = simulator(env), learned_model(env)
+    simulated, ensemble = simulator(env), learned_model(env)
 
     def init(learned: Learned) -> jax.Array:
         return jnp.zeros((learned.config.plan_steps, env.action_size))
 
-    def act(learned: Learned, carry: jax.Array, seen: PyTree, key: jax.Array | None):
+    def act(
+        learned: Learned, carry: jax.Array, seen: PyTree, key: jax.Array | None
+    ) -> tuple[jax.Array, jax.Array, dict[str, Any]]:
         cfg = learned.config
-        model = known if cfg.true_model else fitted
+        model = simulated if cfg.true_model else ensemble
         key = jax.random.key(0) if key is None else key  # the same draws at every step
         plan_key, propose_key = jax.random.split(key)
         per_episode = env.episode_length / cfg.plan_steps

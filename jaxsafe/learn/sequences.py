@@ -1,4 +1,4 @@
-"""Gradient steps on sequences from a replay: what is drawn, its TD(lambda) returns, its scale."""
+"""Gradient steps on sequences from a replay: what is drawn, and its TD(lambda) returns."""
 
 from typing import Any, NamedTuple
 
@@ -72,45 +72,3 @@ def lambda_returns(
     ends = jnp.concatenate([~batch.follows[1:], jnp.ones_like(batch.follows[:1])])
     steps = ValuedSteps(reward[1:], value[:-1], value[1:], batch.rows.terminated[1:], ends)
     return value[:-1] + gae(steps, discount, decay)
-
-
-class Moments(NamedTuple):
-    """Running means of S signals and of their squares, float [S], and the updates so far, float []."""
-
-    count: jax.Array
-    mean: jax.Array
-    square: jax.Array
-
-
-def no_moments(size: int) -> Moments:
-    return Moments(jnp.float32(0), jnp.zeros(size), jnp.zeros(size))
-
-
-def averaged(
-    past: Moments, x: jax.Array, weight: jax.Array, axis_name: str | None, memory: float = 8
-) -> Moments:
-    """`past` moved towards the means of `x` [..., B, S], whose entries of axis B have `weight`.
-
-    The k-th update, from 0 on, has the rate memory / (memory + k). With 1 that is the mean of all
-    batches; with more, old ones are slowly forgotten.
-    """
-    rate = memory / (memory + past.count)
-
-    def mean(x: jax.Array) -> jax.Array:
-        over_batch = (x * weight[:, None]).sum(-2)
-        return pmean(over_batch.reshape(-1, x.shape[-1]).mean(0), axis_name)
-
-    def moved(old: jax.Array, x: jax.Array) -> jax.Array:
-        return old + rate * (mean(x) - old)
-
-    return Moments(past.count + 1, moved(past.mean, x), moved(past.square, x**2))
-
-
-def standard(
-    moments: Moments, x: jax.Array, centre: bool, least: float = 1e-5, most: float = 10.0
-) -> jax.Array:
-    """`x` [..., S] in standard deviations, from the mean if `centre`, clipped to +-`most`. A standard
-    deviation counts as `least` at least."""
-    variance = jnp.maximum(moments.square - moments.mean**2, 0.0)
-    offset = moments.mean if centre else 0.0
-    return jnp.clip((x - offset) / jnp.maximum(jnp.sqrt(variance), least), -most, most)

@@ -1,4 +1,7 @@
-"""Treatments of the constraint: how the cost advantage joins the reward's in one objective."""
+"""Treatments of the constraint: how reward and cost are mixed in one objective, at which price.
+
+What is mixed are advantages in on-policy algorithms, and values of actions in the others.
+"""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -16,8 +19,10 @@ class Treatment(NamedTuple):
     """How the constraint enters the objective, and what is remembered of it: `dual`.
 
     init(cfg) -> dual.
-    update(dual, episode_cost, cfg, iteration) -> dual, once an iteration, before the policy's step.
-    advantage(dual, adv_r, adv_c) -> float [B], what the policy maximises.
+    update(dual, episode_cost, cfg, iteration) -> dual. The loop says when. On-policy: once an
+        iteration, before the policy's step. Off-policy: every `dual_every` environment steps, see
+        `learn.bill`. Offline: after each gradient step.
+    advantage(dual, adv_r, adv_c) -> float [B], what the policy maximises, of advantages or of values.
     metrics(dual) -> metrics.
     constrained_costs(cfg) -> names of the costs that have a limit each; () for `cost` alone.
     """

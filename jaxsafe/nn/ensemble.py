@@ -1,6 +1,6 @@
 """An ensemble of networks with Gaussian outputs: M models as one network with a leading axis.
 
-    h_0 = (x - centre) / spread,   h_l+1 = swish(h_l W_l + b_l),   (mu, v) = h_L W_L + b_L
+    h_0 = (x - mean) / std,   h_l+1 = swish(h_l W_l + b_l),   (mu, v) = h_L W_L + b_L
     log sigma^2 = low + softplus(u - low),   u = high - softplus(high - v)
 
 `low` and `high` are learned, one pair for each output of each model.
@@ -40,8 +40,8 @@ class Ensemble:
 class Scale:
     """Of the inputs, float [I]: they are standardised before they enter the networks."""
 
-    centre: jax.Array
-    spread: jax.Array
+    mean: jax.Array
+    std: jax.Array
 
 
 def init_ensemble(
@@ -50,8 +50,8 @@ def init_ensemble(
     """Weights are N(0, 1 / (4 fan_in)), cut off at two standard deviations; biases are 0."""
     sizes = [inputs, *hidden, 2 * outputs]
     keys, layers = jax.random.split(key, len(sizes) - 1), []
-    for own, fan_in, fan_out in zip(keys, sizes[:-1], sizes[1:], strict=True):
-        draw = jax.random.truncated_normal(own, -2.0, 2.0, (models, fan_in, fan_out))
+    for layer_key, fan_in, fan_out in zip(keys, sizes[:-1], sizes[1:], strict=True):
+        draw = jax.random.truncated_normal(layer_key, -2.0, 2.0, (models, fan_in, fan_out))
         layers.append(Layer(draw / (2 * fan_in**0.5), jnp.zeros((models, fan_out))))
     low, high = (jnp.full((models, outputs), x) for x in FIRST_LOG_VAR)
     return Ensemble(tuple(layers), low, high)
@@ -64,18 +64,18 @@ def unscaled(inputs: int) -> Scale:
 def outputs_of(ensemble: Ensemble, scale: Scale, x: jax.Array) -> Gaussian:
     """What each model says of its own inputs `x` [M, ..., I]: mean and log std [M, ..., K]."""
 
-    def beside(x_like: jax.Array, own: jax.Array) -> jax.Array:
-        """What each model has of its own, [M, K], for arrays [M, ..., K]."""
-        return own.reshape(len(own), *(1,) * (x_like.ndim - 2), -1)
+    def spaced(per_model: jax.Array) -> jax.Array:
+        """[M, K] with axes of size 1 between, so that it broadcasts against [M, ..., K]."""
+        return per_model.reshape(len(per_model), *(1,) * (x.ndim - 2), -1)
 
     def linear(layer: Layer, h: jax.Array) -> jax.Array:
-        return jnp.einsum("m...i,mio->m...o", h, layer.weight) + beside(h, layer.bias)
+        return jnp.einsum("m...i,mio->m...o", h, layer.weight) + spaced(layer.bias)
 
-    h = (x - scale.centre) / scale.spread
+    h = (x - scale.mean) / scale.std
     for layer in ensemble.layers[:-1]:
         h = jax.nn.swish(linear(layer, h))
     mean, v = jnp.split(linear(ensemble.layers[-1], h), 2, axis=-1)
-    low, high = beside(v, ensemble.low), beside(v, ensemble.high)
+    low, high = spaced(ensemble.low), spaced(ensemble.high)
     log_var = low + jax.nn.softplus(high - jax.nn.softplus(high - v) - low)
     return Gaussian(mean, log_var / 2)
 

@@ -16,15 +16,7 @@ from jaxsafe.envs.engines import default_engine
 from jaxsafe.envs.wrap import Wrapper, innermost, wrap_config_of
 from jaxsafe.run.plain import to_plain
 from jaxsafe.run.progress import Reporter
-from jaxsafe.run.settings import (
-    DEFAULT,
-    EnvEntry,
-    Extras,
-    TrainConfig,
-    find_env,
-    load,
-    nested,
-)
+from jaxsafe.run.settings import DEFAULT, EnvEntry, Extras, TrainConfig, find_env, load, nested
 from jaxsafe.types import Algorithm, Env
 
 RUN_OPTIONS = [f.name for f in dataclasses.fields(TrainConfig)]

@@ -139,8 +139,8 @@ def episodes(run: RunPolicies, steps: int, seed: int, sampled: bool) -> Iterator
     wanted = math.ceil(steps / run.env.episode_length)
     each = math.ceil(min(AT_ONCE, wanted) / policies)
 
-    def of_one(params: PyTree, keys: jax.Array) -> Steps:
-        player = Player(run.algo.policy, params, task)
+    def of_one(learned: PyTree, keys: jax.Array) -> Steps:
+        player = Player(run.algo.policy, learned, task)
         return jax.vmap(lambda key: episode(player, key, run.env.obs_size, sampled))(keys)
 
     play = jax.jit(jax.vmap(of_one))

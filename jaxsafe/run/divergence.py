@@ -20,27 +20,27 @@ class Diverged(RuntimeError):
 
 
 class Health(NamedTuple):
-    """Of what acts of M members.
+    """Whether what the policies of M members have learned is finite, and whether it changes.
 
     finite: by name of a parameter, bool [M].
-    mark: uint32 [M], another one whenever a parameter changes, but for about one case in 4e9.
+    mark: uint32 [M], a checksum of the parameters. A change of theirs stays unseen once in 4e9 cases.
     """
 
     finite: dict[str, jax.Array]
     mark: jax.Array
 
 
-def health(params: PyTree) -> Health:
-    """`Health` of `params` [M, ...], the settings among them left aside."""
-    named = dict(zip(checkpoint.leaf_names(params), jax.tree.leaves(params), strict=True))
-    learned = {k: x for k, x in named.items() if not k.startswith("config") and x.dtype == jnp.float32}
-    rows = {k: x.reshape(x.shape[0], -1) for k, x in learned.items()}
+def health(learned: PyTree) -> Health:
+    """`Health` of `learned` [M, ...], the settings among it left aside."""
+    named = dict(zip(checkpoint.leaf_names(learned), jax.tree.leaves(learned), strict=True))
+    floats = {k: x for k, x in named.items() if not k.startswith("config") and x.dtype == jnp.float32}
+    rows = {k: x.reshape(x.shape[0], -1) for k, x in floats.items()}
 
     def mark(x: jax.Array) -> jax.Array:
         bits = jax.lax.bitcast_convert_type(x, jnp.uint32)
         return (bits * (2 * jnp.arange(x.shape[1], dtype=jnp.uint32) + 1)).sum(1)
 
-    none = jnp.zeros(len(jax.tree.leaves(params)[0]), jnp.uint32)  # of a method that learns nothing
+    none = jnp.zeros(len(jax.tree.leaves(learned)[0]), jnp.uint32)  # of a method that learns nothing
     total = sum(((i + 1) * mark(x) for i, x in enumerate(rows.values())), start=none)
     return Health({k: jnp.isfinite(x).all(1) for k, x in rows.items()}, total)
 

@@ -198,7 +198,9 @@ def test_parts_are_whole_settings_or_seeds_of_one_and_of_equal_size():
 def test_every_float_of_every_algorithm_may_differ_between_members(name):
     kind = algos.ALGOS[name].config
     offline = issubclass(kind, OfflineConfig)
-    small = {field: (4,) for field in ("hidden", "model_hidden") if hasattr(kind, field)}
+    small: dict[str, Any] = {
+        field: (4,) for field in ("hidden", "model_hidden") if hasattr(kind, field)
+    }
     cfg = kind(**small) if offline else kind(num_envs=256, horizon=4, **small)
     other = replace(cfg, **{field: 0.25 for field in float_fields(kind)})
     data = data_set_like(Corridor()) if offline else ()

@@ -18,8 +18,9 @@ from toys import START, Lever
 from jaxsafe.algos import ALGOS, seditor
 from jaxsafe.config import ConfigError
 from jaxsafe.learn.learner import GradientStep
+from jaxsafe.learn.normalise import averaged, no_moments, standard
 from jaxsafe.learn.replay import Record
-from jaxsafe.learn.sequences import SequenceBatch, averaged, lambda_returns, no_moments, standard
+from jaxsafe.learn.sequences import SequenceBatch, lambda_returns
 from jaxsafe.nn import beta
 
 CFG = seditor.SEditorConfig(hidden=(), layer_norm=False)

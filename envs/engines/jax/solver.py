@@ -8,9 +8,11 @@ d to where the slope vanishes. It ends where g' H^-1 g is small: what the step h
 stayed on a piece of the cost, what the next one would gain.
 
 The force -s_r' is that of a spring, cut off at its bounds: none of an equality, the loss of dry
-friction, 0 of what only pushes. MJX's own solver evaluates 150 points on every line, however soon it is
-found, goes by the cost, which in float32 is rounding where it is large, and so stops with accelerations
-that are wrong by 0.1% now and then; and all worlds go on until the last one is done.
+friction, 0 of what only pushes.
+
+Why not MJX's own solver: it evaluates 150 points on every line, however soon the minimum is found. It
+goes by the cost. Where the cost is large, its differences are rounding in float32, so that it stops now
+and then with accelerations that are wrong by 0.1%. And all its worlds go on until the last one is done.
 
 Source: Todorov (2014), "Convex and analytically-invertible dynamics with contacts and constraints",
 and MuJoCo's documentation, Computation.
