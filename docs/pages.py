@@ -19,7 +19,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from jaxsafe.algos import ALGOS, Row
-from jaxsafe.envs import make
+from jaxsafe.envs import CarRacing, make
+from jaxsafe.envs.racing import car as racing_car
+from jaxsafe.envs.racing import task as racing
+from jaxsafe.envs.racing import track as racing_track
 from jaxsafe.envs.safety_gym import suite
 from jaxsafe.envs.velocity import config as velocity_config
 from jaxsafe.envs.velocity import suite as velocities
@@ -121,7 +124,8 @@ A name is a robot and a task: `point_goal1`, `car_push2`, `doggo_button1`. Safet
 grids are the original's tests. Vision is not there yet. The six [velocity tasks](velocity.md) are
 Safety-Gymnasium's: `ant_velocity` is `SafetyAntVelocity-v1`. So are
 [`point_circle1`, `point_run0`](../howto/safety_gymnasium.md) and their like. `seditor_point_goal1` and
-its like are [SEditor's tasks](../howto/seditor.md).
+its like are [SEditor's tasks](../howto/seditor.md). So are `car_racing0` and `car_racing1`, which are
+[stand-ins](racing.md) for car racing in Box2D.
 
 Every other option of Safety Gym's Engine is `env.OPTION`.
 [`env.rules`](../howto/safety_gymnasium.md) takes Safety-Gymnasium's rules where they differ.
@@ -202,6 +206,66 @@ m/s at most. There is no option for the last stage.
 
 Five tasks take Runge and Kutta's fourth order, HalfCheetah Euler's integrator. Engine `jax` takes
 longest to compile for Humanoid, of which 128 pairs of geoms can meet.
+"""
+RACING = """# racing
+
+Drive a lap of a random track. Each new tile of the road pays 1000 / tiles, so that a whole lap pays a
+little less than 1000: the tiles under the wheels at the start pay nothing. The tasks are SEditor's
+`SafeCarRacing0-v0` and `SafeCarRacing1-v0`. These ids work, too.
+
+They are stand-ins. The original runs on Box2D, whose physics we do not have. Rewards, costs and sizes
+are those of the original. The car and the shapes of tracks are ours, so returns and costs of the
+original do not carry over.
+
+```sh
+python scripts/train.py env=car_racing1 algo=seditor video=false
+```
+
+There are no pictures of these tasks yet, neither to see nor to learn from. `jaxsafe render` refuses
+them. The version that learns from pixels comes with vision.
+
+## Sizes
+
+{table}
+
+- `off_track` costs 1 on the step in which the last wheel leaves the road, and nothing until the car has
+  been back. With obstacles leaving the road costs nothing, as in the original.
+- `obstacles` costs 1 on the step in which a wheel meets an obstacle. Once all wheels have left it, the
+  next touch costs again.
+- An episode ends when all tiles are visited. This is a success, and its value from there on is 0.
+- Beside the road the tyres hold 60% of what they hold on it.
+- Actions are in [-1, 1]: steering, positive to the right; gas and brake, from -1 (none) to 1 (all).
+
+## Observation
+
+| numbers | |
+|---:|---|
+| 4 | angular velocities of the wheels, rad/s: front left, front right, rear left, rear right |
+| 4 | their angles, rad, positive to the left; those of the rear wheels are 0 |
+| 3 | speed, m/s; yaw rate, rad/s; share of the tiles that is left |
+| 24 | centres of the nearest tile and of the 2nd, 4th, ..., 22nd after it: x and y, m |
+| 9 | with obstacles: x, y and half the width, m, of the next three |
+
+The original's agents have the first 11 beside their picture. There wheels can also spin and lock.
+Places are in the car's frame, x to the front and y to the left.
+
+## The environment
+
+{about}
+
+## The car
+
+{car}
+
+## The track
+
+{track}
+
+## Options
+
+{options}
+
+`env.wrap` is [that of every environment](README.md).
 """
 COSTS = {
     "hazards": "inside a hazard (blue disc)",
@@ -496,6 +560,26 @@ def velocity_page() -> str:
     )
 
 
+def racing_page() -> str:
+    made = {name: make(name) for name in racing.ROWS}
+    rows = ["| | " + " | ".join(f"`{name}`" for name in made) + " |", "|---|" + "---:|" * len(made)]
+    for head, cells in {
+        "action": [str(env.action_size) for env in made.values()],
+        "observation": [str(env.obs_size) for env in made.values()],
+        "tiles for each obstacle": [str(env.obstacle_every or "") for env in made.values()],
+        "costs": [", ".join(f"`{name}`" for name in env.cost_names) for env in made.values()],
+        "seconds of a step": [f"{racing_car.DT:g}"] * len(made),
+    }.items():
+        rows.append(f"| {head} | {' | '.join(cells)} |")
+    return RACING.format(
+        table="\n".join(rows),
+        about=prose(racing.__doc__ or "")[1],
+        car=prose(racing_car.__doc__ or "")[1],
+        track=prose(racing_track.__doc__ or "")[1],
+        options=settings(CarRacing, "env"),
+    )
+
+
 def algorithms() -> str:
     """The index of the algorithms' pages."""
     lines = [f"| [`{name}`]({name}.md) | {row.summary} |" for name, row in ALGOS.items()]
@@ -516,6 +600,7 @@ def pages() -> dict[Path, str]:
         lines.append(f"| {' | '.join(cells)} | {', '.join(made[0].cost_names) or 'none'} |")
     text = ENVIRONMENTS + "\n".join(lines) + "\n"
     found[HERE / "environments" / "velocity.md"] = velocity_page()
+    found[HERE / "environments" / "racing.md"] = racing_page()
     return found | {HERE / "environments" / "README.md": text}
 
 

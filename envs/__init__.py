@@ -1,5 +1,6 @@
-"""Environments: Safety Gym's, velocity tasks, those that a user registers, and wrappers around any."""
+"""Environments: Safety Gym's, velocity tasks, racing, those that a user registers, and wrappers."""
 
+from jaxsafe.envs.racing.task import CarRacing
 from jaxsafe.envs.registry import (
     ALIASES,
     ENVS,
@@ -20,6 +21,7 @@ from jaxsafe.envs.wrap import raw_steps
 __all__ = [
     "ALIASES",
     "ENVS",
+    "CarRacing",
     "SafetyGym",
     "SafetyGymConfig",
     "Velocity",

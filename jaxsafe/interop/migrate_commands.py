@@ -106,7 +106,10 @@ def alf(command: str) -> Migrated:
     if "seditor" not in conf and "sac_safety_gym" not in conf:
         raise ConfigError(f"--conf {conf or '?'}: expected SEditor's, as in seditor_safety_gym_conf.py")
     if "racing" in conf:
-        raise ConfigError(f"--conf {conf} has no counterpart: of SEditor's tasks we have Safety Gym's")
+        raise ConfigError(
+            f"--conf {conf} has no counterpart: its agents see pictures; env=car_racing0 and "
+            "env=car_racing1 show the road as numbers"
+        )
     found, lines = turned(flags, ALF)
     if "seditor" in conf.rpartition("/")[2]:
         lines.append(Line("conf", conf, "algo=seditor preset=published"))

@@ -59,7 +59,7 @@ def test_a_command_of_alf_keeps_task_seed_and_seditor_s_settings():
             ALF.replace("CarButton2", "CarGoal0"),
             "is no task of SEditor's; did you mean 'car_goal",
         ),
-        (alf, "python -m alf.bin.train --conf seditor_safe_car_racing_conf.py", "Safety Gym's"),
+        (alf, "python -m alf.bin.train --conf seditor_safe_car_racing_conf.py", "env=car_racing1"),
         (alf, ALF.replace("random_seed=7", "num_env_steps=0"), "total_steps=0: expected"),
     ],
 )

@@ -31,7 +31,8 @@ from jaxsafe.run.settings import (
 
 CONFIGS = {name: row.config for name, row in algos.ALGOS.items()}
 CONFIGS |= {
-    cls.__name__: cls for cls in (TrainConfig, envs.SafetyGymConfig, envs.VelocityConfig, WrapConfig)
+    cls.__name__: cls
+    for cls in (TrainConfig, envs.SafetyGymConfig, envs.VelocityConfig, envs.CarRacing, WrapConfig)
 }
 INFINITE = {  # fields whose comment or bounds say what infinity means
     "total_iterations", "lam_max", "max_grad_norm", "target_kl", "healthy_z_range",

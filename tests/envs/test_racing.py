@@ -1,0 +1,318 @@
+"""The racing tasks: the car against closed forms, the properties of many tracks, rewards and costs at
+known poses, and a lap of a driver written by hand."""
+
+import functools
+from collections.abc import Callable
+from dataclasses import fields, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from compiling import FAST
+
+from jaxsafe import envs
+from jaxsafe.config import ConfigError
+from jaxsafe.envs.check import check_env
+from jaxsafe.envs.racing import car as cars
+from jaxsafe.envs.racing.car import AXLE, DRAG, DT, GRIP, MASS, MAX_STEER, SIDE, Car, wheels
+from jaxsafe.envs.racing.task import Obstacles
+from jaxsafe.envs.racing.track import HALF_WIDTH, MAX_CURVATURE, MOST_TILES, TILE, paved, shape
+from jaxsafe.types import State
+
+TRACKS = 256
+ROAD = jnp.ones(2)  # grip of both axles
+
+
+@functools.cache
+def compiled(level: int, **options: Any) -> tuple[envs.CarRacing, Callable, Callable]:
+    env = envs.make(f"car_racing{level}", **options)
+    reset, step = (jax.jit(f, compiler_options=FAST) for f in (jax.vmap(env.reset), env.step))
+    return env, reset, step
+
+
+@functools.cache
+def begun() -> State:
+    """The first states of many episodes with obstacles."""
+    return jax.device_get(compiled(1)[1](jax.random.split(jax.random.key(0), TRACKS)))
+
+
+def one(state: State, i: int = 0) -> State:
+    return jax.tree.map(lambda x: jnp.asarray(x[i]), state)
+
+
+# ---- the car -----------------------------------------------------------------------------------
+
+
+@functools.partial(jax.jit, static_argnums=0, compiler_options=FAST)
+def driven(steps: int, car: Car, steer: Any, gas: Any, brake: Any, grip: Any) -> Car:
+    """The car after each step."""
+
+    def step(car: Car, _: None) -> tuple[Car, Car]:
+        car = cars.drive(car, steer, gas, brake, grip)
+        return car, car
+
+    return jax.lax.scan(step, car, None, steps)[1]
+
+
+def rolling_at(speed: float, gas: float = 0.0) -> Car:
+    """Along x."""
+    car = cars.parked(jnp.zeros(2), jnp.zeros(()))
+    return replace(car, velocity=jnp.array([speed, 0.0]), gas=jnp.float32(gas))
+
+
+def test_acceleration_and_braking_are_those_of_the_tyres_against_the_drag():
+    """m v' = F - c v^2 gives v = V tanh(F t / (m V)), V^2 = F / c. Of both brakes it is a tan."""
+    t = DT * np.arange(1, 51)
+    away = driven(50, rolling_at(0.0, gas=1.0), 0.0, 1.0, 0.0, ROAD)
+    top = np.sqrt(GRIP / DRAG)
+    assert top == pytest.approx(100)
+    np.testing.assert_allclose(away.velocity[:, 0], top * np.tanh(GRIP * t / (MASS * top)), rtol=2e-3)
+    assert not away.velocity[:, 1].any() and not away.heading.any()
+
+    hold = 2 * GRIP
+    rate = np.sqrt(hold / DRAG)
+    stops = MASS / (2 * DRAG) * np.log(1 + DRAG * 60**2 / hold)  # m
+    slowed = driven(50, rolling_at(60.0), 0.0, 0.0, 1.0, ROAD)
+    moving = slowed.velocity[:, 0] > 5
+    expected = rate * np.tan(np.arctan(60 / rate) - np.sqrt(hold * DRAG) / MASS * t)
+    np.testing.assert_allclose(slowed.velocity[moving, 0], expected[moving], atol=0.1)
+    assert slowed.position[-1, 0] == pytest.approx(stops, rel=0.02)
+    assert abs(slowed.velocity[-1, 0]) < 1e-3  # and never backwards
+    off = driven(50, rolling_at(60.0), 0.0, 0.0, 1.0, cars.OFF_ROAD * ROAD)
+    assert (off.velocity[:5, 0] > slowed.velocity[:5, 0]).all()
+
+
+def test_a_gentle_turn_has_the_radius_of_its_axles_and_a_hard_one_that_of_the_grip():
+    """With equal axles a car steers neutrally: spin = v tan(steer) / wheelbase, whatever the speed."""
+    for speed in (5.0, 30.0):
+        gentle = driven(50, rolling_at(speed), 0.05, 0.0, 0.0, ROAD)
+        v = np.linalg.norm(gentle.velocity[-1])
+        turn = np.tan(0.05 * MAX_STEER) / (2 * AXLE)
+        assert gentle.spin[-1] / v == pytest.approx(turn, rel=0.02), speed
+        assert v * gentle.spin[-1] < 2 * GRIP / MASS
+    hard = driven(50, rolling_at(80.0), 1.0, 0.0, 0.0, ROAD)
+    speed = np.linalg.norm(hard.velocity, axis=1)
+    path = np.unwrap(np.arctan2(hard.velocity[:, 1], hard.velocity[:, 0]))
+    sideways = speed[1:] * np.diff(path) / DT  # m/s^2; the angle of the wheels asks for 835
+    assert 0.9 < sideways.max() / (2 * GRIP / MASS) < 1
+
+
+def test_steering_gas_and_wheels_are_those_of_the_car():
+    car = driven(8, rolling_at(0.0), 1.0, 1.0, 0.0, ROAD)
+    np.testing.assert_allclose(car.steer[:6], 0.06 * np.arange(1, 7), rtol=1e-5)  # 3 rad/s
+    assert car.steer[-1] == pytest.approx(MAX_STEER)
+    np.testing.assert_allclose(car.gas, 0.1 * np.arange(1, 9), rtol=1e-5)
+    spun = replace(rolling_at(10.0), spin=jnp.float32(2.0), heading=jnp.float32(np.pi / 2))
+    np.testing.assert_allclose(  # front left, front right, rear left, rear right
+        wheels(spun), [[-SIDE, AXLE], [SIDE, AXLE], [-SIDE, -AXLE], [SIDE, -AXLE]], atol=1e-6
+    )
+    along_y = replace(spun, velocity=jnp.array([0.0, 10.0]))
+    expected = (10 + 2.0 * SIDE * np.array([-1, 1, -1, 1])) / cars.WHEEL
+    np.testing.assert_allclose(cars.rolling(along_y), expected, rtol=1e-5)
+
+
+# ---- the track ---------------------------------------------------------------------------------
+
+
+def test_a_circle_has_its_curvature_wherever_it_is_seen_from():
+    theta = 2 * np.pi / 720 * np.arange(720)
+    r = 20 * np.cos(theta) + np.sqrt(80**2 - (20 * np.sin(theta)) ** 2)  # its centre at x = 20
+    curvature, length = shape(jnp.asarray(r, jnp.float32))
+    np.testing.assert_allclose(curvature, 1 / 80, rtol=0.02)
+    assert length == pytest.approx(2 * np.pi * 80, rel=1e-4)
+
+
+def test_every_track_closes_turns_gently_and_never_meets_itself():
+    track = begun().physics.track
+    ways, sharpest, gaps, counts = [], [], [], np.asarray(track.count)
+    for points, n in zip(track.points, counts, strict=True):
+        p = points[:n].astype(float)
+        side = np.roll(p, -1, 0) - p  # the last one closes the loop
+        length = np.linalg.norm(side, axis=1)
+        # chords are a little shorter than the arcs, whose length is the same on all tiles
+        assert length.max() < TILE * (1 + 1 / n) + 1e-2 and length.min() > 0.97 * TILE
+        angle = np.unwrap(np.arctan2(side[:, 1], side[:, 0]), period=2 * np.pi)
+        turn = (np.diff(angle, append=angle[0]) + np.pi) % (2 * np.pi) - np.pi
+        assert abs(abs(turn.sum()) - 2 * np.pi) < 1e-3  # once round
+        ways.append(np.sign(turn.sum()))
+        sharpest.append(np.abs(turn).max() / (MAX_CURVATURE * TILE * (1 + 1 / n)))
+        far = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+        far = np.minimum(far, n - far) * TILE > np.pi / MAX_CURVATURE  # farther than a half circle
+        gaps.append(np.linalg.norm(p[:, None] - p, axis=-1)[far].min())
+        np.testing.assert_array_equal(points, points[np.arange(MOST_TILES) % n])
+    assert 0.9 < max(sharpest) < 1
+    assert min(gaps) > 2 / MAX_CURVATURE > 2 * HALF_WIDTH
+    assert counts.min() > 100 and counts.max() < MOST_TILES and counts.std() > 10
+    assert 0.3 < np.mean(np.array(ways) > 0) < 0.7  # either way round
+
+
+def test_obstacles_stand_on_a_tenth_of_the_tiles_apart_and_off_the_start():
+    world = begun().physics
+    there = world.obstacles.half_width > 0
+    for tile, found, n in zip(world.obstacles.tile, there, world.track.count, strict=True):
+        assert found.sum() == n // 10 - 1
+        assert np.diff(tile[found]).min() > 5 and tile[found].min() >= 10 and n - tile[found].max() > 5
+    assert set(np.abs(world.obstacles.left[there])) == {np.float32(HALF_WIDTH / 2)}
+    width = world.obstacles.half_width[there] / (HALF_WIDTH / 4)
+    assert width.min() >= 0.1 - 1e-6 and abs(width.mean() - 1.167) < 0.05  # of |N(1, 1)|
+
+
+# ---- rewards and costs -------------------------------------------------------------------------
+
+
+@functools.cache
+def stadium(level: int) -> State:
+    """A state whose road goes along x from the origin for 100 m.
+
+    With obstacles there are two of 3 m: at tile 10 in the left half of the road, at tile 20 in the
+    right half.
+    """
+    state = one(compiled(level)[1](jax.random.split(jax.random.key(0), 1)))
+    arc = np.linspace(-np.pi / 2, np.pi / 2, 50)
+    bend = 40 * np.stack([np.cos(arc), np.sin(arc)], 1)  # the right one; the left one is its opposite
+    corners = np.concatenate([np.array([100.0, 40.0]) + bend, np.array([0.0, 40.0]) - bend])
+    track = paved(jnp.asarray(np.roll(corners, 1, axis=0), jnp.float32))
+    world = state.physics
+    k = jnp.arange(len(world.obstacles.tile))
+    left = HALF_WIDTH / 2 * jnp.where(k == 0, 1.0, -1.0)
+    obstacles = Obstacles(10 * (k + 1), left, jnp.where(k < 2, 1.5, -1.0))
+    none = jnp.zeros_like(world.visited)
+    return replace(state, physics=replace(world, track=track, obstacles=obstacles, visited=none))
+
+
+def put(state: State, x: float, y: float, speed: float = 0.0) -> State:
+    car = replace(rolling_at(speed), position=jnp.array([x, y], jnp.float32))
+    return replace(state, physics=replace(state.physics, car=car))
+
+
+STILL = jnp.array([0.0, -1.0, 1.0])  # all brake
+
+
+def test_a_tile_is_paid_once_and_the_last_one_ends_the_episode():
+    step, state = compiled(0)[2], stadium(0)
+    n = int(state.physics.track.count)
+    length = float(jnp.linalg.norm(state.physics.track.points[1]))
+    after = step(put(state, 5 * length, 0.0), STILL)  # wheels at 1.62 m before and behind tile 5
+    assert after.reward == pytest.approx(1000 / n) and after.info["tiles"] == pytest.approx(1 / n)
+    assert after.physics.visited.nonzero()[0].tolist() == [5]
+    again = step(after, STILL)
+    assert again.reward == 0 and not again.terminated
+    between = step(put(again, 6.5 * length, 0.0), STILL)  # the rear wheels on tile 6, the front on 7
+    assert between.reward == pytest.approx(2000 / n)
+    all_but = jnp.arange(MOST_TILES) < n
+    world = replace(between.physics, visited=all_but.at[9].set(False))
+    done = step(put(replace(state, physics=world), 9 * length, 0.0), STILL)
+    assert done.terminated and done.info["lap"] == 1 and done.obs[10] == 0 and not done.truncated
+    assert not step(put(replace(state, physics=world), 8 * length, 0.0), STILL).terminated
+
+
+def test_leaving_the_road_costs_once_and_only_without_obstacles():
+    edge = HALF_WIDTH + SIDE
+    for level, costs in ((0, [0, 1, 0, 0, 1]), (1, [0, 0, 0, 0, 0])):
+        env, _, step = compiled(level)
+        assert env.cost_names == (("off_track",), ("obstacles",))[level]
+        state, paid = stadium(level), []
+        for y in (edge - 0.1, edge + 0.1, edge + 0.1, edge - 0.1, -edge - 0.1):
+            state = step(put(state, 20.0, y), STILL)
+            paid.append(int(state.cost))
+            assert state.info["off_track"] == (abs(y) > edge) and state.costs.tolist() == [state.cost]
+        assert paid == costs
+
+
+def test_an_obstacle_costs_when_it_is_met_and_again_after_it_was_left():
+    step = compiled(1)[2]
+    state, paid = stadium(1), []
+    x, left = 10 * float(jnp.linalg.norm(state.physics.track.points[1])), HALF_WIDTH / 2
+    before = x - TILE / 2 - AXLE - 0.1  # its front wheels are not there yet
+    at = [(before, left), (x, left), (x + 1, left), (before, left), (x, left + SIDE + 1.4),
+          (x, left + SIDE + 1.6), (2 * x, left), (2 * x, -left), (x, left)]  # fmt: skip
+    for place in at:
+        state = step(put(state, *place), STILL)
+        paid.append(int(state.cost))
+    # from one obstacle straight to the other is a new touch, too
+    assert paid == [0, 1, 0, 0, 1, 0, 0, 1, 1]
+
+
+def test_the_observation_is_what_the_docstring_says():
+    env, _, step = compiled(1)
+    length = float(jnp.linalg.norm(stadium(1).physics.track.points[1]))
+    state = step(put(stadium(1), 9 * length, 1.0, 20.0), jnp.array([-1.0, -1.0, -1.0]))
+    car, obs = state.physics.car, np.asarray(state.obs)
+    assert env.obs_size == len(obs) == 44 and envs.make("car_racing0").obs_size == 35
+    np.testing.assert_allclose(obs[:4], cars.rolling(car), rtol=1e-6)
+    np.testing.assert_allclose(obs[4:8], [0.06, 0.06, 0, 0], rtol=1e-5)  # to the left
+    n = int(state.physics.track.count)
+    assert obs[8] == pytest.approx(20, rel=0.02) and obs[9] == car.spin > 0
+    assert obs[10] == pytest.approx(1 - state.physics.visited.sum() / n)
+
+    def world(xy):  # from the car's frame
+        return car.position + cars.rotated(jnp.asarray(xy), car.heading)
+
+    road = world(obs[11:35].reshape(12, 2))
+    np.testing.assert_allclose(road, state.physics.track.points[9 + 2 * np.arange(12)], atol=1e-3)
+    seen = obs[35:].reshape(3, 3)
+    expected = [[10 * length, HALF_WIDTH / 2], [20 * length, -HALF_WIDTH / 2]]
+    np.testing.assert_allclose(world(seen[:2, :2]), expected, atol=0.02)
+    np.testing.assert_array_equal(seen[:, 2], [1.5, 1.5, -1.0])
+
+
+# ---- episodes ----------------------------------------------------------------------------------
+
+
+def careful(obs: jax.Array) -> jax.Array:
+    """Steers at a point of the road ahead, and drives as fast as its curve allows."""
+    road = obs[11:35].reshape(12, 2)
+    at = road[2]
+    bend = 2 * at[1] / jnp.square(at).sum()  # curvature of the circle through it
+    steer = -jnp.arctan(2 * AXLE * bend) / MAX_STEER
+    after = road[6] - road[4]
+    turn = jnp.abs(jnp.arctan2(after[1], after[0]))
+    wanted = jnp.where(turn > 0.6, 35.0, jnp.where(turn > 0.3, 45.0, 60.0))
+    push = (wanted - obs[8]) / 5
+    return jnp.stack([steer, 2 * jnp.clip(push, 0, 1) - 1, 2 * jnp.clip(-push, 0, 1) - 1])
+
+
+def test_a_driver_written_by_hand_finishes_most_of_its_laps():
+    env = envs.make("car_racing0")
+
+    def episode(key: jax.Array) -> dict[str, jax.Array]:
+        def step(carry, _):
+            state, over = carry
+            after = env.step(state, careful(state.obs))
+            alive = ~over
+            seen = {"ret": after.reward, "cost": after.cost, "lap": after.info["lap"], "steps": 1.0}
+            return (after, over | after.terminated), {k: alive * x for k, x in seen.items()}
+
+        start = (env.reset(key), jnp.bool_(False))
+        (last, _), seen = jax.lax.scan(step, start, None, env.episode_length)
+        finite = jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(last)]).all()
+        return {k: x.sum(0) for k, x in seen.items()} | {"finite": finite}
+
+    keys = jax.random.split(jax.random.key(1), 8)
+    seen = jax.jit(jax.vmap(episode), compiler_options=FAST)(keys)
+    assert seen["finite"].all()
+    assert seen["ret"].mean() > 900 and seen["ret"].max() < 1000  # the first tiles are not paid
+    assert seen["lap"].mean() > 0.5 and seen["cost"].mean() < 2
+    assert seen["steps"].min() > 300
+
+
+@pytest.mark.parametrize("level", [0, 1])
+def test_the_contract_of_environments_is_kept(level):
+    env = envs.make(f"car_racing{level}")
+    assert check_env(env, "racing") is env
+    assert envs.canonical(f"SafeCarRacing{level}-v0") == f"car_racing{level}"
+    assert envs.env_defaults(f"car_racing{level}")["obstacle_every"] == 10 * level
+    assert env == envs.CarRacing(obstacle_every=10 * level)
+    first = one(begun(), 0)
+    assert level == 0 or (first.cost, first.reward, first.terminated) == (0, 0, False)
+
+
+def test_options_have_bounds():
+    assert envs.make("car_racing0", obstacle_every=5, num_steps=10).episode_length == 10
+    with pytest.raises(ConfigError, match=r"env\.obstacle_every=21: expected a whole number between 0"):
+        envs.make("car_racing1", obstacle_every=21)
+    with pytest.raises(ConfigError, match="did you mean 'obstacle_every'"):
+        envs.make("car_racing1", obstacles_every=2)
+    assert {f.name for f in fields(envs.CarRacing)} == {"obstacle_every", "num_steps"}
