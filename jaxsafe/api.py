@@ -377,11 +377,11 @@ def collect(
         arXiv:2306.09303, for the file's arrays.
     """
     out = collecting.data_file(path)
-    size, seed = convert(size, collecting.Size, "size"), convert(seed, Seed, "seed")
+    count, seed = convert(size, collecting.Size, "size"), convert(seed, Seed, "seed")
     shares = [convert(share, float, "a share") for share in runs.values()]
     collecting.check_shares(shares)
     opened = [(run if isinstance(run, Run) else Run(run))._opened for run in runs]
-    return collecting.write(out, [*map(Ingredient, opened, shares)], size, seed, sampled)
+    return collecting.write(out, [*map(Ingredient, opened, shares)], count, seed, sampled)
 
 
 def evaluate(run: Run | str | Path, episodes: int = 100, seed: int = 1, setting: int = 0) -> Scores:

@@ -10,6 +10,7 @@ import pytest
 from shell import SMALL, TOY, typed
 from toys import Corridor
 
+import jaxsafe
 from jaxsafe.config import ConfigError
 from jaxsafe.run import collect, dataset
 from jaxsafe.run.dataset import read_dataset, write_dataset
@@ -63,6 +64,22 @@ def test_whole_episodes_of_every_policy_with_dsrls_keys_and_a_recipe(run, tmp_pa
     np.testing.assert_allclose(arrays["rewards"], after[:, 2], atol=1e-6)
     inside = ~arrays["timeouts"][:-1]
     np.testing.assert_array_equal(after[:-1][inside], obs[1:][inside])
+
+
+def test_python_collects_what_the_command_does(run, tmp_path):
+    files = [tmp_path / f"{name}.npz" for name in ("command", "python")]
+    assert typed("collect", str(run), TOY, "size=40", "seed=3", f"out={files[0]}") == 0
+    opened = jaxsafe.Run(run, "toys:Corridor")
+    made = jaxsafe.collect({opened: 1}, files[1], size=4e1, seed=3)
+    assert_equal(*map(read_dataset, map(str, files)))
+    assert made.run.tolist() == [0] * 40 and made.recipe["runs"][0]["episodes"] == 2
+    for shares, path, message in (
+        ({opened: 0.5}, files[1], "sum to 1"),
+        ({opened: -1}, files[1], "sum to 1"),
+        ({opened: 1}, tmp_path / "data.csv", "ends in .hdf5 or .npz"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            jaxsafe.collect(shares, path)
 
 
 def test_the_same_command_collects_the_same_and_mean_actions_are_not_sampled_ones(run, tmp_path):

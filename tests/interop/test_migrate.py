@@ -501,6 +501,12 @@ def test_a_velocity_task_is_migrated_with_its_thresholds(theirs, ours):
         assert f"env={settings.env_name}" == ours[0]
 
 
+def test_an_id_of_goal_is_the_task_with_its_rules():
+    by_id, by_name = (arguments.compose(words) for words in (["env=SafetyPointGoal1-v0"], PLAIN))
+    assert by_id.plain() == by_name.plain()
+    assert by_id.plain()["env"]["rules"] == "safety_gymnasium"
+
+
 def test_the_options_of_every_registered_environment_are_its_name():
     for name, options in suite.suite().items():
         assert migrate.safety_gym(options).argv == [f"env={name}"]
