@@ -97,8 +97,8 @@ class MultiplierConfig(LagrangianConfig, CostCriticConfig):
     """For `lagrangian`."""
 
     # Adam's step of the price, whatever the size of the violation. A policy answers a price only after
-    # some hundred thousand steps. With a step of 0.03 the return on point_goal1 fell from 9 to 2 before it
-    # rose again, in two seeds.
+    # some hundred thousand steps. With a step of 0.03, two seeds of point_goal1 fell from a return of
+    # 9 to 2 before they rose again.
     dual_lr: Rate = 0.01
 
 
