@@ -423,11 +423,10 @@ def test_every_option_that_a_key_becomes_exists_in_its_family():
         assert {o for rule in own.values() for o in rule.ours.split()} <= fields
 
 
-def test_all_of_omnisafe_but_crabs_is_here_and_no_row_has_a_name_that_is_not_there():
+def test_all_of_omnisafe_is_here_and_no_row_has_a_name_that_is_not_there():
     ours = {theirs: migrate.family_of(algos.ALGOS[n]) for theirs, n in migrate.algorithms().items()}
-    assert list(migrate.MISSING) == ["CRABS"]
-    assert ours | migrate.MISSING == {n: kind for kind, names in THEIRS.items() for n in names.split()}
-    assert len(ours) == sum(bool(row.omnisafe) for row in algos.ALGOS.values()) == 44
+    assert ours == {n: kind for kind, names in THEIRS.items() for n in names.split()}
+    assert len(ours) == sum(bool(row.omnisafe) for row in algos.ALGOS.values()) == 45
 
 
 BCQ_LAG = {  # of OmniSafe's BCQLag.yaml
@@ -470,7 +469,7 @@ def test_offline_configs_count_gradient_steps_and_keep_a_path():
             "batch_size=0: expected a whole number between 1 and",
         ),
         ({}, "PPOlag", "point_goal1", "did you mean 'PPOLag'"),
-        ({}, "CRABS", "point_goal1", "CRABS is not here yet"),
+        ({}, "CRABS", "SafetyPointGoal1-v0", "CRABS is for SafeInvertedPendulumSwing-v2 alone"),
         ({}, "", "point_goal1", "add --algo"),
         ({}, "CPO", "", "add --env"),
         ({}, "CPO", "SafetyRacecarGoal1-v0", "no counterpart"),
