@@ -1,4 +1,4 @@
-"""CRABS: soft actor-critic within a set of states that a learned certificate proves safe."""
+"""CRABS: soft actor-critic within a set of states that a learned certificate finds safe."""
 
 import math
 from typing import Annotated, Any
@@ -20,6 +20,7 @@ from jaxsafe.config import (
     config,
 )
 from jaxsafe.learn.acting import Learned
+from jaxsafe.learn.actor_critic import at_every
 from jaxsafe.learn.barrier import (
     BarrierConfig,
     Core,
@@ -65,7 +66,7 @@ LEAST, MOST = 0.1, 10.0  # adversarial steps for each gradient step, likewise
 
 @config
 class CRABSConfig(EnsembleConfig, BarrierConfig, sac.SACConfig):
-    """CRABS: soft actor-critic within a set of states that a learned certificate proves safe.
+    """CRABS: soft actor-critic within a set of states that a learned certificate finds safe.
 
         h(s) = softplus(f(s) - f(s_0)) + B(s) - 1,   C = {s: h(s) < 0}
         u(s, a) = max_m h(T_m(s, a)),                T_m(s, a) the mean of model m
@@ -86,10 +87,10 @@ class CRABSConfig(EnsembleConfig, BarrierConfig, sac.SACConfig):
     last certificate, and the policy takes more of these steps. Nothing is proved for all states of C: a
     step can be unsafe where the models are wrong, or where a violation was not found.
 
-    The paper is given a safe policy to begin with, and its code also loads a certificate and models.
-    They come from training on Upright, whose violations do not count there. Here a run of its own makes
-    them. Until its first certificate CRABS is SAC, and unsafe. Another run begins with what it has
-    learned, and is safe from its first step on:
+    The paper is given a safe policy that earns little. Its code loads one for Swing, with models and a
+    certificate, which seem to come from training on Upright. Violations before that do not count. Here
+    a run of its own makes all three. Until its first certificate CRABS is SAC, and unsafe. Another run
+    begins with what the first one has learned, and acts within its certificate from the first step on:
 
         jaxsafe train algo=crabs env=pendulum_upright run_dir=runs/start
         jaxsafe train algo=crabs env=pendulum_tilt init_from=runs/start
@@ -266,8 +267,12 @@ def crabs(env: Env) -> Learner:
             metrics = {"train/actor_loss": -climbed, **jax.tree.map(batch.mean, found)}
             return batch.mean(made.extra) - climbed, metrics
 
-        nets, found = descend_each(loss, nets, actor.optimisers(cfg, share), axis_name)
-        nets, more = resist(follow(nets, cfg.tau), cfg)
+        def improve(nets: Trainable) -> tuple[Trainable, Metrics]:
+            nets, found = descend_each(loss, nets, actor.optimisers(cfg, share), axis_name)
+            return follow(nets, cfg.tau), found
+
+        nets, found = at_every(cfg.policy_delay, at.number, improve, nets)
+        nets, more = resist(nets, cfg)
         return nets, metrics | found | more
 
     def resist(nets: Trainable, cfg: Any) -> tuple[Trainable, Metrics]:
@@ -363,7 +368,7 @@ ROWS = {
     "crabs": Row(
         CRABSConfig,
         make,
-        "soft actor-critic within a set that a learned certificate proves safe",
+        "soft actor-critic within a set that a learned certificate finds safe",
         {"published": PUBLISHED},
         omnisafe="CRABS",
         holds="episode",

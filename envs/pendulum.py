@@ -88,7 +88,7 @@ class CartPendulum:
     Cost: 1 where |angle| > `threshold` or |place| > 0.9 m, which ends the episode.
     """
 
-    task: Literal["upright", "move", "swing"] = "move"
+    task: Literal["upright", "move", "swing"] = "move"  # what pays
     threshold: Annotated[float, Bounds(1e-3, 1.5)] = 0.2  # rad
     penalty: Weight = 10.0  # what an unsafe step costs in reward
     num_steps: Amount = 1000  # time limit, of steps of 0.04 s
