@@ -193,11 +193,12 @@ class Search:
 
 
 def begun(system: System, barrier: PyTree, key: jax.Array, cfg: Any) -> Search:
-    """Walks that begin anywhere in a box around C. Those that begin outside of C jump until they are
-    in it: see `walk`."""
+    """Walks that begin anywhere in a box around C, and one at s_0, which is always in C. Those that
+    begin outside of C jump until they are in it: see `walk`."""
     box_key, z_key, key = jax.random.split(key, 3)
     box = box_around(system, barrier, box_key, cfg)
     z = jax.random.uniform(z_key, (cfg.chains, len(system.start)), minval=-1.0, maxval=1.0)
+    z = z.at[0].set((system.start - box.centre) / box.half)
     return Search(z, jnp.full(cfg.chains, TAU), box, jax.random.key_data(key))
 
 
@@ -236,8 +237,8 @@ def volume(system: System, barrier: PyTree, search: Search, cfg: Any) -> jax.Arr
 
 
 def walk(system: System, core: Core, search: Search, cfg: Any) -> Search:
-    """One step of each walk: Langevin's, Metropolis-adjusted. A state outside of C jumps to anywhere in
-    the box, if that is in C.
+    """One step of each walk: Langevin's, Metropolis-adjusted. A state outside of C jumps into it: to
+    anywhere in the box or, where C is thin, near to a state in C.
 
     The drift of a step is at most 1 in each direction, in units of the box.
     """
@@ -256,7 +257,12 @@ def walk(system: System, core: Core, search: Search, cfg: Any) -> Search:
     slope, (f, inside) = climb(z)
     noise = jax.random.normal(noise_key, z.shape)
     stepped = z + drift(slope) + jnp.sqrt(2 * tau)[:, None] * noise
-    jumped = jax.random.uniform(jump_key, z.shape, minval=-1.0, maxval=1.0)
+    far_key, coin_key, other_key = jax.random.split(jump_key, 3)
+    far = jax.random.uniform(far_key, z.shape, minval=-1.0, maxval=1.0)
+    chosen = jax.random.randint(other_key, tau.shape, 0, jnp.maximum(inside.sum(), 1))
+    other = jnp.argsort(~inside)[chosen]  # any of those in C
+    near = z[other] + jnp.sqrt(2 * tau[other])[:, None] * noise
+    jumped = jnp.where(jax.random.bernoulli(coin_key, shape=(len(z), 1)), far, near)
     new = jnp.where(inside[:, None], stepped, jumped)
     new_slope, (new_f, new_inside) = climb(new)
     forth = -(noise**2).sum(-1) / 2
