@@ -144,6 +144,16 @@ def throughput_table() -> str:
     return "\n".join(lines)
 
 
+def velocity_speeds() -> str:
+    """Environment steps a second of the velocity tasks on one H200."""
+    rows = [r for r in benchmark_rows("benchmark_h200.jsonl") if r["env"].endswith("_velocity")]
+    lines = ["| | environments | steps/s | slowest, fastest run |", "|---|---:|---:|---:|"]
+    for (env, size), r in sorted(latest(rows, "env", "num_envs").items()):
+        rates = f"{r['env_steps_per_s']:,.0f} | {r['slowest']:,.0f}, {r['fastest']:,.0f}"
+        lines.append(f"| {env} | {size:,} | {rates} |")
+    return "\n".join(lines)
+
+
 def engine_jax() -> str:
     """Environment steps a second of engine jax, with MJX's solver and with ours."""
     lines = [
@@ -337,6 +347,7 @@ def pages() -> dict[Path, str]:
         HERE / "benchmark.md": {"speeds": algorithm_speeds()},
         HERE / "performance.md": {
             "throughput": throughput_table(),
+            "velocity": velocity_speeds(),
             "training": training_speeds(),
             "engine jax": engine_jax(),
         },
