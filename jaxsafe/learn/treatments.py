@@ -91,6 +91,44 @@ lagrangian = Treatment(
 
 
 @config
+class DampedConfig(LagrangianConfig):
+    """For `damped_lagrangian`."""
+
+    # Price for each unit by which J_c exceeds its limit, beside the multiplier; below the limit it is
+    # taken off. A multiplier alone overshoots, because it goes on to rise until J_c has fallen.
+    dual_damping: Weight = 0.02
+
+
+class Damped(NamedTuple):
+    lam: jax.Array  # float [] or [K], the price, >= 0
+    multiplier: Multiplier
+
+
+def init_damped(cfg: Any) -> Damped:
+    multiplier = init_multiplier(cfg)
+    return Damped(multiplier.lam, multiplier)
+
+
+def damped_ascent(dual: Damped, episode_cost: jax.Array, cfg: Any, iteration: Count) -> Damped:
+    """lam = (l + dual_damping (J_c - cost_limit)), in [0, lam_max], with the multiplier l."""
+    multiplier = adam_ascent(dual.multiplier, episode_cost, cfg, iteration)
+    over = episode_cost - limit(cfg, constrained_costs(cfg))
+    lam = jnp.clip(multiplier.lam + cfg.dual_damping * over, 0.0, cfg.lam_max)
+    return Damped(lam, multiplier)
+
+
+# Platt and Barr (1987), "Constrained Differential Optimization", section 3.1, whose damping is the
+# gradient of a quadratic penalty
+damped_lagrangian = Treatment(
+    init=init_damped,
+    update=damped_ascent,
+    advantage=mixed,
+    metrics=lambda dual: {"train/lam": dual.lam, "train/multiplier": dual.multiplier.lam},
+    constrained_costs=constrained_costs,
+)
+
+
+@config
 class PIDConfig(LimitsConfig):
     """For `pid`."""
 
