@@ -242,7 +242,7 @@ def learning(runs: Sequence[SettingRun], path: Path) -> None:
     for g in sorted(groups, key=lambda g: names.index(g.name)):
         for axes, name in zip(panels, ("train/return", "train/cost"), strict=True):
             values = np.concatenate([plots.stretches(run.table, name, edges) for run in g.runs])
-            plots.band(axes, edges[1:] / 1e6, values, g.name)
+            plots.band(axes, name, edges[1:] / 1e6, values, g.name)
     panels[1].axhline(25, color="0.4", ls="--", lw=1, label="limit")
     for axes, what in zip(panels, ("return", "cost"), strict=True):
         axes.set(xlabel="million environment steps", ylabel=f"{what} of an episode")
