@@ -58,14 +58,15 @@ class DDPGLagConfig(MultiplierConfig, DDPGConfig):
         minimise_l    -l (J_c - cost_limit),  l >= 0,  by Adam, once every `dual_every` steps
 
     J_c is what an episode has cost since lam last moved. unit is the standard deviation of what it
-    divides over the batch, or 1 with `price_unit=reward`. The rest is as in DDPG.
+    divides over the batch, or 1 with `price_unit=reward`. With `cost_floor`
+    a Q_c or Q'_c below 0 counts as 0. The rest is as in DDPG.
 
     Source: Ray, Achiam and Amodei (2019), "Benchmarking Safe Exploration in Deep Reinforcement
     Learning", for the multiplier; Platt and Barr (1987), "Constrained Differential Optimization", for
     its damping.
     Differs from OmniSafe: there lam is l, without damping, and moves at every gradient step, so that
-    its speed depends on `replay_ratio`. There is one critic of cost, whose target takes mu(s'), and
-    unit is 1.
+    its speed depends on `replay_ratio`. There is one critic of cost, without a floor, whose target
+    takes mu(s'), and unit is 1.
     """
 
 

@@ -9,8 +9,9 @@
 
 The methods differ in a', in what is picked and in the bonus, which is an entropy or 0: see `Actor`. How
 Q_r and Q_c are mixed is the treatment's: (Q_r / unit - lam Q_c) / (1 + lam) is a Lagrangian's. The unit
-is the standard deviation of Q_r over the batch, or 1: see `price_unit`. A limit is on the undiscounted
-cost of an episode; Q_c, which is discounted, only gives the direction.
+is the standard deviation of Q_r over the batch, or 1: see `price_unit`. Where the method weighs cost, a
+reduced Q_c or Q'_c below 0 counts as 0, unless `cost_floor` is off. A limit is on the undiscounted cost
+of an episode; Q_c, which is discounted, only gives the direction.
 """
 
 from collections.abc import Callable
@@ -237,7 +238,7 @@ def actor_critic(env: Env, actor: Actor, treatment: Treatment) -> Learner:
         return targets_of(batch, charged, Values(q_r + bonus, q_c), names(cfg), cfg)
 
     def known_cost(params: PyTree, obs: jax.Array, action: jax.Array, cfg: Any) -> jax.Array:
-        """Q_c of what the critics say and of what is known of costs: float [B] or [B, K]."""
+        """Q_c as the critics estimate it, with the floor of `cost_floor`: float [B] or [B, K]."""
         q_c = expected_cost(params, obs, action, names(cfg), cfg)
         has_floor = treatment is not no_treatment and cfg.cost_floor
         return jnp.maximum(q_c, 0.0) if has_floor else q_c

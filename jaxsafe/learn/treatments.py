@@ -110,7 +110,7 @@ def init_damped(cfg: Any) -> Damped:
 
 
 def damped_ascent(dual: Damped, episode_cost: jax.Array, cfg: Any, iteration: Count) -> Damped:
-    """lam = (l + dual_damping (J_c - cost_limit)), in [0, lam_max], with the multiplier l."""
+    """lam = l + dual_damping (J_c - cost_limit), clipped to [0, lam_max], with the multiplier l."""
     multiplier = adam_ascent(dual.multiplier, episode_cost, cfg, iteration)
     over = episode_cost - limit(cfg, constrained_costs(cfg))
     lam = jnp.clip(multiplier.lam + cfg.dual_damping * over, 0.0, cfg.lam_max)
@@ -139,15 +139,15 @@ class PIDConfig(LimitsConfig):
     pid_kd: Weight = 0.01  # Price for each unit that the smoothed cost rose, as in OmniSafe.
     # Share of the past in the smoothed violation and the smoothed cost, as in OmniSafe.
     pid_smoothing: Share = 0.95
-    pid_delay: Iterations = 10  # Iterations over which the rise is measured, as in OmniSafe.
+    # Moves of the price over which the rise is measured, one an iteration on-policy. As in OmniSafe.
+    pid_delay: Iterations = 10
 
 
 class PID(NamedTuple):
     """What the controller remembers: lam and integral are prices, the others costs per episode.
 
     Of several constraints all have a last axis K. `error`, `cost` and `past` start at 0, as in the code
-    of Stooke et al. and in OmniSafe: the first `pid_delay` iterations see the whole smoothed cost as a
-    rise.
+    of Stooke et al. and in OmniSafe: the first `pid_delay` moves see the whole smoothed cost as a rise.
     """
 
     lam: jax.Array  # float [], standard deviations of A_r per unit of cost, >= 0

@@ -54,7 +54,7 @@ def curves(
     Evaluations during training are points on dashed lines, each the mean over seeds.
 
     Settings trained side by side have a colour each, and their own limits where those differ. Named
-    costs with limits of their own have panels instead of a limit on the sum.
+    costs with limits of their own have panels in place of `cost`'s.
     """
     # with each limit its column of metrics.csv, which is there where the settings differ in it
     limits = {
