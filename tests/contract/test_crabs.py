@@ -127,7 +127,7 @@ def test_it_acts_by_its_policy_until_there_is_a_certificate_and_then_within_it()
     safe = safe.replace(model=safe.model.replace(scale=scale))
     bound = dataclasses.replace(free, params=free.params | {"safe": safe, "certified": jnp.ones(())})
     within = Corridor().reset(jax.random.key(0))
-    beyond = within.replace(obs=within.obs.at[1].set(0.49))
+    beyond = dataclasses.replace(within, obs=within.obs.at[1].set(0.49))
     h = [interval_barrier(state.obs[1], 0.5) + np.log(2) - 1 for state in (within, beyond)]
     assert h[0] < 0 < h[1]
 

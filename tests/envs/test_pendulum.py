@@ -2,6 +2,7 @@
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import jax
@@ -28,22 +29,23 @@ def flown(env, actions):
 
 
 def test_the_cart_moves_as_in_mujoco():
-    model = mujoco.MjModel.from_xml_path(
+    mj: Any = mujoco
+    model = mj.MjModel.from_xml_path(
         str(Path(gymnasium.__file__).parent / "envs/mujoco/assets/inverted_pendulum.xml")
     )
-    data = mujoco.MjData(model)
+    data = mj.MjData(model)
     actions = np.random.default_rng(0).uniform(-1.2, 1.2, (8, 1))
     obs, reward, _, _ = flown(envs.make("pendulum_swing"), jnp.asarray(actions, jnp.float32))
     for action, seen in zip(actions, obs, strict=True):
         data.ctrl[:] = np.clip(action, -1, 1)
-        mujoco.mj_step(model, data, nstep=2)
+        mj.mj_step(model, data, nstep=2)
         np.testing.assert_allclose(seen, np.concatenate([data.qpos, data.qvel]), rtol=1e-4, atol=1e-4)
     np.testing.assert_allclose(reward, obs[:, 1] ** 2, rtol=1e-6)
     assert np.abs(obs[:, 1]).max() > 0.1
 
 
 def test_the_pendulum_moves_as_in_gymnasium():
-    theirs = gymnasium.make("Pendulum-v1").unwrapped
+    theirs: Any = gymnasium.make("Pendulum-v1").unwrapped
     theirs.reset()
     theirs.state, theirs.last_u = np.array([0.3, -0.9]), None
     actions = np.random.default_rng(0).uniform(-1.2, 1.2, (20, 1))
