@@ -107,14 +107,14 @@ class MultiplierConfig(DampedConfig, CostCriticConfig):
 
     CONVENTIONS: ClassVar = (
         Convention(
-            {"dual_damping": 0.0},
-            "the price is the multiplier",
-            "it also rises and falls with the violation at once",
+            {"dual_damping": 0.0, "dual_eps": 1e-8},
+            "the price is the multiplier, which moves by about `dual_lr` at any violation",
+            "the price also follows the violation at once, and a small one moves the multiplier little",
         ),
     )
 
-    # Adam's step of the multiplier, whatever the size of the violation. A policy answers a price only
-    # after some hundred thousand steps.
+    # Adam's step of the multiplier where the violation is far above `dual_eps`. A policy answers a
+    # price only after some hundred thousand steps.
     dual_lr: Rate = 0.01
 
 
