@@ -101,7 +101,8 @@ class VAEBCConfig(VAEConfig, OfflineConfig):
 
 def learner(env: Env) -> Learner:
     def init(key: jax.Array, obs_size: int, action_size: int, cfg: Any) -> Trainable:
-        actor = coarse_mlp(cfg, action_size).init(key, blank(observation_like(env)))
+        obs = blank(observation_like(env)) if cfg.encoder == "cnn" else jnp.zeros(obs_size)
+        actor = coarse_mlp(cfg, action_size).init(key, obs)
         return Trainable({"actor": actor}, {"actor": adam(cfg.lr, cfg).init(actor)})
 
     def mu(actor: PyTree, obs: PyTree, cfg: Any) -> jax.Array:

@@ -249,7 +249,7 @@ class SafetyGym:
         )
 
     def _observed(self, world: World, readings: Readings, ctrl: jax.Array) -> PyTree:
-        obs = observe.observe(self.arena, world, readings, ctrl, self.ray_slack)
+        obs: Any = observe.observe(self.arena, world, readings, ctrl, self.ray_slack)
         if self._picture is None:
             return obs
         parts = {"vector": obs} if self.config.observation_flatten else obs

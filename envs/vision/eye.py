@@ -150,7 +150,8 @@ def camera_of(model: mujoco.MjModel, name: str) -> Callable[[Pose], Pose]:
 def colours(drawing: Drawing, view: View, u: jax.Array, v: jax.Array) -> surface.Colour:
     """Of the rays through u [1, W] and v [H, 1], from 0 to 1, [H, W] each."""
     shape = jnp.broadcast_shapes(u.shape, v.shape)
-    depth, seen = jnp.full(shape, jnp.inf), surface.sky_colour(drawing.sky, ray(view.axes, u, v))
+    depth: jax.Array = jnp.full(shape, jnp.inf)
+    seen = surface.sky_colour(drawing.sky, ray(view.axes, u, v))
     for geom, thing in enumerate(drawing.things):
         if thing.alpha == 1:
             t, colour = painted(drawing, view, geom, u, v)
@@ -158,7 +159,8 @@ def colours(drawing: Drawing, view: View, u: jax.Array, v: jax.Array) -> surface
             depth = jnp.where(nearer, t, depth)
             seen = each(lambda new, old, nearer=nearer: jnp.where(nearer, new, old), colour, seen)
     # T_1 ... T_n T_n ... T_1 c = through c + added
-    through, added = jnp.ones(shape), (jnp.zeros(shape),) * 3
+    through, nothing = jnp.ones(shape), jnp.zeros(shape)
+    added = nothing, nothing, nothing
     for geom, thing in enumerate(drawing.things):
         if 0 < thing.alpha < 1:
             t, colour = painted(drawing, view, geom, u, v)

@@ -52,8 +52,8 @@ def fixed(position: np.ndarray, quat: np.ndarray) -> Pose:
     matrices = np.zeros((len(quat), 9))
     for matrix, q in zip(matrices, np.asarray(quat, float), strict=True):
         mujoco.mju_quat2Mat(matrix, q)
-    position, rotation = np.float32(position), np.float32(matrices).reshape(-1, 3, 3)
-    return Pose(jnp.asarray(position), jnp.asarray(rotation))
+    rotation = jnp.asarray(matrices.reshape(-1, 3, 3), jnp.float32)
+    return Pose(jnp.asarray(position, jnp.float32), rotation)
 
 
 def kinematics(model: mujoco.MjModel) -> Kinematics:

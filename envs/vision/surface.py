@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxsafe.envs.vision.rays import TINY, Vector, dot
 
-Colour = tuple[jax.Array, jax.Array, jax.Array]
+Colour = tuple[jax.Array, jax.Array, jax.Array]  # red, green, blue, from 0 to 1
 
 
 class Lights(NamedTuple):
@@ -43,7 +43,9 @@ def lights_of(model: mujoco.MjModel) -> Lights:
     )
 
 
-def lit(rgb: Colour, lights: Lights, normal: Vector, towards: list[Vector]) -> Colour:
+def lit(
+    rgb: tuple[float, float, float], lights: Lights, normal: Vector, towards: list[Vector]
+) -> Colour:
     """A surface of colour `rgb` under the lights that stand `towards`, in the frame of `normal`."""
     shares = [jnp.maximum(dot(normal, light), 0.0) for light in towards]
 
@@ -134,7 +136,8 @@ def sky_colour(sky: Sky | None, direction: Vector) -> Colour:
     """
     x, y, z = direction
     if sky is None:
-        return (jnp.zeros_like(z),) * 3
+        black = jnp.zeros_like(z)
+        return black, black, black
     flat = jnp.sqrt(jnp.maximum(x**2 + y**2, TINY))
     e = jnp.arctan2(z, flat) / (jnp.pi / 2)
     share = (1 + jnp.sqrt(2.0) * e / jnp.sqrt(1 + e**2)) / 2

@@ -104,9 +104,10 @@ def options_of(args: argparse.Namespace) -> dict[str, Any]:
 def measure(name: str, num_envs: int, args: argparse.Namespace) -> dict:
     env = envs.make(name, **options_of(args))
     if args.algo:
-        config = algos.ALGOS[args.algo].config
+        config: Any = algos.ALGOS[args.algo].config
         settings = {"horizon": args.horizon} if args.horizon else {}
-        settings |= {"encoder": "cnn"} if args.vision and issubclass(config, EncoderConfig) else {}
+        sees = issubclass(algos.ALGOS[args.algo].config, EncoderConfig)
+        settings |= {"encoder": "cnn"} if args.vision and sees else {}
         cfg = config(num_envs=num_envs, **settings)
         horizon = cfg.horizon
         state, fn = training(env, args.algo, cfg, args.seeds, args.devices)

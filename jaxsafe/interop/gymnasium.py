@@ -213,9 +213,10 @@ def spaces(env: Env) -> tuple[gymnasium.Space, gymnasium.Space]:
         return box(0, 255, like.shape, np.uint8) if picture else box(-np.inf, np.inf, like.shape)
 
     like = observation_like(env)
-    parts = {name: part(x) for name, x in like.items()} if isinstance(like, dict) else None
-    seen = part(like) if parts is None else gymnasium.spaces.Dict(parts)
-    return seen, box(-1.0, 1.0, (env.action_size,))
+    action = box(-1.0, 1.0, (env.action_size,))
+    if isinstance(like, dict):
+        return gymnasium.spaces.Dict({name: part(x) for name, x in like.items()}), action
+    return part(like), action
 
 
 def arrays(obs: PyTree) -> Any:

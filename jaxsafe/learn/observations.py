@@ -23,12 +23,12 @@ class EncoderConfig:
     encoder: Literal["none", "cnn"] = "none"
 
 
-def vector_of(obs: PyTree) -> jax.Array:
+def vector_of(obs: PyTree) -> Any:
     """Of an observation, what is not a picture."""
     return obs["vector"] if isinstance(obs, dict) else obs
 
 
-def with_vector(obs: PyTree, vector: jax.Array) -> PyTree:
+def with_vector(obs: PyTree, vector: Any) -> PyTree:
     """`obs` with another vector."""
     return obs | {"vector": vector} if isinstance(obs, dict) else vector
 

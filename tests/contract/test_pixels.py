@@ -77,8 +77,8 @@ def test_bc_imitates_from_pictures_of_a_file(tmp_path):
     states = jax.jit(jax.vmap(Patch().reset))(jax.random.split(jax.random.key(0), 256))
     action = 0.4 * jnp.argmax(states.obs["vision"][:, 3, :, 1] > 200, 1) - 1.2
     nothing, path = np.zeros(256, np.float32), tmp_path / "data.npz"
-    obs = jax.device_get(states.obs)
-    made = data_set(obs, action[:, None], nothing, nothing, obs, nothing, nothing, {"red": nothing})
+    obs, target = jax.device_get((states.obs, action[:, None]))
+    made = data_set(obs, target, nothing, nothing, obs, nothing, nothing, {"red": nothing})
     write_dataset(path, made)
     data = read_dataset(str(path))
     chex.assert_trees_all_equal(data, made)

@@ -20,6 +20,7 @@ from jaxsafe.envs.vision.rays import SHAPES
 from jaxsafe.envs.vision.surface import Checker, checkered
 from jaxsafe.learn.rollout import collect, init_rollout, memoryless
 
+native: Any = mujoco  # its functions are not known to type checkers
 ASSETS = Path(envs.__file__).parent
 SIZE = (60, 40)
 
@@ -30,19 +31,20 @@ def seeing(name: str, **options: Any) -> Any:
 
 @pytest.mark.parametrize("kind", ["plane", "sphere", "capsule", "cylinder", "box"])
 def test_rays_enter_a_shape_where_those_of_mujoco_do(kind):
-    model = mujoco.MjModel.from_xml_string(
+    model = native.MjModel.from_xml_string(
         f"<mujoco><worldbody><geom type='{kind}' size='.3 .5 .4'/></worldbody></mujoco>"
     )
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
+    data = native.MjData(model)
+    native.mj_forward(model, data)
     rng = np.random.default_rng(0)
     origin = np.array([0.9, -0.7, 1.1])
     direction = rng.uniform(-0.7, 0.7, (400, 3)) - origin  # past the shape or at it
-    shape, size = SHAPES[int(model.geom_type[0])], tuple(model.geom_size[0].tolist())
+    shape: Any = SHAPES[int(model.geom_type[0])]
+    size = tuple(model.geom_size[0].tolist())
     found = jax.jit(lambda d: shape(size, tuple(origin), tuple(d.T)))(direction)
     there, geom = [], np.zeros(1, np.int32)
     for d in direction:
-        far = mujoco.mj_ray(model, data, origin, d, None, 1, -1, geom)
+        far = native.mj_ray(model, data, origin, d, None, 1, -1, geom)
         there.append(np.inf if far < 0 else far)
     np.testing.assert_allclose(found.distance, there, rtol=1e-4)
     hit = np.isfinite(there)
@@ -57,13 +59,13 @@ def test_rays_enter_a_shape_where_those_of_mujoco_do(kind):
 
 def test_bodies_are_where_mujoco_has_them():
     models = [drawn_model(seeing(name).arena) for name in ("car_push1", "doggo_button1")]
-    models += [mujoco.MjModel.from_xml_path(str(ASSETS / "velocity" / "assets" / "humanoid.xml"))]
+    models += [native.MjModel.from_xml_path(str(ASSETS / "velocity" / "assets" / "humanoid.xml"))]
     rng = np.random.default_rng(0)
     for model in models:
-        data = mujoco.MjData(model)
-        mujoco.mj_integratePos(model, data.qpos, rng.normal(size=model.nv), 1.0)
+        data = native.MjData(model)
+        native.mj_integratePos(model, data.qpos, rng.normal(size=model.nv), 1.0)
         data.mocap_pos[:] = rng.normal(size=data.mocap_pos.shape)
-        mujoco.mj_forward(model, data)
+        native.mj_forward(model, data)
         at = jax.jit(kinematics(model))(data.qpos, data.mocap_pos, data.mocap_quat)
         np.testing.assert_allclose(at.position, data.xpos, atol=2e-5)
         np.testing.assert_allclose(at.rotation.reshape(-1, 9), data.xmat, atol=2e-5)
@@ -202,7 +204,7 @@ def test_a_light_or_a_texture_of_another_kind_is_refused():
             "expected a checker",
         ),
     ]:
-        spec = mujoco.MjSpec.from_string(scene.format(asset, body))
+        spec = native.MjSpec.from_string(scene.format(asset, body))
         spec.visual.headlight.specular[:] = 0
         with pytest.raises(ValueError, match=reason):
             make_eye(spec.compile(), "c", (4, 4))

@@ -275,7 +275,7 @@ def test_without_gymnasium_there_is_one_line(monkeypatch):
 
 
 def test_pictures_have_a_space_and_stay_whole():
-    env = GymEnv(Patch())
+    env: Any = GymEnv(Patch())
     assert env.observation_space["vision"] == gymnasium.spaces.Box(0, 255, (8, 8, 3), np.uint8)
     obs, _ = env.reset(seed=0)
     assert env.observation_space.contains(obs)
