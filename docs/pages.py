@@ -126,7 +126,8 @@ ENVIRONMENTS = """# Environments
 
 A name is a robot and a task: `point_goal1`, `car_push2`, `doggo_button1`. Safety Gym's ids, as in
 `Safexp-PointGoal1-v0`, work too. Goal, Button and Push are the suite's 27 tasks. Run, Circle and the
-grids are the original's tests. Vision is not there yet. The six [velocity tasks](velocity.md) are
+grids are the original's tests. [`env.observe_vision=true`](../howto/pixels.md)
+adds what a camera on the robot sees. The six [velocity tasks](velocity.md) are
 Safety-Gymnasium's: `ant_velocity` is `SafetyAntVelocity-v1`. So are
 [`point_circle1`, `point_run0`](../howto/safety_gymnasium.md) and their like. `seditor_point_goal1` and
 its like are [SEditor's tasks](../howto/seditor.md). So are `car_racing0` and `car_racing1`, which are
@@ -228,7 +229,7 @@ python scripts/train.py env=car_racing1 algo=seditor video=false
 ```
 
 There are no pictures of these tasks yet, neither to see nor to learn from. `jaxsafe render` refuses
-them. The version that learns from pixels comes with vision.
+them. The version that learns from pixels is not there.
 
 ## Sizes
 

@@ -694,9 +694,8 @@ KNOWN = OFFLINE | OFF_POLICY | MODEL_BASED
 # Options that Engine does not have.
 OURS_ALONE = (
     "rules", "observation", "awake", "contact_room", "bounds_num", "bounds", "bounds_cost",
+    "vision_camera",
 )  # fmt: skip
-# Engine's options that ours takes, and does not use yet.
-VISION = ("observe_vision", "vision_size", "vision_render", "vision_render_size")
 
 
 class Line(NamedTuple):
@@ -850,11 +849,7 @@ def safety_gym(config: dict[str, Any]) -> Migrated:
         if key not in known:
             raise ConfigError(f"unknown option {key} of Engine{nearest(key, known)}")
     lines = []
-    for key in [k for k in VISION if k in config]:
-        asked = key == "observe_vision" and bool(config[key])
-        lines.append(Line(key, config.pop(key), "vision is not available yet", asked))
     options = dataclasses.asdict(read_config(defaults(**config)))
-    options = {k: v for k, v in options.items() if k not in VISION}
 
     def differences(name: str) -> dict[str, Any]:
         other = envs.env_defaults(name)
