@@ -323,8 +323,8 @@ def crabs(env: Env) -> Learner:
             keep = cfg.barrier_keep * certified
             found = certify(here, core, safe.barrier, keep, state["barrier"], state["search"], cfg)
             new = core.replace(barrier=found.barrier)  # type: ignore[attr-defined]
-            back = jnp.where(certified > 0, 1.0, 0.0)  # to the last certificate, if there is one
-            rejected = select(back > 0, safe.barrier, found.barrier)
+            # back to the last certificate, if there is one
+            rejected = select(certified > 0, safe.barrier, found.barrier)
             factor = jnp.where(found.at_once, 1 / 2, 1 / 1.2)
             pressure = state["pressure"] * jnp.where(found.certified, factor, 2.0)
             params = params | {

@@ -422,7 +422,7 @@ def measured(name: str) -> str:
     if not rows and issubclass(ALGOS[name].config, OfflineConfig):
         return "Not run at length yet."
     if issubclass(ALGOS[name].config, BarrierConfig):
-        return "[Two short runs](../theory/certificates.md#two-short-runs); no figures are published."
+        return "[Short runs](../theory/certificates.md#short-runs). There is no published table."
     if not rows:
         return "Not run at length yet; it learns the small exact problem of tests/toys.py, Lever."
     head = "| 1e7 steps a seed, limit 25 | return, last 10% | cost | published |\n|---|---|---|---|\n"
