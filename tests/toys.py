@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsafe.learn.acting import Player
+from jaxsafe.learn.barrier import interval_barrier
 from jaxsafe.learn.steps import Context
 from jaxsafe.types import Algorithm, Env, Policy, Shared, State
 
@@ -55,6 +56,9 @@ class Corridor:
     action_size: int = 2
     episode_length: int = 20
     cost_names: tuple[str, ...] = ("wall",)
+
+    def barrier(self, obs: jax.Array) -> jax.Array:
+        return interval_barrier(obs[..., 1], self.half_width)
 
     def reset(self, key: jax.Array) -> State:
         position = jax.random.uniform(key, (2,), minval=-0.1, maxval=0.1)

@@ -290,6 +290,9 @@ def off_policy(
         """The environment steps of a round, and whether the normaliser had to skip them."""
         cfg, sizes = ts.config, sizes_of(ts.config, axis_name)
         learned = Learned(cfg, now.nets.params, ts.dual, now.normaliser)
+        random = at.warming_up
+        if learner.random_start is not None:
+            random &= learner.random_start(learned)
 
         def behave(
             carry: PyTree, state: State, first: jax.Array, key: jax.Array
@@ -306,7 +309,7 @@ def off_policy(
                     return act_in_all(player, carry, state, first, explore_key)
                 return explore(learned, network_inputs(now.normaliser, state.obs), explore_key), carry
 
-            return jax.lax.cond(at.warming_up, at_random, chosen, carry)
+            return jax.lax.cond(random, at_random, chosen, carry)
 
         keys = jax.random.split(device_key(key, axis_name), sizes.every)
         stepping, (rows, steps) = collect_records(env, behave, now.stepping, keys, learner.record(cfg))
