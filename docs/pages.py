@@ -30,6 +30,7 @@ from jaxsafe.learn.model_based import ModelBasedConfig
 from jaxsafe.learn.off_policy import OffPolicyConfig
 from jaxsafe.learn.offline import OfflineConfig
 from jaxsafe.learn.on_policy import OnPolicyConfig
+from jaxsafe.learn.world_model import WorldModelConfig
 from jaxsafe.report import stats, studies
 from jaxsafe.report import tables as report
 from jaxsafe.report.published import read_published
@@ -57,10 +58,12 @@ FAMILIES = {  # the pages of docs/theory
     ),
     "recorded_data": ("bcq", "bcq_lag", "crr", "ccrr", "coptidice"),
     "planning": ("pets", "cce_pets", "rce_pets", "cap_pets", "loop", "safe_loop"),
+    "world_models": ("dreamer", "dreamer_lag"),
 }
 PLANNING = " env.observation=coordinates env.wrap.action_repeat=5 algo.learn_cost=false"
 LOOPS = {  # the first that an algorithm's config is one of
     ModelBasedConfig: "planning",
+    WorldModelConfig: "world-model",
     OnPolicyConfig: "on-policy",
     OffPolicyConfig: "off-policy",
     OfflineConfig: "offline",
@@ -74,7 +77,8 @@ and what it made in our runs. Which one to take: [choosing](../choosing.md#an-al
 How families work, step by step: [prices](../theory/prices.md),
 [trust regions](../theory/trust_region.md), [penalties](../theory/penalties.md),
 [budgets in the state](../theory/budgets.md), [values of actions](../theory/actor_critics.md),
-[recorded data](../theory/recorded_data.md), [planning](../theory/planning.md).
+[recorded data](../theory/recorded_data.md), [planning](../theory/planning.md),
+[world models](../theory/world_models.md).
 
 The on-policy algorithms share these options:
 

@@ -84,8 +84,8 @@ class ReplayConfig:
 
 
 @config
-class OffPolicyConfig(ReplayConfig):
-    """What the off-policy algorithms share."""
+class RoundConfig(ReplayConfig):
+    """What algorithms share that take gradient steps on rows of a replay."""
 
     # Steps of each environment between two rounds of gradient steps.
     learn_every: Amount = 1
@@ -93,6 +93,12 @@ class OffPolicyConfig(ReplayConfig):
     # Transitions of a gradient step, of all devices together. OmniSafe has 256.
     batch_size: Amount = 1024
     n_step: Iterations = 1  # Rewards summed before the critics' value. OmniSafe has 1.
+
+
+@config
+class OffPolicyConfig(RoundConfig):
+    """What the off-policy algorithms share."""
+
     # Units of the hidden layers of each network, as in OmniSafe.
     hidden: tuple[Units, ...] = (256, 256)
     activation: Literal["relu", "tanh"] = "relu"  # Of the hidden layers, as in OmniSafe.
@@ -444,7 +450,7 @@ def sizes_of(cfg: Any, axis_name: str | None) -> Sizes:
     num_envs = cfg.num_envs * devices
     rows = ring_rows(cfg.replay_size, num_envs, cfg.horizon)
     warm_up = -(-cfg.learning_starts // num_envs)
-    if not isinstance(cfg, OffPolicyConfig):  # no gradient steps on transitions
+    if not isinstance(cfg, RoundConfig):  # no gradient steps on rows of the replay
         return Sizes(1, cfg.horizon, 0, 0, 1, rows, warm_up, False)
     if cfg.horizon % cfg.learn_every:
         choices = [n for n in range(1, cfg.horizon + 1) if cfg.horizon % n == 0]
@@ -477,7 +483,7 @@ def sizes_of(cfg: Any, axis_name: str | None) -> Sizes:
         n_step=cfg.n_step,
         rows=rows,
         warm_up=warm_up,
-        normalises=cfg.obs_normalize,
+        normalises=isinstance(cfg, OffPolicyConfig) and cfg.obs_normalize,
     )
 
 
