@@ -58,7 +58,7 @@ FAMILIES = {  # the pages of docs/theory
     ),
     "recorded_data": ("bcq", "bcq_lag", "crr", "ccrr", "coptidice"),
     "planning": ("pets", "cce_pets", "rce_pets", "cap_pets", "loop", "safe_loop"),
-    "world_models": ("dreamer", "dreamer_lag"),
+    "world_models": ("dreamer", "dreamer_lag", "ambs"),
 }
 PLANNING = " env.observation=coordinates env.wrap.action_repeat=5 algo.learn_cost=false"
 LOOPS = {  # the first that an algorithm's config is one of

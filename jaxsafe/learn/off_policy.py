@@ -297,18 +297,21 @@ def off_policy(
 
         def behave(
             carry: PyTree, state: State, first: jax.Array, key: jax.Array
-        ) -> tuple[jax.Array, PyTree]:
+        ) -> tuple[jax.Array, PyTree, dict[str, jax.Array]]:
             explore_key, random_key = jax.random.split(key)
 
-            def at_random(carry: PyTree) -> tuple[jax.Array, PyTree]:
-                shape = (cfg.num_envs, env.action_size)
-                return jax.random.uniform(random_key, shape, minval=-1.0, maxval=1.0), carry
-
-            def chosen(carry: PyTree) -> tuple[jax.Array, PyTree]:
+            def chosen(carry: PyTree) -> tuple[jax.Array, PyTree, dict[str, jax.Array]]:
                 if learner.policy is not None:
                     player = Player(policy, learned, env)
                     return act_in_all(player, carry, state, first, explore_key)
-                return explore(learned, network_inputs(now.normaliser, state.obs), explore_key), carry
+                obs = network_inputs(now.normaliser, state.obs)
+                return explore(learned, obs, explore_key), carry, {}
+
+            def at_random(carry: PyTree) -> tuple[jax.Array, PyTree, dict[str, jax.Array]]:
+                shape = (cfg.num_envs, env.action_size)
+                action = jax.random.uniform(random_key, shape, minval=-1.0, maxval=1.0)
+                silent = {k: jnp.zeros(x.shape) for k, x in jax.eval_shape(chosen, carry)[2].items()}
+                return action, carry, silent
 
             return jax.lax.cond(at.warming_up, at_random, chosen, carry)
 
@@ -368,10 +371,12 @@ def off_policy(
 
 def act_in_all(
     player: Player, carry: PyTree, state: State, first: jax.Array, key: jax.Array
-) -> tuple[jax.Array, PyTree]:
-    """The actions [N, A] of a policy in N environments, and its carries, begun anew at `first` [N]."""
+) -> tuple[jax.Array, PyTree, dict[str, jax.Array]]:
+    """The actions [N, A] of a policy in N environments, its carries, begun anew at `first` [N], and
+    what it says beside the actions, float [N] by name."""
     carry = reset_carry(player.policy, player.learned, carry, first)
-    return jax.vmap(player.act)(carry, state, jax.random.split(key, len(first)))
+    action, carry, said = jax.vmap(player.decide)(carry, state, jax.random.split(key, len(first)))
+    return action, carry, jax.tree.map(jnp.float32, said)
 
 
 def drawn_transitions(
@@ -410,6 +415,7 @@ def metrics_of_steps(
     return {
         **step_metrics(env, steps, rate, length, axis_name),
         **{f"train/cost_estimate_{n}": rate(charged[..., k]) * length for k, n in enumerate(names)},
+        **{f"train/{name}": rate(x) for name, x in steps.said.items()},
     }
 
 

@@ -13,13 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compiling import FAST
-from toys import START, Corridor, Lever
+from toys import START, Corridor, Ledge, Lever
 
 from jaxsafe.algos import ALGOS
 from jaxsafe.config import ConfigError
 from jaxsafe.learn.acting import Player
 from jaxsafe.learn.world_model import WorldModelConfig
-from jaxsafe.types import Shared
+from jaxsafe.types import Env, Shared
 
 NAMES = [name for name, row in ALGOS.items() if issubclass(row.config, WorldModelConfig)]
 TINY: dict[str, Any] = {
@@ -27,11 +27,13 @@ TINY: dict[str, Any] = {
     "replay_size": 4 * 24, "learning_starts": 4 * 10, "size": "tiny", "imagine_steps": 3,
     "lr_warmup": 1,
 }  # fmt: skip
-COMPILED = "dreamer_lag"  # the row whose update is compiled
+# rows whose update is compiled
+COMPILED = ["dreamer_lag", pytest.param("ambs", marks=pytest.mark.slow)]
 
 
 def settings_of(name: str, **settings: Any) -> Any:
-    return ALGOS[name].config(**TINY | settings)
+    tiny = TINY | ({"shield_rollouts": 4} if "shield_rollouts" in vars(ALGOS[name].config) else {})
+    return ALGOS[name].config(**tiny | settings)
 
 
 def at(iteration: int, since: int = 0) -> Shared:
@@ -39,7 +41,7 @@ def at(iteration: int, since: int = 0) -> Shared:
 
 
 @cache
-def together(name: str = COMPILED):
+def together(name: str):
     """Two members: their states at first, and the compiled update, which uses up its argument."""
     algo, cfg = ALGOS[name].make(Corridor()), settings_of(name)
     keys = jax.random.split(jax.random.key(3), 2)
@@ -105,8 +107,9 @@ def test_sizes_that_do_not_fit_are_refused(settings, message):
 # ---- compiled ------------------------------------------------------------------------------------
 
 
-def test_an_update_learns_once_the_warm_up_is_over_and_writes_in_place():
-    before, update = together()
+@pytest.mark.parametrize("name", COMPILED)
+def test_an_update_learns_once_the_warm_up_is_over_and_writes_in_place(name):
+    before, update = together(name)
     ts = copy(before)
     for iteration in range(3):
         ts, metrics = update(ts, at(iteration))
@@ -125,8 +128,9 @@ def test_an_update_learns_once_the_warm_up_is_over_and_writes_in_place():
     assert not any(" copy(" in line for line in made)
 
 
-def test_a_member_is_what_it_is_beside_any_other():
-    ts, update = together()
+@pytest.mark.parametrize("name", COMPILED)
+def test_a_member_is_what_it_is_beside_any_other(name):
+    ts, update = together(name)
     swapped = jax.tree.map(lambda x: x[::-1], ts)
     here, there = copy(ts), copy(swapped)
     for iteration in range(3):
@@ -135,8 +139,9 @@ def test_a_member_is_what_it_is_beside_any_other():
         np.testing.assert_array_equal(x, y[::-1])
 
 
-def test_a_resumed_run_acts_by_its_policy_while_it_refills():
-    ts, update = together()
+@pytest.mark.parametrize("name", COMPILED)
+def test_a_resumed_run_acts_by_its_policy_while_it_refills(name):
+    ts, update = together(name)
     fresh, _ = update(copy(ts), at(0))
     again, metrics = update(copy(ts), at(40, since=40))
     assert (fresh.stepping.rollout.carry.action == 0).all()  # at random, by no policy
@@ -146,8 +151,9 @@ def test_a_resumed_run_acts_by_its_policy_while_it_refills():
     assert not any(same(ts.params, later.params)) and jnp.isfinite(metrics["train/critic_loss"]).all()
 
 
-def test_a_world_that_is_not_finite_costs_the_others_nothing_and_is_counted():
-    ts, update = together()
+@pytest.mark.parametrize("name", COMPILED)
+def test_a_world_that_is_not_finite_costs_the_others_nothing_and_is_counted(name):
+    ts, update = together(name)
     rollout = ts.stepping.rollout
     state = dataclasses.replace(
         rollout.state,
@@ -164,8 +170,9 @@ def test_a_world_that_is_not_finite_costs_the_others_nothing_and_is_counted():
     assert all(jnp.isfinite(x).all() for x in jax.tree.leaves((ts.params, ts.opt_state)))
 
 
-def test_the_mean_action_needs_no_key_and_draws_are_spread_about_it():
-    algo, ts = ALGOS[COMPILED].make(Corridor()), member(together()[0], 0)
+@pytest.mark.parametrize("name", COMPILED)
+def test_the_mean_action_needs_no_key_and_draws_are_spread_about_it(name):
+    algo, ts = ALGOS[name].make(Corridor()), member(together(name)[0], 0)
     learned = algo.learned(ts)
     player = Player(algo.policy, learned, algo.task(learned))
     state = Corridor().reset(jax.random.key(0))
@@ -175,10 +182,10 @@ def test_the_mean_action_needs_no_key_and_draws_are_spread_about_it():
     np.testing.assert_array_equal(mean, act(player.begin(), state)[0])
     np.testing.assert_array_equal(mean, carry.action)
     assert (act(carry, state)[0] != mean).any()  # it remembers
-    draws = jax.jit(jax.vmap(lambda key: player.act(player.begin(), state, key)[0]))(
-        jax.random.split(jax.random.key(1), 2000)
-    )
-    np.testing.assert_allclose(draws.mean(0), mean, atol=0.1)
+    drawn = jax.vmap(lambda key: player.act(player.begin(), state, key)[0])
+    keys = jax.random.split(jax.random.key(1), 500)
+    draws = jax.jit(drawn, compiler_options=FAST)(keys)
+    np.testing.assert_allclose(draws.mean(0), mean, atol=0.15)
     assert draws.std(0).min() > 0.5
 
 
@@ -187,9 +194,9 @@ def test_the_mean_action_needs_no_key_and_draws_are_spread_about_it():
 LIMIT, BEST = 2.5, 14.375  # cost of an episode of Lever, and the best return within it
 
 
-def trained(name: str, updates: int, **settings: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return and cost of an episode of Lever, of two seeds, over the last quarter of the updates."""
-    algo, cfg = ALGOS[name].make(Lever()), ALGOS[name].config(**{**ALGOS[name].lever, **settings})
+def trained(name: str, updates: int, env: Env, **settings: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return and cost of an episode, of two seeds, over the last quarter of the updates."""
+    algo, cfg = ALGOS[name].make(env), ALGOS[name].config(**{**ALGOS[name].lever, **settings})
 
     def train(key):
         ts = algo.init(key, cfg, START)
@@ -206,15 +213,28 @@ def trained(name: str, updates: int, **settings: Any) -> tuple[np.ndarray, np.nd
 @pytest.mark.parametrize("actor_grad", ["reinforce", "backprop"])
 def test_without_a_constraint_all_the_reward_is_taken_and_the_cost_paid(actor_grad):
     """20 and 10 at best, 12.5 and 5 by chance."""
-    ret, cost = trained("dreamer", updates=100, actor_grad=actor_grad)
+    ret, cost = trained("dreamer", 100, Lever(), actor_grad=actor_grad)
     assert (ret > 18).all() and (cost > 7).all()
 
 
 @pytest.mark.slow
 def test_the_multiplier_holds_the_limit_on_average():
-    ret, cost = trained("dreamer_lag", updates=160, cost_limit=LIMIT)
+    ret, cost = trained("dreamer_lag", 160, Lever(), cost_limit=LIMIT)
     assert (cost < LIMIT * 1.15).all()
     assert (ret > 0.85 * BEST).all()
+
+
+LEDGE: dict[str, Any] = {"discount": 0.9, "imagine_steps": 6}
+SHIELD: dict[str, Any] = {"shield_horizon": 4, "delta": 0.1, "eps": 0.05, "shield_rollouts": 32}
+
+
+@pytest.mark.slow
+def test_a_shield_keeps_from_a_ledge_that_dreamer_goes_beyond():
+    """8.9 to earn with 9 violations in an episode, 4.8 without."""
+    ret, cost = trained("dreamer", 30, Ledge(), **LEDGE)
+    assert (ret > 8).all() and (cost > 8).all()
+    ret, cost = trained("ambs", 60, Ledge(), **LEDGE, **SHIELD)
+    assert (ret > 3).all() and (cost < 0.3).all()
 
 
 # ---- devices -------------------------------------------------------------------------------------
@@ -255,7 +275,7 @@ for name in sys.argv[2:]:
 def test_two_devices_keep_the_same_parameters():
     env = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
     here = os.path.dirname(os.path.dirname(__file__))
-    command = [sys.executable, "-c", DEVICES, here, COMPILED]
+    command = [sys.executable, "-c", DEVICES, here, "ambs"]
     out = subprocess.run(command, env=env, capture_output=True, text=True)
     assert out.returncode == 0, out.stderr[-3000:]
-    assert out.stdout.split() == [COMPILED, "ok"]
+    assert out.stdout.split() == ["ambs", "ok"]

@@ -176,7 +176,7 @@ def recorded(env: Any, steps: int) -> Record:
     """Rows [T, N] of three environments with random actions, of the loop's own rollout."""
 
     def behave(carry, state, first, key):
-        return jax.random.uniform(key, (3, 1), minval=-1.0), carry
+        return jax.random.uniform(key, (3, 1), minval=-1.0), carry, {}
 
     def play(key):
         stepping = started(init_rollout(env, key, 3, stagger=False))
@@ -232,8 +232,7 @@ def test_the_policy_remembers_what_the_model_learns_from():
     @jax.jit
     def both(stepping, keys):
         def behave(carry, state, first, key):
-            action, carry = act_in_all(likeliest, carry, state, first, key)
-            return action, carry
+            return act_in_all(likeliest, carry, state, first, key)
 
         def step(stepping, key):
             stepping, (rows, _) = collect_records(env, behave, stepping, key[None])
