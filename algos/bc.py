@@ -124,7 +124,7 @@ def learner(action_size: int) -> Learner:
 
 
 def safe_episodes(data: DataSet, cfg: Any) -> Callable[[jax.Array], jax.Array]:
-    """Draws rows of episodes that are whole and cost at most `cost_limit`, of which there is one."""
+    """Draws rows of episodes that are whole and cost at most `cost_limit`; `check_safe` finds one."""
     episodes = need_episodes(data, "bc_safe learns from whole episodes")
     safe = jnp.asarray(episodes.whole) & (jnp.asarray(episodes.cost) <= cfg.cost_limit)
     upto = jnp.cumsum(safe[jnp.asarray(episodes.number)])  # safe transitions up to each

@@ -12,7 +12,7 @@ from jaxsafe.learn.actor_critic import ControllerConfig, MultiplierConfig, actor
 from jaxsafe.learn.conventions import Convention
 from jaxsafe.learn.off_policy import off_policy
 from jaxsafe.learn.row import Row
-from jaxsafe.learn.treatments import Treatment, lagrangian, no_treatment, pid
+from jaxsafe.learn.treatments import Treatment, damped_lagrangian, no_treatment, pid
 from jaxsafe.types import Algorithm, Env, PyTree
 
 
@@ -54,15 +54,19 @@ class DDPGLagConfig(MultiplierConfig, DDPGConfig):
         y_c = c + cost_discount (1 - terminated) reduce_j Q'_cj(s', mu'(s'))
         minimise_Q    E[sum_j (Q_cj(s, a) - y_c)^2], and the loss of Q as in DDPG
         maximise_mu   E[(Q(s, mu(s)) / unit - lam Q_c(s, mu(s))) / (1 + lam)]
-        minimise_lam  -lam (J_c - cost_limit),  lam >= 0,  by Adam, once every `dual_every` steps
+        lam = (l + dual_damping (J_c - cost_limit))+
+        minimise_l    -l (J_c - cost_limit),  l >= 0,  by Adam, once every `dual_every` steps
 
     J_c is what an episode has cost since lam last moved. unit is the standard deviation of what it
-    divides over the batch, or 1 with `price_unit=reward`. The rest is as in DDPG.
+    divides over the batch, or 1 with `price_unit=reward`. With `cost_floor`
+    a Q_c or Q'_c below 0 counts as 0. The rest is as in DDPG.
 
     Source: Ray, Achiam and Amodei (2019), "Benchmarking Safe Exploration in Deep Reinforcement
-    Learning", for the multiplier.
-    Differs from OmniSafe: there lam moves at every gradient step, so that its speed depends on
-    `replay_ratio`. There is one critic of cost, whose target takes mu(s'), and unit is 1.
+    Learning", for the multiplier; Platt and Barr (1987), "Constrained Differential Optimization", for
+    its damping.
+    Differs from OmniSafe: there lam is l, without damping, and moves at every gradient step, so that
+    its speed depends on `replay_ratio`. There is one critic of cost, without a floor, whose target
+    takes mu(s'), and unit is 1.
     """
 
 
@@ -108,7 +112,7 @@ ROWS = {
     ),
     "ddpg_lag": Row(
         DDPGLagConfig,
-        partial(make, treatment=lagrangian),
+        partial(make, treatment=damped_lagrangian),
         "DDPG with an adaptive price on cost",
         td3.published(sac.LAG, sac.LAG_NAVIGATION),
         omnisafe="DDPGLag",

@@ -239,7 +239,7 @@ ROWS = {
     "ppo_saute": Row(
         PPOSauteConfig,
         partial(make, augmentation=saute),
-        "PPO that sees its budget on cost, and earns nothing without",
+        "PPO that sees its budget on cost, and pays a penalty once it is spent",
         {"omnisafe": PUBLISHED | OMNISAFE_SAUTE},
         omnisafe="PPOSaute",
         holds="episode",

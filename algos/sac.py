@@ -19,7 +19,7 @@ from jaxsafe.learn.actor_critic import (
 from jaxsafe.learn.off_policy import off_policy
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.steps import adam
-from jaxsafe.learn.treatments import Treatment, lagrangian, no_treatment, pid
+from jaxsafe.learn.treatments import Treatment, damped_lagrangian, no_treatment, pid
 from jaxsafe.nn.squashed import init_squashed, squashed_mean, squashed_policy, squashed_sample
 from jaxsafe.types import Algorithm, Env, PyTree
 
@@ -59,17 +59,20 @@ class SACLagConfig(MultiplierConfig, SACConfig):
         y_c = c + cost_discount (1 - terminated) reduce_j Q'_cj(s', a'),   a' ~ pi(s'), as for y
         minimise_Q    E[sum_j (Q_cj(s, a) - y_c)^2], and the loss of Q as in SAC
         maximise_pi   E[((min_i Q_i(s, a) - alpha log pi(a | s)) / unit - lam Q_c(s, a)) / (1 + lam)]
-        minimise_lam  -lam (J_c - cost_limit),  lam >= 0,  by Adam, once every `dual_every` steps
+        lam = (l + dual_damping (J_c - cost_limit))+
+        minimise_l    -l (J_c - cost_limit),  l >= 0,  by Adam, once every `dual_every` steps
 
     J_c is what an episode has cost since lam last moved. unit is the standard deviation of what it
-    divides over the batch, or 1 with `price_unit=reward`. The rest is as in SAC.
+    divides over the batch, or 1 with `price_unit=reward`. With `cost_floor`
+    a Q_c or Q'_c below 0 counts as 0. The rest is as in SAC.
 
     Source: Ray, Achiam and Amodei (2019), "Benchmarking Safe Exploration in Deep Reinforcement
-    Learning", for the multiplier; Ha et al. (2020), "Learning to Walk in the Real World with Minimal
-    Human Effort", arXiv:2002.08550, for SAC with one.
-    Differs from OmniSafe: there lam moves at every gradient step, so that its speed depends on
-    `replay_ratio`. There is one critic of cost, whose target takes the policy's mean action, and unit
-    is 1.
+    Learning", for the multiplier; Platt and Barr (1987), "Constrained Differential Optimization", for
+    its damping; Ha et al. (2020), "Learning to Walk in the Real World with Minimal Human Effort",
+    arXiv:2002.08550, for SAC with one.
+    Differs from OmniSafe: there lam is l, without damping, and moves at every gradient step, so that
+    its speed depends on `replay_ratio`. There is one critic of cost, without a floor, whose target
+    takes the policy's mean action, and unit is 1.
     """
 
 
@@ -161,13 +164,14 @@ NAVIGATION: dict[str, Any] = OMNISAFE | {"alpha_init": 1e-5, "lr": 5e-6, "critic
 PARALLEL: dict[str, Any] = {"num_envs": 64, "replay_ratio": 256, "batch_size": 4096, "tau": 0.005}
 # A price that OmniSafe moves at every step by 1e-5 moves by 0.2 in 20,000 steps; likewise the others.
 LAG: dict[str, Any] = {
-    "dual_starts": 200_000, "dual_lr": 0.2, "cost_reduce": "one", "price_unit": "reward",
-    "cost_normalize": True,
+    "dual_starts": 200_000, "dual_lr": 0.2, "dual_damping": 0.0, "cost_reduce": "one",
+    "cost_floor": False, "price_unit": "reward", "cost_normalize": True,
 }  # fmt: skip
 LAG_NAVIGATION: dict[str, Any] = LAG | {"dual_lr": 0.01, "lam_init": 0.0, "cost_normalize": False}
 PID: dict[str, Any] = {
-    "dual_starts": 200_000, "pid_kp": 1e-6, "pid_ki": 2e-3, "pid_kd": 1e-7, "lr": 1e-4,
-    "cost_reduce": "one", "price_unit": "reward", "cost_normalize": True,
+    "dual_starts": 200_000, "pid_kp": 1e-6, "pid_ki": 2e-3, "pid_kd": 1e-7, "pid_smoothing": 0.95,
+    "lr": 1e-4, "cost_reduce": "one", "cost_floor": False, "price_unit": "reward",
+    "cost_normalize": True,
 }  # fmt: skip
 PID_NAVIGATION: dict[str, Any] = PID | {
     "pid_kp": 5e-7, "pid_ki": 2e-4, "pid_kd": 1e-8, "lr": 5e-6, "cost_normalize": False,
@@ -199,7 +203,7 @@ ROWS = {
     ),
     "sac_lag": Row(
         SACLagConfig,
-        partial(make, treatment=lagrangian),
+        partial(make, treatment=damped_lagrangian),
         "SAC with an adaptive price on cost",
         {
             "omnisafe": OMNISAFE | LAG,

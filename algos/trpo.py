@@ -171,7 +171,7 @@ ROWS = {
     "trpo_saute": Row(
         TRPOSauteConfig,
         partial(make, augmentation=saute),
-        "TRPO that sees its budget on cost, and earns nothing without",
+        "TRPO that sees its budget on cost, and pays a penalty once it is spent",
         {"omnisafe": PUBLISHED | OMNISAFE_SAUTE},
         omnisafe="TRPOSaute",
         holds="episode",

@@ -144,6 +144,16 @@ def throughput_table() -> str:
     return "\n".join(lines)
 
 
+def velocity_speeds() -> str:
+    """Environment steps a second of the velocity tasks on one H200."""
+    rows = [r for r in benchmark_rows("benchmark_h200.jsonl") if r["env"].endswith("_velocity")]
+    lines = ["| | environments | steps/s | slowest, fastest run |", "|---|---:|---:|---:|"]
+    for (env, size), r in sorted(latest(rows, "env", "num_envs").items()):
+        rates = f"{r['env_steps_per_s']:,.0f} | {r['slowest']:,.0f}, {r['fastest']:,.0f}"
+        lines.append(f"| {env} | {size:,} | {rates} |")
+    return "\n".join(lines)
+
+
 def engine_jax() -> str:
     """Environment steps a second of engine jax, with MJX's solver and with ours."""
     lines = [
@@ -232,7 +242,7 @@ def learning(runs: Sequence[SettingRun], path: Path) -> None:
     for g in sorted(groups, key=lambda g: names.index(g.name)):
         for axes, name in zip(panels, ("train/return", "train/cost"), strict=True):
             values = np.concatenate([plots.stretches(run.table, name, edges) for run in g.runs])
-            plots.band(axes, edges[1:] / 1e6, values, g.name)
+            plots.band(axes, name, edges[1:] / 1e6, values, g.name)
     panels[1].axhline(25, color="0.4", ls="--", lw=1, label="limit")
     for axes, what in zip(panels, ("return", "cost"), strict=True):
         axes.set(xlabel="million environment steps", ylabel=f"{what} of an episode")
@@ -337,6 +347,7 @@ def pages() -> dict[Path, str]:
         HERE / "benchmark.md": {"speeds": algorithm_speeds()},
         HERE / "performance.md": {
             "throughput": throughput_table(),
+            "velocity": velocity_speeds(),
             "training": training_speeds(),
             "engine jax": engine_jax(),
         },

@@ -22,10 +22,10 @@ from jaxsafe.envs.velocity.task import Velocity
 from jaxsafe.envs.wrap import WrapConfig, wrapped
 from jaxsafe.types import Env
 
-# name -> options that differ from Safety Gym's defaults, the config of a velocity task, or a function
-# that makes another environment
 SUITE = suite.suite()
 OURS: dict[str, Any] = {**SUITE, **suite.circles_and_runs(), **suite.seditor()}
+# name -> options that differ from Safety Gym's defaults, the config of a velocity task, or a function
+# that makes another environment
 ENVS: dict[str, Any] = {**OURS, **velocities.suite(), **racing.ROWS}
 Config = SafetyGymConfig | VelocityConfig
 PLAIN = (type(None), bool, int, float, str, list, tuple, dict)

@@ -62,9 +62,10 @@ def make(env: str | SafetyGymConfig | VelocityConfig, **options: Any) -> Any:
 
     Args:
         env: a name ('car_push1'), an id ('Safexp-CarPush1-v0'), 'module:name' for code of
-            yours, which is imported, or a config.
+            yours, which is imported, or a config of Safety Gym or of a velocity task.
         options: Safety Gym's (`hazards_num`, ...; lengths in m, angles in rad) or a velocity task's
-            (`velocity_threshold`, ...), and `engine`: 'auto', 'c', 'warp' or 'jax'.
+            (`velocity_threshold`, ...), both with `engine`: 'auto', 'c', 'warp' or 'jax'. Of any other
+            environment, the arguments of the function that makes it. All have `wrap`.
 
     Returns:
         The environment; of 'module:name' what stands there, if it is an `Env` (jaxsafe.types).
@@ -147,7 +148,7 @@ class Run:
     def policy(self, obs: jax.Array, key: jax.Array | None = None, index: int = 0) -> jax.Array:
         """The action of a trained policy, compiled; it may be used inside `jit`, `vmap` and `scan`.
 
-        It is that of the first step of an episode where the policy has a memory; see `player`.
+        A policy with a memory acts as at the first step of an episode; for whole episodes see `player`.
 
         Args:
             obs: float [..., obs_size] of `run.env(index)`, as the environment gives it.
@@ -232,7 +233,7 @@ class SweepResult(NamedTuple):
     folder: with summary.md, summary.csv and summary.png, and a run folder for each program.
     rows: one a setting: `row.name`, `row.cost_limit`, `row.ret` and `row.cost` (mean, low, high over
         seeds of the last 10 % of training), `row.returns` and `row.costs`, float [S], and `row.held`,
-        whether the limit is.
+        whether every limit is: 'yes', 'no', 'unclear' within the interval, or '-' if not known.
     runs: the run folders.
     """
 

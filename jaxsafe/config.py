@@ -147,8 +147,10 @@ def from_dict(cls: type[T], values: dict[str, Any], where: str = "") -> T:
 
 
 def check_values(cfg: Any, where: str = "") -> None:
-    """Raise ConfigError for a number of the dataclass `cfg` that is out of its bounds. What stands for
-    a number while JAX traces is passed over."""
+    """Raise ConfigError for a number of the dataclass `cfg` that is out of its bounds.
+
+    JAX's traced values are not checked.
+    """
     hints = typing.get_type_hints(type(cfg), include_extras=True)
     for name in (f.name for f in dataclasses.fields(cfg)):
         if isinstance(value := getattr(cfg, name), numbers.Real | tuple):
@@ -175,7 +177,7 @@ def convert(value: Any, kind: Any, name: str) -> Any:
                 continue
         if not others:
             return convert(value, last, name)
-        with contextlib.suppress(ConfigError):
+        with contextlib.suppress(ConfigError):  # the error at the end names all options
             return convert(value, last, name)
     elif origin is tuple and isinstance(value, list | tuple):
         if args[-1] is Ellipsis:

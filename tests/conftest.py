@@ -1,6 +1,7 @@
 import sys
 import tempfile
 from collections.abc import Iterator
+from pathlib import Path
 
 import jax
 import pytest
@@ -13,6 +14,8 @@ use_compilation_cache()  # what a first run of the tests compiles, the next one 
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 
 
+MAPS = Path("/proc/self/maps")
+MOST_MAPS = 40_000  # Linux lets a process have 65,530
 OURS = [(registry, dict(registry)) for registry in (envs.ENVS, algos.ALGOS)]
 
 
@@ -28,6 +31,16 @@ def forgotten_programs(request: pytest.FixtureRequest) -> Iterator[None]:
         registry.clear()
         registry.update(ours)
     if request.path.parent.name != "envs":
+        jax.clear_caches()
+
+
+@pytest.fixture(autouse=True)
+def few_memory_maps(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Free the compiled programs before a file of many slow tests has had too many of them."""
+    yield
+    if not request.node.get_closest_marker("slow") or not MAPS.exists():
+        return
+    if len(MAPS.read_bytes().splitlines()) > MOST_MAPS:
         jax.clear_caches()
 
 

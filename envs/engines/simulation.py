@@ -142,7 +142,7 @@ PhysicsCall = Callable[[Physics, jax.Array, jax.Array], tuple[Physics, Readings]
 class Engine(NamedTuple):
     """Physics of one world as pure functions; callers `vmap`, over environments and again over seeds.
 
-    advance, show: what `run` and `forward` call.
+    `run` calls `advance`, and `forward` calls `show`.
     """
 
     name: str

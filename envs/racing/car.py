@@ -33,11 +33,10 @@ MAX_STEER = 0.4  # rad
 STEER_SPEED = 3.0  # rad/s
 GAS_STEP = 0.1  # the most that gas grows in a step
 STIFFNESS = 4000.0  # N/rad, of an axle; ours: it slides from 0.2 rad on
-EASE, ENGINE_EASE, BRAKE_EASE = (
-    5.0,
-    2.7,
-    1.0,
-)  # m/s, for what is undefined at rest; the second is Box2D's
+# m/s, for what is undefined at rest
+EASE = 5.0
+ENGINE_EASE = 2.7  # Box2D's
+BRAKE_EASE = 1.0
 
 
 @flax.struct.dataclass

@@ -139,9 +139,9 @@ def build(cfg: SafetyGymConfig, mjx: bool = False, drawn: bool = False) -> Scene
     """Compile the scene of `cfg`.
 
     Args:
-        mjx: for MJX in JAX, which collides a capsule better than a cylinder (pillars become capsules,
-            with caps out of reach), would let what is fixed meet what is fixed, and has room for
-            `MJX_LIMITS` only.
+        mjx: build it for engine `jax`. Pillars become capsules with their caps out of reach, which
+            collide better there than cylinders. Fixed bodies do not meet each other. There is room for
+            the contacts of `MJX_LIMITS` only.
         drawn: add what only rendering needs (light, cameras, colours, the gremlins' guides).
     Raises:
         ConfigError: an unknown robot, sensor or body.

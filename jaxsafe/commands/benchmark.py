@@ -2,8 +2,9 @@
 
 Each row is one program. Compiling is timed apart. The rate is the median of --repeats runs, after
 --warmup steps of each environment: fresh layouts, where nothing touches yet, are faster. With --algo a
-run is an update of the algorithm, else steps with random actions, resets included. A physics step is
-one substep. The forward pass at the end of a step is not counted.
+run is an update of the algorithm, else steps with random actions, resets included. An algorithm with a
+replay is measured once it learns. A physics step is one substep. The forward pass at the end of a step
+is not counted.
 """
 
 import argparse
@@ -25,6 +26,7 @@ import numpy as np
 from jaxsafe import algos, envs
 from jaxsafe.commands.guard import guarded
 from jaxsafe.config import Amount, ConfigError, Devices, Iterations, Period
+from jaxsafe.learn.off_policy import ReplayConfig
 from jaxsafe.learn.rollout import collect, init_rollout, memoryless
 from jaxsafe.run import run_folder
 from jaxsafe.run.arguments import fail, number
@@ -34,15 +36,14 @@ from jaxsafe.run.settings import TrainConfig, find_algo
 from jaxsafe.types import Shared
 
 
-def timed(fn, *args, before: int, repeats: int) -> tuple[float, list[float]]:
-    """Compile time, then the run times of `state = fn(state)` after some `before`, in seconds."""
+def timed(fn, state, before: int, repeats: int) -> tuple[float, list[float]]:
+    """Compile time, then the run times of `state = fn(state, i)` after some `before`, in seconds."""
     start = time.perf_counter()
-    compiled = jax.jit(fn, donate_argnums=0).lower(*args).compile()
+    compiled = jax.jit(fn, donate_argnums=0).lower(state, np.int32(0)).compile()
     compile_time, runs = time.perf_counter() - start, []
-    state = args[0]
-    for _ in range(before + repeats):
+    for i in range(before + repeats):
         start = time.perf_counter()
-        state = jax.block_until_ready(compiled(state))
+        state = jax.block_until_ready(compiled(state, np.int32(i)))
         runs.append(time.perf_counter() - start)
     return compile_time, runs[before:]
 
@@ -64,7 +65,7 @@ def stepping(env, num_envs: int, seeds: int, horizon: int):
         reset_key, key = jax.random.split(key)
         return init_rollout(env, reset_key, num_envs, stagger=True), key
 
-    return per_seed(init, seeds), lambda state: jax.vmap(run)(state)[0]
+    return per_seed(init, seeds), lambda state, i: jax.vmap(run)(state)[0]
 
 
 def training(env, algo: str, cfg, seeds: int, devices: int):
@@ -72,9 +73,8 @@ def training(env, algo: str, cfg, seeds: int, devices: int):
     settings = TrainConfig(num_seeds=seeds, devices=devices)
     check_devices(settings)
     program = build(env, algos.ALGOS[algo].make, [cfg], settings)
-    shared = Shared(np.int32(0))
-    state = jax.jit(program.init)(jax.device_put(program.start, program.sharding), shared)
-    return state, lambda ts: program.update(ts, shared)[0]
+    state = jax.jit(program.init)(jax.device_put(program.start, program.sharding), program.shared())
+    return state, lambda ts, i: program.update(ts, Shared(i))[0]
 
 
 def per_seed(init, seeds: int):
@@ -91,18 +91,22 @@ def memory() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
-def measure(name: str, num_envs: int, args: argparse.Namespace) -> dict:
+def measure(name: str, num_envs: int | None, args: argparse.Namespace) -> dict:
+    """A row; without `num_envs` those of the algorithm, or 256."""
     options = {} if args.awake is None else {"awake": args.awake}
     env = envs.make(name, engine=args.engine, **options)
+    warmup = args.warmup
     if args.algo:
-        config = algos.ALGOS[args.algo].config
-        cfg = config(num_envs=num_envs, **({"horizon": args.horizon} if args.horizon else {}))
-        horizon = cfg.horizon
+        given = {"num_envs": num_envs, "horizon": args.horizon}
+        cfg = algos.ALGOS[args.algo].config(**{k: v for k, v in given.items() if v})
+        num_envs, horizon = cfg.num_envs, cfg.horizon
+        if isinstance(cfg, ReplayConfig):  # until then it only fills its replay
+            warmup = max(warmup, -(-cfg.learning_starts // num_envs) + horizon)
         state, fn = training(env, args.algo, cfg, args.seeds, args.devices)
     else:
-        horizon = args.horizon or 100
+        num_envs, horizon = num_envs or 256, args.horizon or 100
         state, fn = stepping(env, num_envs, args.seeds, horizon)
-    before = max(1, -(-args.warmup // horizon))
+    before = max(1, -(-warmup // horizon))
     compile_time, runs = timed(fn, state, before=before, repeats=args.repeats)
     seconds = statistics.median(runs)
     rate = num_envs * horizon * args.seeds / seconds
@@ -180,8 +184,8 @@ def command() -> int:
         "--num-envs",
         type=number(Amount),
         nargs="+",
-        default=[256],
-        help="environments of each seed (default 256)",
+        default=[None],
+        help="environments of each seed (default 256, or with --algo those of the algorithm)",
     )
     parser.add_argument(
         "--seeds", type=number(Devices), default=1, help="seeds side by side (default 1)"

@@ -41,7 +41,8 @@ def guarded(command: Callable[[], int]) -> int:
 
 
 def complain(line: str, status: int) -> int:
-    """A file may have put more than letters into `line`, which would tell the terminal what to do."""
+    """Print `line` as an error; return `status`."""
+    # a file may have put control characters into it, which a terminal would obey
     shown = "".join(letter if letter.isprintable() else "?" for letter in line)
     print(f"error: {shown}", file=sys.stderr)
     return status

@@ -32,8 +32,9 @@ def main() -> int:
 
 def job(config: dict[str, Any], number: int | None) -> None:
     """One run; `number` is its own in a --multirun."""
-    status = guarded(lambda: train(config, number))  # here already: of a job that raises, Hydra prints
-    if status:  # the overrides
+    # guarded here, not only in `main`: Hydra prints the overrides of a job that raises
+    status = guarded(lambda: train(config, number))
+    if status:
         distributed.exit_all_if_joined(status)
         raise SystemExit(status)
 

@@ -53,8 +53,12 @@ class Facts(NamedTuple):
         return "algo.epochs" not in self.options
 
     def batch(self) -> dict[str, Any]:
-        """steps_per_epoch as environments side by side, batch_size as a divisor of the batch, and
-        window_lens, which are episodes, as iterations of one episode of each environment."""
+        """Our options for steps_per_epoch, batch_size and window_lens.
+
+        steps_per_epoch becomes environments side by side, with whole episodes. batch_size becomes the
+        number of minibatches that divides the batch and comes nearest. window_lens counts episodes;
+        ours counts iterations, in each of which every environment has one episode.
+        """
         steps = self.whole("algo_cfgs.steps_per_epoch", 20_000)
         size = self.whole("algo_cfgs.batch_size", 128 if self.trust_region else 64)
         horizon = min(steps, EPISODE)
@@ -82,8 +86,9 @@ class Rule(NamedTuple):
 
     ours: the options, separated by spaces; '' if there is none. note: how, or why not.
     turn(value, facts): the options with their values; {} if jaxsafe does so anyway, None if it cannot.
-        Without, each of `ours` has the value as it is; those that the algorithm lacks are left out.
-    same: of a key without option: the values with which nothing is lost; None: any.
+        Without `turn`, each of `ours` gets the value as it is. Options that the algorithm lacks are
+        left out.
+    same: for a key without an option, the values that jaxsafe matches anyway; None: all of them.
     """
 
     ours: str = ""
@@ -309,8 +314,10 @@ OFFLINE: dict[str, Rule] = OMNISAFE | {  # of its offline algorithms; what diffe
 
 
 def off_policy_loop(names: str) -> Translate:
-    """Of OmniSafe's vector_env_nums, update_cycle, update_iters, size and batch_size, of which the last
-    two are there for each environment."""
+    """The options `names`, from vector_env_nums, update_cycle, update_iters, size and batch_size.
+
+    OmniSafe's size and batch_size are those of each environment.
+    """
 
     def turn(value: Any, facts: Facts) -> dict[str, Any] | None:
         envs_there = facts.whole("train_cfgs.vector_env_nums", 1)

@@ -9,8 +9,9 @@
 
 The methods differ in a', in what is picked and in the bonus, which is an entropy or 0: see `Actor`. How
 Q_r and Q_c are mixed is the treatment's: (Q_r / unit - lam Q_c) / (1 + lam) is a Lagrangian's. The unit
-is the standard deviation of Q_r over the batch, or 1: see `price_unit`. A limit is on the undiscounted
-cost of an episode; Q_c, which is discounted, only gives the direction.
+is the standard deviation of Q_r over the batch, or 1: see `price_unit`. Where the method weighs cost, a
+reduced Q_c or Q'_c below 0 counts as 0, unless `cost_floor` is off. A limit is on the undiscounted cost
+of an episode; Q_c, which is discounted, only gives the direction.
 """
 
 from collections.abc import Callable
@@ -20,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from jaxsafe.config import Iterations, Rate, Weight, config
+from jaxsafe.config import Iterations, Rate, Share, Weight, config
 from jaxsafe.learn.batch import pmean
 from jaxsafe.learn.bill import PriceClockConfig
 from jaxsafe.learn.constraints import metrics_by_constraint, signal
@@ -38,7 +39,7 @@ from jaxsafe.learn.normalise import CLIP, MIN_STD, averaged, no_moments, standar
 from jaxsafe.learn.off_policy import OffPolicyConfig
 from jaxsafe.learn.replay import Transitions
 from jaxsafe.learn.steps import Trainable, adam, descend_each, follow
-from jaxsafe.learn.treatments import LagrangianConfig, PIDConfig, Treatment, no_treatment
+from jaxsafe.learn.treatments import DampedConfig, PIDConfig, Treatment, no_treatment
 from jaxsafe.nn.critics import q_values
 from jaxsafe.types import Env, Metrics, PyTree
 
@@ -72,12 +73,20 @@ class CostCriticConfig(PriceClockConfig):
             "`cost_normalize` takes the mean from costs, so that a step without cost pays",
             "`cost_normalize` only scales costs",
         ),
+        Convention(
+            {"cost_floor": False},
+            "values of cost may be below 0",
+            "they count as 0 there",
+        ),
     )
 
-    # How the values of two cost critics become one. max is cautious: its estimates are too high. With
-    # mean the policy finds actions whose cost is estimated too low, below 0 even. In six runs on
-    # point_goal1 its return then fell below 1. one: a single critic, as in OmniSafe.
-    cost_reduce: Literal["mean", "max", "one"] = "max"
+    # How the values of two cost critics become one. max is cautious: its estimates are some times too
+    # high. one: a single critic, as in OmniSafe.
+    cost_reduce: Literal["mean", "max", "one"] = "mean"
+    # Whether a Q_c below 0 counts as 0, because no cost is negative. Without it the policy finds
+    # actions whose cost is estimated far too low. Costs that `cost_centre` centres have values below 0:
+    # switch it off for them.
+    cost_floor: bool = True
     # What a price of 1 on one unit of cost weighs as much as. deviation: the standard deviation of Q_r
     # over the batch, so that one step of the price suits rewards of any size. reward: one unit of
     # reward, as in OmniSafe.
@@ -93,12 +102,19 @@ class CostCriticConfig(PriceClockConfig):
 
 
 @config
-class MultiplierConfig(LagrangianConfig, CostCriticConfig):
-    """For `lagrangian`."""
+class MultiplierConfig(DampedConfig, CostCriticConfig):
+    """For `damped_lagrangian`."""
 
-    # Adam's step of the price, whatever the size of the violation. A policy answers a price only after
-    # some hundred thousand steps. With a step of 0.03, two seeds of point_goal1 fell from a return of
-    # 9 to 2 before they rose again.
+    CONVENTIONS: ClassVar = (
+        Convention(
+            {"dual_damping": 0.0},
+            "the price is the multiplier",
+            "it also rises and falls with the violation at once",
+        ),
+    )
+
+    # Adam's step of the multiplier, whatever the size of the violation. A policy answers a price only
+    # after some hundred thousand steps.
     dual_lr: Rate = 0.01
 
 
@@ -106,10 +122,11 @@ class MultiplierConfig(LagrangianConfig, CostCriticConfig):
 class ControllerConfig(PIDConfig, CostCriticConfig):
     """For `pid`."""
 
-    pid_kp: Weight = 0.004  # Price for each unit of the smoothed violation.
-    # Price that each unit of violation adds at each move. 25 units add as much as a step of `dual_lr`.
-    pid_ki: Weight = 4e-4
+    pid_kp: Weight = 0.01  # Price for each unit of the smoothed violation.
+    pid_ki: Weight = 2e-4  # Price that each unit of violation adds at each move.
     pid_kd: Weight = 0.004  # Price for each unit that the smoothed cost rose.
+    # Share of the past in the smoothed violation. With 0.95 a price reacts 20 moves late.
+    pid_smoothing: Share = 0.8
 
 
 class Proposal(NamedTuple):
@@ -217,8 +234,14 @@ def actor_critic(env: Env, actor: Actor, treatment: Treatment) -> Learner:
         q_r = q_values(targets["critic_r"], obs, action, cfg).min(0)
         if treatment is not no_treatment and cfg.cost_action == "mean":
             action = actor.act(params, obs, None, cfg)
-        q_c = expected_cost(targets, obs, action, names(cfg), cfg)
+        q_c = known_cost(targets, obs, action, cfg)
         return targets_of(batch, charged, Values(q_r + bonus, q_c), names(cfg), cfg)
+
+    def known_cost(params: PyTree, obs: jax.Array, action: jax.Array, cfg: Any) -> jax.Array:
+        """Q_c as the critics estimate it, with the floor of `cost_floor`: float [B] or [B, K]."""
+        q_c = expected_cost(params, obs, action, names(cfg), cfg)
+        has_floor = treatment is not no_treatment and cfg.cost_floor
+        return jnp.maximum(q_c, 0.0) if has_floor else q_c
 
     def policy_loss(
         params: dict[str, PyTree],
@@ -234,7 +257,7 @@ def actor_critic(env: Env, actor: Actor, treatment: Treatment) -> Learner:
             q_r = actor.pick(q_values(params["critic_r"], batch.obs, proposal.action, cfg))
             worth = q_r + proposal.bonus
             if treatment is not no_treatment:
-                q_c = expected_cost(params, batch.obs, proposal.action, names(cfg), cfg)
+                q_c = known_cost(params, batch.obs, proposal.action, cfg)
                 unit = price_unit(batch, worth, cfg, axis_name)
                 worth = treatment.advantage(at.dual, worth / unit, q_c)
             climbed = batch.mean(worth)

@@ -22,8 +22,10 @@ MIN_BUDGET = 1e-6  # cost per episode, so that a limit of 0 divides nothing by z
 
 
 class Augmentation(NamedTuple):
-    """wrap(env, cfg, dual) -> the Env that the policy acts in, in training and afterwards; what it
-    appends to the observation passes the normaliser by. Its floats may be traced.
+    """What the learner sees and is paid beside the task.
+
+    wrap(env, cfg, dual) -> the Env that the policy acts in, in training and afterwards. What it appends
+        to the observation is not normalised. Its floats may be traced.
     renew(resets, cfg, dual) -> State [N], resets drawn in an earlier iteration as they are now.
     stop(episode, cfg) -> bool [N], where an episode of training ends for good.
     reward(traj, cfg) -> float [T, N], what the learner is paid.

@@ -7,8 +7,11 @@ from jaxsafe.types import PyTree
 
 
 def pmean(tree: PyTree, axis_name: str | None) -> PyTree:
-    """The mean over devices of every leaf. Differentiate this device's share first, then call this:
-    its own derivative is not that of a mean over devices under `shard_map(check_vma=False)`."""
+    """The mean over devices of every leaf.
+
+    Do not differentiate through it: under `shard_map(check_vma=False)` its derivative is not that of a
+    mean over devices. Take it of the gradients of each device's share.
+    """
     return tree if axis_name is None else jax.lax.pmean(tree, axis_name)
 
 

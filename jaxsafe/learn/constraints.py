@@ -44,7 +44,7 @@ def limit(cfg: Any, names: Names) -> jax.Array:
 
 
 def limits_by_name(cfg: Any) -> dict[str, float]:
-    """The limits by name, of the config of any algorithm; none where there is but cost_limit."""
+    """The limits by name, of the config of any algorithm; empty where there is only cost_limit."""
     return dict(sorted((dataclasses.asdict(cfg).get("cost_limits") or {}).items()))
 
 

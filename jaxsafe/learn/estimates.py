@@ -138,7 +138,7 @@ def estimate_batch(
     def of_signal(
         x: jax.Array, v: jax.Array, next_v: jax.Array, discount: Any, decay: Any
     ) -> SignalEstimate:
-        x = jnp.where(bad, v, x)  # whose difference to v is 0
+        x = jnp.where(bad, v, x)  # a bad step is terminated, so its error is x - v = 0
         steps = ValuedSteps(x, v, next_v, traj.terminated | bad, traj.done)
         advantage, error = advantages(cfg.estimator, steps, ratio, discount, decay)
         return SignalEstimate(advantage, error + v, error)

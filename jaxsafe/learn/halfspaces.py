@@ -2,9 +2,9 @@
 
     e_i.y + kappa_i <= 0,  |e_i| = 1
 
-Vectors stay where they are: all that is asked for are cosines, gram_ij = e_i.e_j [K, K] and, with a
-unit vector e_g to go along, rho_i = e_g.e_i [K]. There are 2^K sets, each with one K x K system. The
-one that breaks the optimality conditions least is taken, so rounding cannot leave none.
+The functions take no vectors, only their cosines: gram_ij = e_i.e_j [K, K] and, with a unit vector e_g
+to go along, rho_i = e_g.e_i [K]. There are 2^K sets, each with one K x K system. Rounding may break the
+optimality conditions of all of them a little, so the set that breaks them least is taken.
 
 Where two half-spaces are nearly opposed, within about 0.05 rad, `RIDGE` changes the solution itself:
 it then weighs both violations instead of touching both planes.
@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 RIDGE = 1e-4  # added to the diagonal, for half-spaces that are parallel
-FAR = 1e6  # a |kappa| from which on all is the same
+FAR = 1e6  # larger |kappa| are cut to this
 HIGHEST = jax.lax.Precision.HIGHEST
 
 
@@ -73,7 +73,7 @@ def furthest_point(
 
         alpha = sqrt((1 - kappa'C^-1 kappa) / (1 - rho'C^-1 rho)),   beta = C^-1 (kappa + alpha rho)
 
-    and is the solution if beta >= 0 and the other half-spaces hold y.
+    and is the solution if beta >= 0 and y lies within the other half-spaces too.
 
     Returns:
         alpha: float [], > 0; beta: float [K], >= 0.

@@ -29,12 +29,11 @@ class Stepping:
 
 
 class StepRecord(NamedTuple):
-    """What T steps of N environments came to, [T, N], costs [T, N, K]. A reset and a bad step are none:
-    `real` is false.
+    """What T steps of N environments came to, [T, N], costs [T, N, K].
 
-    terminated marks episodes that fail with the step. ended marks complete episodes that end with it;
-    episode and length are their sums. said: what the policy reported beside the action, float [T, N] by
-    name.
+    `real` is false of a reset and of a bad step, which do not count as steps. terminated marks episodes
+    that fail with the step. ended marks complete episodes that end with it; episode and length are
+    their sums. said: what the policy reported beside the action, float [T, N] by name.
     """
 
     real: jax.Array
@@ -129,7 +128,9 @@ def collect_records(
 
 
 def marked(state: State, bad: Bad, before: jax.Array) -> State:
-    """`state` with a reward of NaN in bad worlds, so that no transition that leads there counts. What
-    they observe is what they did `before`, [N, O]."""
+    """`state` with a reward of NaN in bad worlds, so that no transition that leads there counts.
+
+    In these worlds obs is the last one, `before` [N, O].
+    """
     state = dataclasses.replace(mended(state, bad), obs=select_rows(bad.any, before, state.obs))
     return dataclasses.replace(state, reward=jnp.where(bad.any, jnp.nan, state.reward))

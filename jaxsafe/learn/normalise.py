@@ -46,8 +46,8 @@ def merge(
 ) -> Normaliser:
     """`stats` with the samples `x` [..., O] of all devices added.
 
-    weight: float [], of each sample that counts. The others are 0, and weigh nothing; on average a
-        sample weighs 1.
+    weight: float [], the reciprocal of the share of samples that count. The other samples must be 0;
+        they do not change mean and variance.
     """
     x = x.reshape(-1, x.shape[-1])
     mean = batch_mean(x, axis_name, axis=0) * weight

@@ -154,8 +154,9 @@ def sound(ret: jax.Array, cost: jax.Array) -> jax.Array:
 
 
 def standing(ret: jax.Array, cost: jax.Array, cfg: Any) -> tuple[jax.Array, jax.Array]:
-    """Whether at least `elites` plans are feasible, bool []; and which are, bool [S]. A cost at the
-    limit is feasible.
+    """Whether at least `elites` plans are feasible, bool [], and which are, bool [S].
+
+    A cost at the limit is feasible.
 
     Raises:
         ConfigError: there are fewer than `elites` plans.

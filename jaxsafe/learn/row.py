@@ -1,4 +1,4 @@
-"""A row of the registry of algorithms: all that the rest of the house needs to know of one."""
+"""A row of the registry of algorithms: all that the rest of jaxsafe needs to know of one."""
 
 from collections.abc import Callable, Mapping
 from types import MappingProxyType

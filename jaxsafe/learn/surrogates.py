@@ -49,7 +49,8 @@ def near_old(dist: Gaussian, batch: Any, advantage: jax.Array, cfg: Any) -> tupl
 
     Source: Zhang, Vuong and Ross (2020), "First Order Constrained Optimization in Policy Space",
     arXiv:2002.06506, equation 11; the KL is KL(new || old). Without `per_state` it is OmniSafe's,
-    E[1{KL <= eta}] E[w A] / temperature - E[1{KL <= eta} KL], where a matrix is formed by oversight.
+    E[1{KL <= eta}] E[w A] / temperature - E[1{KL <= eta} KL], because [B, 1] and [B] broadcast there to
+    a matrix.
     """
     divergence = kl(dist, batch.old)
     inside = divergence <= cfg.near_kl

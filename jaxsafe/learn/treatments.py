@@ -91,6 +91,44 @@ lagrangian = Treatment(
 
 
 @config
+class DampedConfig(LagrangianConfig):
+    """For `damped_lagrangian`."""
+
+    # Price for each unit by which J_c exceeds its limit, beside the multiplier; below the limit it is
+    # taken off. A multiplier alone overshoots, because it goes on to rise until J_c has fallen.
+    dual_damping: Weight = 0.02
+
+
+class Damped(NamedTuple):
+    lam: jax.Array  # float [] or [K], the price, >= 0
+    multiplier: Multiplier
+
+
+def init_damped(cfg: Any) -> Damped:
+    multiplier = init_multiplier(cfg)
+    return Damped(multiplier.lam, multiplier)
+
+
+def damped_ascent(dual: Damped, episode_cost: jax.Array, cfg: Any, iteration: Count) -> Damped:
+    """lam = l + dual_damping (J_c - cost_limit), clipped to [0, lam_max], with the multiplier l."""
+    multiplier = adam_ascent(dual.multiplier, episode_cost, cfg, iteration)
+    over = episode_cost - limit(cfg, constrained_costs(cfg))
+    lam = jnp.clip(multiplier.lam + cfg.dual_damping * over, 0.0, cfg.lam_max)
+    return Damped(lam, multiplier)
+
+
+# Platt and Barr (1987), "Constrained Differential Optimization", section 3.1, whose damping is the
+# gradient of a quadratic penalty
+damped_lagrangian = Treatment(
+    init=init_damped,
+    update=damped_ascent,
+    advantage=mixed,
+    metrics=lambda dual: {"train/lam": dual.lam, "train/multiplier": dual.multiplier.lam},
+    constrained_costs=constrained_costs,
+)
+
+
+@config
 class PIDConfig(LimitsConfig):
     """For `pid`."""
 
@@ -101,15 +139,15 @@ class PIDConfig(LimitsConfig):
     pid_kd: Weight = 0.01  # Price for each unit that the smoothed cost rose, as in OmniSafe.
     # Share of the past in the smoothed violation and the smoothed cost, as in OmniSafe.
     pid_smoothing: Share = 0.95
-    pid_delay: Iterations = 10  # Iterations over which the rise is measured, as in OmniSafe.
+    # Moves of the price over which the rise is measured, one an iteration on-policy. As in OmniSafe.
+    pid_delay: Iterations = 10
 
 
 class PID(NamedTuple):
     """What the controller remembers: lam and integral are prices, the others costs per episode.
 
     Of several constraints all have a last axis K. `error`, `cost` and `past` start at 0, as in the code
-    of Stooke et al. and in OmniSafe: the first `pid_delay` iterations see the whole smoothed cost as a
-    rise.
+    of Stooke et al. and in OmniSafe: the first `pid_delay` moves see the whole smoothed cost as a rise.
     """
 
     lam: jax.Array  # float [], standard deviations of A_r per unit of cost, >= 0

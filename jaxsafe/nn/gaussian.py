@@ -1,4 +1,5 @@
-"""Diagonal Gaussians. On-policy methods use them as they are; `squashed` takes their tanh."""
+"""Diagonal Gaussians. On-policy methods use them as they are, `squashed` takes their tanh,
+and `bounded` the tanh of their mean."""
 
 import math
 from typing import NamedTuple

@@ -30,7 +30,8 @@ class MLP(nn.Module):
     and Bengio, 2010).
 
     layer_norm: normalise what each hidden layer gives to its activation (Ba et al., 2016).
-    precision: of the products. On a GPU the default rounds them to 10 bits, too few for KLs of 1e-2.
+    precision: of the products. On a GPU JAX's default rounds them to 10 bits, too few for KLs of
+        1e-2.
     """
 
     hidden: tuple[int, ...]

@@ -42,7 +42,7 @@ def evaluate(run: RunPolicies, num: int, seed: int, data: PyTree = ()) -> list[S
     examined = settings.row.examine(run.algo, run.learned, num, seed)
     tables = list(run_folder.by_setting(run_folder.read_metrics(run.folder)).values())
     cost_names = run.algo.task(jax.tree.map(lambda x: x[0], run.learned)).cost_names
-    seeds, scores = settings.train.num_seeds, []
+    seeds, by_setting = settings.train.num_seeds, []
     for i, member in enumerate(members(settings.configs, settings.train)[::seeds]):
         of_setting = Episodes(*(x[i * seeds : (i + 1) * seeds] for x in episodes))
         limits, metrics = limits_of(member.config), tables[i] if i < len(tables) else {}
@@ -53,8 +53,8 @@ def evaluate(run: RunPolicies, num: int, seed: int, data: PyTree = ()) -> list[S
             rows |= dsrl_scores(settings.env_name, rows, float(member.config.cost_limit))
             rows |= of_data(data, float(member.config.cost_limit))
         by_seed = {name: values.mean(1).tolist() for name, values in found.items()}
-        scores.append(Scores(member.setting, limits, of_setting.ret.size, rows, by_seed))
-    return scores
+        by_setting.append(Scores(member.setting, limits, of_setting.ret.size, rows, by_seed))
+    return by_setting
 
 
 def summary(

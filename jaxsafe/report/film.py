@@ -34,7 +34,7 @@ def film(policies: list[RunPolicy], path: Path, seed: int, labels: list[str] | N
     """Write one episode of each deterministic policy as a video, side by side in labelled panels.
 
     Raises:
-        NoVideo: this machine has neither EGL nor OSMesa.
+        NoVideo: this machine has neither EGL nor OSMesa nor a display.
     """
     key = jax.random.fold_in(jax.random.key(seed), 0x66696C6D)
     try:

@@ -54,7 +54,7 @@ def curves(
     Evaluations during training are points on dashed lines, each the mean over seeds.
 
     Settings trained side by side have a colour each, and their own limits where those differ. Named
-    costs with limits of their own have panels instead of a limit on the sum.
+    costs with limits of their own have panels in place of `cost`'s.
     """
     # with each limit its column of metrics.csv, which is there where the settings differ in it
     limits = {
@@ -72,7 +72,7 @@ def curves(
         for i, (setting, table) in enumerate(settings.items()):
             if name in table and len(table["steps"]):
                 column, estimated = drawn_of(table, name)
-                draw_setting(axes, *by_seed(table, column), f"C{i % 10}", setting, estimated)
+                draw_setting(axes, name, *by_seed(table, column), f"C{i % 10}", setting, estimated)
             for end, (called, marker) in EVALUATED.items():
                 if (column := name.replace("train/", "eval/") + end) in table:
                     look = {"marker": marker, "mfc": "none" if end else None, "color": f"C{i % 10}"}
@@ -112,6 +112,7 @@ def axis_of(metrics: Mapping[str, np.ndarray]) -> str:
 
 def draw_setting(
     axes: Axes,
+    measure: str,
     steps: np.ndarray,
     values: np.ndarray,
     color: str,
@@ -125,15 +126,17 @@ def draw_setting(
     label = ", ".join(filter(None, [setting, ESTIMATED * estimated]))
     if not alone:
         label = label or f"mean of {len(values)} seeds"
-        band(axes, steps, values, label, color=color, ls=ls)
+        band(axes, measure, steps, values, label, color=color, ls=ls)
         axes.collections[-1].set_label(None if setting else "95 % interval")
     elif label:
         lines[0].set_label(label)
 
 
-def band(axes: Axes, steps: np.ndarray, values: np.ndarray, label: str, **style: Any) -> None:
-    """Mean over seeds and its 95 % interval, of `values` [S, T]."""
-    e = stats.estimate(values, draws=1000)
+def band(
+    axes: Axes, measure: str, steps: np.ndarray, values: np.ndarray, label: str, **style: Any
+) -> None:
+    """Mean over seeds and its 95 % interval, of `values` [S, T] of `measure`."""
+    e = stats.of_measure(measure, values)
     (line,) = axes.plot(steps, e.mean, lw=2, label=label, **style)
     axes.fill_between(steps, e.low, e.high, color=line.get_color(), alpha=0.2, lw=0)
 
@@ -224,6 +227,7 @@ def learning(groups: Sequence[Group]) -> Figure:
                     label = f"{g.name}, {ESTIMATED}" if guess else g.name
                     band(
                         axes,
+                        name,
                         edges[1:],
                         values,
                         label,

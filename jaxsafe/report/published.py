@@ -52,7 +52,6 @@ def beside(g: Group, published: Mapping[tuple[str, str], Published]) -> Publishe
     found = published.get((g.env, g.algo or ""))
     if found is None or found.cost_limit != g.cost_limit:
         return None
-    rules = (
-        run.config.get("env.rules", "safety_gym") for run in g.runs
-    )  # none before they were an option
+    # runs from before `rules` was an option have none
+    rules = (run.config.get("env.rules", "safety_gym") for run in g.runs)
     return found if all(map(found.holds_for, rules)) else None

@@ -38,7 +38,7 @@ class SettingRun(NamedTuple):
     folder: Path
     env: str
     config: dict[str, Any]  # {'env.name': ..., 'algo.clip': ...}, and the folder as 'run_dir'
-    limits: dict[str, float]  # by the name of a cost; '' is their sum
+    limits: dict[str, float]  # by the name of a cost; '' is the name of `cost`
     table: dict[str, np.ndarray]  # the columns of metrics.csv
     seeds: np.ndarray  # [S]
     values: dict[str, np.ndarray]  # [S] by name; NaN for a seed without complete episodes
@@ -202,7 +202,7 @@ def measured(
     Args:
         env: the task, for its characteristic scores.
         table: the columns.
-        limits: by the name of a cost; '' is their sum.
+        limits: by the name of a cost; '' is the name of `cost`.
 
     Return and cost are the learner's estimates where no episode has ended.
     """
@@ -242,6 +242,6 @@ def normalised(
 
 def cost_names(columns: Iterable[str]) -> list[str]:
     """The costs that an environment tells apart, by the columns of metrics.csv."""
-    others = ("train/cost_estimate", "train/cost_rate")  # of the sum, or of each under its own limit
+    others = ("train/cost_estimate", "train/cost_rate")  # of `cost`, or of each under its own limit
     found = [name for name in columns if name.startswith("train/cost_") and not name.startswith(others)]
     return [name.removeprefix("train/cost_") for name in found]

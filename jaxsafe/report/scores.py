@@ -1,4 +1,6 @@
-"""Safety Gym's normalised scores.
+"""Normalised scores: Safety Gym's, and DSRL's further down.
+
+Safety Gym's are
 
     ret / Ret,    max(0, cost - limit) / max(1e-6, Cost - limit),    cost_rate / CostRate
 

@@ -106,9 +106,8 @@ def joined(at: Position | None) -> Iterator[None]:
     """
     if at:
         port = meet(at)
-        atexit.register(
-            exit_all_if_joined, 1
-        )  # of an error that nobody expected, its traceback printed by then
+        # for an error that nobody expected; its traceback is printed by then
+        atexit.register(exit_all_if_joined, 1)
         threading.Thread(target=watch_lifelines, daemon=True).start()
         jax.distributed.initialize(
             f"{at.host if ':' not in at.host else f'[{at.host}]'}:{port}",

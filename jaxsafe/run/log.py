@@ -117,8 +117,8 @@ class Log:
                 f"({', '.join(kinds)}) by {shown:,} {self.unit.name}; such worlds are reset, and the "
                 f"step does not count ({BAD[0]} in metrics.csv)"
             )
-        # NaN where no episode ended
-        if not self.warned_of_overflow and (values.get(OVERFLOW, np.zeros(())) > 0).any():
+        overflow = values.get(OVERFLOW, np.zeros(()))  # NaN where no episode ended
+        if not self.warned_of_overflow and (overflow > 0).any():
             self.warned_of_overflow = True
             self.report.line(
                 f"warning: contacts found no room in some steps ({OVERFLOW} in metrics.csv); "

@@ -1,6 +1,6 @@
 """The training loop: compile once, call `update`, log, checkpoint, stop when asked.
 
-The loop stays one update ahead of what is logged, in a thread, so the device does not wait for files.
+A thread logs an update while the device computes the next one, so the device does not wait for files.
 """
 
 import contextlib

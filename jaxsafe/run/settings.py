@@ -38,6 +38,7 @@ from jaxsafe.run.plain import as_text, differences, merged, repeated, replaced, 
 from jaxsafe.types import Env
 
 DEFAULT = {"env": "point_goal1", "algo": "ppo_lag"}
+# options that may change when a run is resumed
 ON_RESUME = (
     "total_steps",
     "total_updates",
@@ -47,7 +48,7 @@ ON_RESUME = (
     "eval_every",
     "eval_episodes",
     "video",
-)  # may change
+)
 NOT_COMPARED = ("run_dir", "resume", "logger", *ON_RESUME)
 OFFLINE_UPDATES = 100_000  # total_updates with a data set, unless the user says otherwise
 READ_FROM = ("dataset", "init_from", "env.robot_base")  # options that name a file or folder to read
@@ -123,7 +124,7 @@ class Extras(NamedTuple):
     algos: Mapping[str, Row] = {}
 
 
-NO_EXTRAS = Extras()  # nothing beside them
+NO_EXTRAS = Extras()
 
 
 class Settings(NamedTuple):

@@ -65,7 +65,8 @@ class ByHand:
         return (np.einsum("bi,nij->nbj", pair, critics["kernel"]) + critics["bias"][:, None])[..., 0]
 
     def reduced(self, q):
-        return q.max(0) if self.reduce == "max" else q.mean(0)
+        q_c = q.max(0) if self.reduce == "max" else q.mean(0)
+        return q_c if self.omnisafe else np.maximum(q_c, 0.0)  # no cost is negative
 
     def next_action(self):
         obs = self.batch.next_obs
@@ -438,6 +439,7 @@ def test_a_bill_is_the_cost_of_real_steps_since_the_last_move_for_each_constrain
         "num_envs": 4, "horizon": 12, "learn_every": 6, "batch_size": 8, "replay_ratio": 1,
         "replay_size": 96, "learning_starts": 10_000, "hidden": (4,), "stagger": False,
         "dual_every": 48, "lam_init": 1.0, "dual_lr": 0.5, "cost_limits": {"a": 2.0, "b": 8.0},
+        "dual_damping": 0.2,
     }  # fmt: skip
     cfg, algo = ALGOS["td3_lag"].config(**settings), ALGOS["td3_lag"].make(env)
 
@@ -448,5 +450,6 @@ def test_a_bill_is_the_cost_of_real_steps_since_the_last_move_for_each_constrain
     np.testing.assert_allclose(metrics["train/cost_estimate_a"], 2.5, rtol=1e-6)
     np.testing.assert_allclose(metrics["train/cost_estimate_b"], 7.5, rtol=1e-6)
     np.testing.assert_allclose(metrics["train/cost_estimate"], 10.0, rtol=1e-6)
-    np.testing.assert_allclose(ts.dual.lam, [1.5, 0.5], rtol=1e-4)  # one above its limit, one below
+    np.testing.assert_allclose(ts.dual.multiplier.lam, [1.5, 0.5], rtol=1e-4)  # above, below the limit
+    np.testing.assert_allclose(ts.dual.lam, [1.5 + 0.2 * 0.5, 0.5 - 0.2 * 0.5], rtol=1e-4)
     assert metrics["train/lam_a"] == ts.dual.lam[0] and ts.bill.age == 0

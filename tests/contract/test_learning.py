@@ -17,6 +17,7 @@ from toys import START, Lever
 
 from jaxsafe.algos import ALGOS
 from jaxsafe.run import evaluate
+from jaxsafe.types import Shared
 
 QUICK = ("cpo", "p3o", "trpo_saute")
 LIMIT, BEST = 2.5, 14.375  # cost of an episode, and the best return within it
@@ -35,7 +36,7 @@ def train(name, iterations=100, options=None, **swept):
 
     def run(key, swept):
         ts = algo.init(key, dataclasses.replace(cfg, **swept), START)
-        return jax.lax.scan(lambda ts, _: algo.update(ts, START), ts, None, iterations)
+        return jax.lax.scan(lambda ts, i: algo.update(ts, Shared(i)), ts, jnp.arange(iterations))
 
     keys = jax.random.split(jax.random.key(0), max(map(len, swept.values()), default=2))
     return algo, *jax.jit(jax.vmap(run), compiler_options=FAST)(keys, swept)

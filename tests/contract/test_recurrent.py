@@ -15,6 +15,7 @@ from jaxsafe.learn.acting import Player, reset_carry
 from jaxsafe.nn.networks import apply_to_rollout, net_of, recurrent_step
 from jaxsafe.nn.recurrent import Sequences, unroll
 from jaxsafe.run import evaluate
+from jaxsafe.types import Shared
 
 SIZES: dict[str, Any] = {"num_envs": 64, "horizon": 12, "minibatches": 2, "hidden": (8, 16)}
 FIRST_ORDER: dict[str, Any] = {"lr": 3e-3, "target_kl": 0.1, "epochs": 5, "discount": 0.9}
@@ -32,7 +33,7 @@ def trained():
 
     def train(key):
         ts = algo.init(key, cfg, START)
-        return jax.lax.scan(lambda ts, _: algo.update(ts, START), ts, None, 60)[0]
+        return jax.lax.scan(lambda ts, i: algo.update(ts, Shared(i)), ts, jnp.arange(60))[0]
 
     keys = jax.random.split(jax.random.key(0), 2)
     return algo, jax.jit(jax.vmap(train), compiler_options=FAST)(keys)

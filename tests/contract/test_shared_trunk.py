@@ -17,6 +17,7 @@ from jaxsafe.learn.steps import with_values
 from jaxsafe.learn.surrogates import clipped
 from jaxsafe.nn.gaussian import log_prob, sample
 from jaxsafe.nn.networks import action_dist, init_params, share_trunk, value, values
+from jaxsafe.types import Shared
 
 CFG = ALGOS["ppo_lag"].config(hidden=(4,), trunk="shared", value_coef=0.3)
 
@@ -113,7 +114,8 @@ def test_each_value_on_a_shared_trunk_learns_its_own_cost():
     )  # fmt: skip
 
     def train(key):
-        return jax.lax.scan(lambda ts, _: algo.update(ts, START), algo.init(key, cfg, START), None, 20)
+        ts = algo.init(key, cfg, START)
+        return jax.lax.scan(lambda ts, i: algo.update(ts, Shared(i)), ts, jnp.arange(20))
 
     seeds = jax.random.split(jax.random.key(0), 2)
     ts, metrics = jax.jit(jax.vmap(train), compiler_options=FAST)(seeds)
@@ -135,9 +137,8 @@ def test_a_policy_on_a_shared_trunk_learns_what_the_limit_allows():
     )  # fmt: skip
 
     def train(key):
-        return jax.lax.scan(
-            lambda ts, _: algo.update(ts, START), algo.init(key, cfg, START), None, 100
-        )[1]
+        ts = algo.init(key, cfg, START)
+        return jax.lax.scan(lambda ts, i: algo.update(ts, Shared(i)), ts, jnp.arange(100))[1]
 
     metrics = jax.jit(jax.vmap(train), compiler_options=FAST)(jax.random.split(jax.random.key(0), 2))
     ret, cost = (np.asarray(metrics[f"train/{k}"])[:, -30:].mean(1) for k in ("return", "cost"))

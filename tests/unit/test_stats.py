@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 import scipy
+from matplotlib.figure import Figure
 
-from jaxsafe.report import stats
+from jaxsafe.report import plots, stats
 
 # rliable 1.2.0 (with pandas 2.3) on these: 20,000 draws, probability of improvement 3,000.
 X = np.array([
@@ -125,3 +126,13 @@ def test_a_profile_is_the_share_of_seeds_above_each_threshold():
     e = stats.profile([np.array([0.0, 1.0]), np.array([2.0, 2.0])], np.array([-1.0, 0.0, 1.0, 2.0]))
     np.testing.assert_array_equal(e.mean, [1, 0.75, 0.5, 0])
     assert np.all(e.low <= e.mean) and np.all(e.mean <= e.high)
+
+
+def test_a_drawn_band_ends_where_its_measure_ends():
+    """Three seeds cost 0, 0 and 3. The interval of their mean reaches below 0, but no cost does."""
+    values = np.array([[0.0, 1.0], [0.0, 2.0], [3.0, 3.0]])
+    axes = Figure().subplots()
+    for measure in ("train/return", "train/cost"):
+        plots.band(axes, measure, np.arange(2), values, "")
+    low = [band.get_paths()[0].vertices[:, 1].min() for band in axes.collections]
+    assert low[0] < -1 and low[1] == 0

@@ -4,8 +4,17 @@ import numpy as np
 import pytest
 
 from jaxsafe.algos.ppo import CPPOPIDConfig, IPOConfig, PPOLagConfig, PPOPenaltyConfig
+from jaxsafe.algos.sac import SACLagConfig
 from jaxsafe.algos.trpo import CRPOConfig
-from jaxsafe.learn.treatments import barrier, lagrangian, no_treatment, penalty, pid, switch
+from jaxsafe.learn.treatments import (
+    barrier,
+    damped_lagrangian,
+    lagrangian,
+    no_treatment,
+    penalty,
+    pid,
+    switch,
+)
 
 
 def test_the_multiplier_takes_adams_steps_by_hand():
@@ -18,6 +27,37 @@ def test_the_multiplier_takes_adams_steps_by_hand():
     # over 1 - 0.9^2 and 1 - 0.999^2
     m, v = (-0.9 + 0.5) / 0.19, (0.0999 + 0.025) / 0.001999
     np.testing.assert_allclose(dual.lam, 1.1 - 0.1 * m / v**0.5, rtol=1e-5)
+
+
+def test_a_damped_price_is_the_multiplier_and_a_share_of_the_violation():
+    cfg = SACLagConfig(cost_limit=25.0, dual_lr=0.1, lam_init=1.0, dual_damping=0.02, lam_max=1.5)
+    dual = damped_lagrangian.init(cfg)
+    assert dual.lam == 1.0
+    for cost, multiplier, lam in [(35.0, 1.1, 1.3), (60.0, 1.2, 1.5), (-60.0, 1.17, 0.0)]:
+        dual = damped_lagrangian.update(dual, jnp.float32(cost), cfg, 0)
+        np.testing.assert_allclose(dual.multiplier.lam, multiplier, atol=0.03)
+        np.testing.assert_allclose(dual.lam, lam, atol=0.03)
+    over = dual.multiplier.lam + 0.02 * (-60 - 25)
+    assert over < 0 <= dual.lam  # a price never pays for cost
+
+
+def test_damping_ends_the_swing_of_a_policy_that_answers_late():
+    """J_c follows 60 - 100 lam through two lags of 20 moves each. A multiplier alone swings on."""
+
+    def swing(damping):
+        cfg = SACLagConfig(cost_limit=25.0, dual_lr=0.01, lam_init=0.0, dual_damping=damping)
+
+        def move(carry, _):
+            dual, policy, cost = carry
+            policy = policy + (60.0 - 100.0 * dual.lam - policy) / 20
+            cost = cost + (policy - cost) / 20
+            return (damped_lagrangian.update(dual, cost, cfg, 0), policy, cost), cost
+
+        begin = damped_lagrangian.init(cfg), jnp.float32(60.0), jnp.float32(60.0)
+        costs = jax.jit(lambda: jax.lax.scan(move, begin, length=1000)[1])()
+        return float(jnp.abs(costs[-300:] - 25.0).max())
+
+    assert swing(0.0) > 10.0 and swing(0.01) < 2.0
 
 
 @pytest.mark.parametrize("cost, bound", [(0.0, 0.0), (1e6, 0.3)])

@@ -147,12 +147,15 @@ def rod_box(rod: Any, box: Any, cap: float) -> Collision:
             point = project(jnp.clip(point, -extent, extent), thin, short)
         return point, jnp.clip(point, -extent, extent)
 
+    # candidates for n: the box's faces, the rod's ends, edges against its side, and lines between pairs
     pairs = [closest(share * jnp.minimum(radius, half)) for share in (1.0, 0.5, 0.1)]
     lines = jnp.stack([*jnp.eye(3), axis, *jnp.cross(jnp.eye(3), axis)])
     lines = jnp.where((lines @ centre > 0)[:, None], -lines, lines)
     lines = jnp.concatenate([lines, jnp.stack([on_box - on_rod for on_rod, on_box in pairs])])
     lengths = jnp.linalg.norm(lines, axis=1)
     lines /= jnp.maximum(lengths, 1e-9)[:, None]
+
+    # s(n) of each, and the n of the largest
     cosine = lines @ axis
     sine = jnp.sqrt(jnp.maximum(1 - cosine**2, 0.0))
     reach = half * jnp.abs(cosine) + radius * jnp.maximum(sine, cap)
@@ -175,9 +178,10 @@ def rod_box(rod: Any, box: Any, cap: float) -> Collision:
     inner *= jnp.minimum(1.0, radius / jnp.maximum(jnp.linalg.norm(inner), 1e-9))
     side = jnp.where(steep > FLAT, radius * across / jnp.maximum(steep, 1e-9), inner)
 
-    # What of the rod's side lies on a face or edge, which the box's axes span that n does not see. As
-    # in MuJoCo they touch at both its ends on a face, twice at one of them if only that one touches, at
-    # the upper one on an edge, and else at one point.
+    # The part of the rod, from low to high on its axis, that lies on the box. The box's axes that are
+    # `free`, square to n, span what touches: two a face, one an edge. As in MuJoCo a face is touched at
+    # both ends of that part, or twice at one end if the other is off the face. An edge is touched at
+    # high. A rod that does not lie on the box touches at one point.
     free = jnp.abs(n) < FLAT
     lies = jnp.linalg.norm(jnp.where(free, 0.0, axis - lean * n)) < FLAT
     slope = jnp.where(jnp.abs(axis) < 1e-6, 1e-6, axis)
@@ -216,6 +220,8 @@ def box_box(one: Any, two: Any) -> Collision:
     """
     turn, away = one.mat.T @ two.mat, one.mat.T @ (two.pos - one.pos)  # of box two, in the frame of one
     back = -turn.T @ away
+
+    # how far they are apart, along the normals of faces and along crossings of edges
     faces = jnp.abs(jnp.concatenate([away, back])) - jnp.concatenate(
         [one.size + jnp.abs(turn) @ two.size, two.size + jnp.abs(turn.T) @ one.size]
     )
@@ -280,17 +286,20 @@ def crossed(
 def clipped(
     turn: jax.Array, away: jax.Array, size: jax.Array, other: jax.Array, axis: jax.Array
 ) -> Collision:
-    """Distances [8], places [8, 3] and normal [3], where a box touches the face of another on `axis`.
+    """Distances [8], places [8, 3] and normal [3], where box B touches box A's face on `axis`.
 
     Args:
-        turn, away: axes (columns) and centre of the box, in the frame of the other.
-        size, other: half lengths of the face's box and of the one that touches.
+        turn, away: axes (columns) and centre of B, in the frame of A.
+        size, other: half lengths of A and of B.
     """
+    # from here on: x and y along A's face, z off it, towards B; the origin is the face's middle
     order = (axis + jnp.array([1, 2, 0])) % 3  # of coordinates: along the face, then off it
     up = jnp.where(away[axis] < 0, -1.0, 1.0)
     mirror = jnp.array([1.0, 1.0, up])
     size, centre = size[order], away[order] * mirror - size[order] * jnp.array([0.0, 0, 1])
     turn = turn[order] * mirror[:, None]
+
+    # B's side that faces A, of centre +- u +- v
     facing = (jnp.abs(turn[2]).argmax() + jnp.array([1, 2, 0])) % 3
     u, v, w = (turn[:, facing] * other[facing]).T
     centre -= jnp.sign(w[2]) * w
@@ -314,6 +323,7 @@ def clipped(
     over = (jnp.abs(along_u) < 1) & (jnp.abs(along_v) < 1)
     points.append(jnp.column_stack([outline, centre[2] + along_u * u[2] + along_v * v[2]]))
 
+    # of all these points the eight deepest
     points = jnp.concatenate(points)
     there = jnp.concatenate([inside, inside & (end < 1), over]) & (points[:, 2] <= 0)
     dists, chosen = jax.lax.top_k(-jnp.where(there, points[:, 2], 1.0), 8)

@@ -4,7 +4,7 @@
 
 x: accelerations, x0: those without constraints, s_r: the cost of row r, convex and quadratic in pieces.
 An iteration solves H d = -g with the gradient g and the Hessian H = M + J' diag(s'') J, and goes along
-d to where the slope vanishes. It ends where g' H^-1 g, what the next one would gain, is small.
+d to where the slope vanishes. Iterations end where g' H^-1 g, the gain of a further one, is small.
 
 A contact has up to 10 rows, but all are linear in 6 numbers, the relative motion (*twist*) of its two
 bodies at one point; and a box on the floor has 20 contacts. So the rows of contacts are never formed. A
