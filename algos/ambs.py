@@ -24,6 +24,7 @@ from jaxsafe.learn.dreaming import (
     fixed,
     moved,
     no_range,
+    seen,
 )
 from jaxsafe.learn.off_policy import off_policy
 from jaxsafe.learn.replay import Record
@@ -31,7 +32,7 @@ from jaxsafe.learn.row import Row
 from jaxsafe.learn.world_model import CHANCE, critic_of, dream_returns, read, world_of
 from jaxsafe.nn.rssm import Latent
 from jaxsafe.nn.two_hot import BINS, two_hot_mean
-from jaxsafe.types import Algorithm, Env, Metrics, Policy, PyTree
+from jaxsafe.types import Algorithm, Env, Metrics, Policy, PyTree, State
 
 ROUNDING = 1e-5  # a sum of costs that is above a bound by less is at the bound
 
@@ -42,6 +43,7 @@ class AMBSConfig(dreamer.DreamerConfig):
 
         p(s)  = share of m dreams of pi from s with  R > C discount^T,   R = sum of discounted costs
         act by pi_safe if  p(s) > delta - eps,   else by pi
+        or, with rule=binomial, if  P(B <= m p(s)) > confidence,   B binomial: m draws at delta
         c     = C where a step has a violation, else 0;   y says whether it has none
         R     = c_1 + discount k_1 (c_2 + .. c_H + discount k_H min_i V_i(s_H)),   H < T
         V_i   : returns of c under pi, cut at the first violation, discount k y
@@ -55,6 +57,10 @@ class AMBSConfig(dreamer.DreamerConfig):
     discount^(i-1) C, so R tells whether there is one within T steps. The dreams have only H steps. V_i
     stand for the rest. The shield acts in training, evaluation and films. What is dreamed begins with
     actions of pi that are drawn anew, unless `verify_action` has the proposed one dreamed first.
+
+    With `shield=true_dynamics` the simulator takes the place of the dreams: pi goes on for T steps in m
+    copies of it. They foresee its random numbers, too, and only the actions differ. It shows what a
+    learned model costs. The policy then needs the simulator wherever it acts.
 
     What the shield guarantees: if the model is exact, m dreams are at least ln(1 / confidence) / (2
     eps^2), and C and V_i are known, then where it lets pi act, pi keeps the probability of a violation
@@ -81,11 +87,15 @@ class AMBSConfig(dreamer.DreamerConfig):
     # Costs of the environment that are violations where they are above 0. []: `cost`.
     labels: tuple[str, ...] = ()
     violation_cost: Annotated[float, Bounds(1e-3, 1e6)] = 10.0  # C, as in the paper.
+    # Where the shield looks ahead: in the model's dreams, or in copies of the simulator.
+    shield: Literal["dreams", "true_dynamics"] = "dreams"
+    # By which bound it decides. hoeffding: as in the paper. binomial: exact, so fewer dreams do.
+    rule: Literal["hoeffding", "binomial"] = "hoeffding"
     shield_rollouts: Amount = 512  # m, dreams of the shield at each step, as in the paper.
     shield_horizon: Iterations = 30  # T, steps within which a violation counts, as in the paper.
     # Delta, the probability of a violation that is still let through, as in the paper.
     delta: Share = 0.1
-    # The error of the estimate that is allowed for, as in the paper.
+    # The error of the estimate that `hoeffding` allows for, as in the paper.
     eps: Annotated[float, Bounds(1e-6, 1)] = 0.09
     # The probability that the estimate is further off, as in the paper.
     confidence: Annotated[float, Bounds(1e-12, 1)] = 0.01
@@ -278,24 +288,79 @@ def unsafe(cost: jax.Array, alive: jax.Array, value: jax.Array, cfg: Any) -> jax
     return total > (1 + ROUNDING) * threshold(cfg)
 
 
+class Ahead(NamedTuple):
+    """A copy of the simulator that runs ahead: where the policy thinks that it is, the state; whether
+    there was a violation, and whether the episode still runs, bool []."""
+
+    latent: Latent
+    state: State
+    hit: jax.Array
+    alive: jax.Array
+
+
+def true_risk(
+    env: Env, learned: Learned, latent: Latent, proposed: jax.Array, state: State, key: jax.Array
+) -> jax.Array:
+    """p as of `risk`, in copies of the simulator in place of dreams."""
+    cfg = learned.config
+
+    def step(now: Ahead, x: tuple[jax.Array, jax.Array]) -> tuple[Ahead, None]:
+        h, key = x
+        act_key, latent_key = jax.random.split(key)
+        action = chosen(env, learned, "actor", now.latent, act_key)
+        action = jnp.where((h == 0) & cfg.verify_action, proposed, action)
+        after = env.step(now.state, action)
+        memory = Memory(now.latent, action)
+        latent = seen(env, shielded_behaviour, learned, memory, after.obs, latent_key)
+        hit = now.hit | (now.alive & violated(env, after, cfg))
+        return Ahead(latent, after, hit, now.alive & ~after.ended), None
+
+    def ahead(key: jax.Array) -> jax.Array:
+        start = Ahead(latent, state, jnp.bool_(False), jnp.bool_(True))
+        steps = jnp.arange(cfg.shield_horizon), jax.random.split(key, cfg.shield_horizon)
+        return jax.lax.scan(step, start, steps)[0].hit
+
+    return jax.vmap(ahead)(jax.random.split(key, cfg.shield_rollouts)).mean()
+
+
+def overrules(p: jax.Array, cfg: Any) -> jax.Array:
+    """Whether the shield acts where a share `p` of the dreams is unsafe, bool []. A `delta` above 1
+    turns it off."""
+    if cfg.rule == "hoeffding":
+        return p > cfg.delta - cfg.eps
+    m = cfg.shield_rollouts
+    unsafe = jnp.round(p * m)
+    # P(B <= unsafe), of a binomial with m draws at delta
+    likely = jax.scipy.special.betainc(
+        jnp.maximum(m - unsafe, 1.0), unsafe + 1, 1 - jnp.minimum(cfg.delta, 1.0)
+    )
+    return (jnp.where(unsafe < m, likely, 1.0) > cfg.confidence) & (cfg.delta <= 1)
+
+
 def shielded(env: Env, policy: Policy) -> Policy:
     """`policy`, under a shield: where what it proposes looks unsafe, the safe policy acts instead. What
     is remembered is the action that is taken."""
 
+    def privileged(learned: Learned) -> bool:
+        return learned.config.shield == "true_dynamics"
+
     def act(
         learned: Learned, carry: Memory, obs: Any, key: jax.Array | None
     ) -> tuple[jax.Array, Memory, dict[str, Any]]:
-        cfg = learned.config
         keys: Any = (None, None) if key is None else jax.random.split(key)
-        proposed, after, said = policy.act(learned, carry, obs, keys[0])
         backup_key, dream_key = (None, jax.random.key(0)) if key is None else jax.random.split(keys[1])
-        p = risk(env, learned, after.latent, proposed, dream_key)
-        overruled = p > cfg.delta - cfg.eps
+        in_simulator = privileged(learned)
+        proposed, after, said = policy.act(learned, carry, obs.obs if in_simulator else obs, keys[0])
+        if in_simulator:
+            p = true_risk(env, learned, after.latent, proposed, obs, dream_key)
+        else:
+            p = risk(env, learned, after.latent, proposed, dream_key)
+        overruled = overrules(p, learned.config)
         action = jnp.where(overruled, chosen(env, learned, "safe", after.latent, backup_key), proposed)
         said = {**said, "overruled": overruled, "risk": p}
         return action, after._replace(action=action), said
 
-    return policy._replace(act=act)
+    return policy._replace(act=act, privileged=privileged)
 
 
 def make(env: Env, axis_name: str | None = None) -> Algorithm:
@@ -326,15 +391,22 @@ def required_rollouts(
 def note(cfg: Any) -> str:
     """What the shield guarantees with these settings, in one line."""
     m, eps, confidence = cfg.shield_rollouts, float(cfg.eps), float(cfg.confidence)
-    least = math.floor((float(cfg.delta) - eps) * m) + 1
+    counts = np.arange(m + 1)
+    decides = np.asarray(overrules(jnp.asarray(counts / m, jnp.float32), cfg))
+    least = counts[decides][0] if decides.any() else "none"
+    what = "dreams" if cfg.shield == "dreams" else "copies of the simulator"
+    line = f"shield: overrules from {least} of {m} {what} with a violation"
+    line += f" within {cfg.shield_horizon} steps"
+    goal = f"P < {float(cfg.delta):g} with confidence {1 - confidence:g}"
+    unknown = "; how wrong the learned model is, nobody knows" if cfg.shield == "dreams" else ""
+    if cfg.rule == "binomial":
+        return f"{line}: {goal}, if the model is exact{unknown}"
     exact = required_rollouts(eps, confidence, one_sided=True)
-    learned = required_rollouts(eps, confidence, one_sided=True, learned=True)
+    off = required_rollouts(eps, confidence, one_sided=True, learned=True)
     enough = "enough" if m >= exact else "too few"
     return (
-        f"shield: overrules where {least} of {m} dreams have a violation within {cfg.shield_horizon} "
-        f"steps. For P < {float(cfg.delta):g} with confidence {1 - confidence:g} an exact model takes "
-        f"{exact} dreams ({m} are {enough}), a model that is off by {eps:g} / {cfg.shield_horizon} "
-        f"a step at most takes {learned}. How wrong the learned model is, nobody knows"
+        f"{line}. {goal} takes {exact} with an exact model ({m} are {enough}), and {off} with a model "
+        f"that is off by {eps:g} / {cfg.shield_horizon} a step at most{unknown}"
     )
 
 
@@ -443,8 +515,10 @@ AUTHORS: dict[str, Any] = {
     "n_step": 63, "learning_starts": 1024, "model_lr": 1e-4, "lr": 3e-5, "critic_lr": 3e-5,
     "dyn_scale": 0.5, "replay_value": 0.0, "limit_ends": True, "size": "12m",
 }  # fmt: skip
-LEVER: dict[str, Any] = dreamer.LEVER | {
-    "shield_rollouts": 16, "shield_horizon": 4, "delta": 0.5, "eps": 0.1,
+TRUE: dict[str, Any] = {"shield": "true_dynamics", "rule": "binomial", "shield_rollouts": 64}
+# for a problem of a ledge, some steps away
+LEDGE: dict[str, Any] = dreamer.LEVER | {
+    "discount": 0.9, "imagine_steps": 6, "shield_rollouts": 32, "shield_horizon": 4, "eps": 0.05,
 }  # fmt: skip
 
 ROWS = {
@@ -452,9 +526,8 @@ ROWS = {
         AMBSConfig,
         make,
         "Dreamer with a shield that dreams ahead, and a safe policy",
-        {name: AUTHORS | options for name, options in PENALTIES.items()},
+        {name: AUTHORS | options for name, options in PENALTIES.items()} | {"true_dynamics": TRUE},
         holds="nothing",
-        lever=LEVER,
         note=note,
         examine=examine,
     ),

@@ -34,7 +34,7 @@ def test_stopped_and_resumed_it_ends_bit_for_bit_as_if_uninterrupted(trained, tm
     args = (*AMBS, f"total_steps={4 * STEPS}", "checkpoint_iterations=2", f"run_dir={run}")
     assert typed("train", *args) == 0
     said = capsys.readouterr().out
-    assert "shield: overrules where 1 of 4 dreams" in said and "(4 are too few)" in said
+    assert "shield: overrules from 1 of 4 dreams" in said and "(4 are too few)" in said
     for kind in ("checkpoints", "policy"):  # as if it had been killed after iteration 2
         shutil.rmtree(run / kind / "00000004")
     assert typed("train", *args, "resume=true") == 0

@@ -15,7 +15,7 @@ import pytest
 from compiling import FAST
 from toys import START, Corridor, Ledge, Lever
 
-from jaxsafe.algos import ALGOS
+from jaxsafe.algos import ALGOS, ambs
 from jaxsafe.config import ConfigError
 from jaxsafe.learn.acting import Player
 from jaxsafe.learn.world_model import WorldModelConfig
@@ -78,6 +78,15 @@ def test_an_update_keeps_the_structure(name, actor_grad):
     assert {"train/return", "train/cost_estimate", "train/model_kl", "train/nonfinite"} <= {*metrics}
     assert algo.clocks(cfg) == (32, 2)
     assert before.normaliser == () and before.replay.obs.shape == (24, 4, 4)
+
+
+def test_a_shield_in_the_simulator_keeps_the_structure_and_sees_the_state():
+    algo, cfg = ALGOS["ambs"].make(Corridor()), settings_of("ambs", shield="true_dynamics")
+    before = jax.eval_shape(lambda: algo.init(jax.random.key(0), cfg, START))
+    after, metrics = jax.eval_shape(algo.update, before, START)
+    assert jax.tree.leaves(before) == jax.tree.leaves(after)
+    assert {"train/overruled", "train/risk"} <= metrics.keys()
+    assert algo.policy.privileged(jax.eval_shape(algo.learned, before))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -224,16 +233,12 @@ def test_the_multiplier_holds_the_limit_on_average():
     assert (ret > 0.85 * BEST).all()
 
 
-LEDGE: dict[str, Any] = {"discount": 0.9, "imagine_steps": 6}
-SHIELD: dict[str, Any] = {"shield_horizon": 4, "delta": 0.1, "eps": 0.05, "shield_rollouts": 32}
-
-
 @pytest.mark.slow
 def test_a_shield_keeps_from_a_ledge_that_dreamer_goes_beyond():
     """8.9 to earn with 9 violations in an episode, 4.8 without."""
-    ret, cost = trained("dreamer", 30, Ledge(), **LEDGE)
+    ret, cost = trained("dreamer", 30, Ledge(), discount=0.9, imagine_steps=6)
     assert (ret > 8).all() and (cost > 8).all()
-    ret, cost = trained("ambs", 60, Ledge(), **LEDGE, **SHIELD)
+    ret, cost = trained("ambs", 60, Ledge(), **ambs.LEDGE)
     assert (ret > 3).all() and (cost < 0.3).all()
 
 

@@ -9,8 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.stats
 from compiling import FAST
-from toys import START, Corridor
+from toys import START, Corridor, Ledge
 
 from jaxsafe.algos import ALGOS, ambs
 from jaxsafe.config import ConfigError
@@ -40,8 +41,21 @@ def test_one_side_takes_fewer_dreams_and_a_learned_model_four_times_as_many():
     assert ambs.required_rollouts(0.09, 0.01, learned=True) == 1309
     assert ambs.required_rollouts(0.09, 0.01, one_sided=True, learned=True) == 1138
     line = ambs.note(CFG)
-    assert "6 of 512" in line and "285 dreams (512 are enough)" in line and "takes 1138" in line
+    assert "from 6 of 512 dreams" in line and "285 with an exact model (512 are enough)" in line
+    assert "and 1138 with" in line
     assert "too few" in ambs.note(dataclasses.replace(CFG, shield_rollouts=200))
+
+
+@pytest.mark.parametrize("rollouts, allowed", [(44, 0), (64, 1), (128, 5), (256, 14), (512, 35)])
+def test_the_exact_bound_allows_more_than_hoeffdings(rollouts, allowed):
+    cfg = dataclasses.replace(CFG, rule="binomial", shield_rollouts=rollouts)
+    shares = jnp.arange(rollouts + 1) / rollouts
+    overruled = np.asarray(ambs.overrules(shares, cfg))
+    np.testing.assert_array_equal(overruled, np.arange(rollouts + 1) > allowed)
+    exact = scipy.stats.binom.cdf(np.arange(rollouts + 1), rollouts, cfg.delta) > cfg.confidence
+    np.testing.assert_array_equal(overruled, exact)
+    assert not ambs.overrules(shares, dataclasses.replace(cfg, delta=jnp.inf)).any()
+    assert f"from {allowed + 1} of {rollouts} dreams" in ambs.note(cfg)
 
 
 def test_a_chain_that_is_a_little_off_is_at_most_as_much_off_as_the_bound_says():
@@ -87,8 +101,8 @@ def test_the_critics_stand_for_the_steps_that_are_not_dreamed():
 
 
 def test_six_of_512_unsafe_dreams_overrule_and_five_do_not():
-    for unsafe, overruled in ((5, False), (6, True)):
-        assert bool(unsafe / 512 > jnp.float32(CFG.delta) - jnp.float32(CFG.eps)) == overruled
+    overruled = ambs.overrules(jnp.array([5, 6]) / 512, jax.tree.map(jnp.float32, CFG))
+    assert overruled.tolist() == [False, True]
 
 
 def test_the_value_of_costs_ends_with_the_first_violation():
@@ -249,11 +263,27 @@ def test_on_a_known_chain_it_overrules_where_the_bound_says(monkeypatch):
     assert 0 < overruled[1] < 1  # between the two bounds it may do either
 
 
+def test_in_the_simulator_it_knows_what_comes(monkeypatch):
+    """Two steps to the right go beyond the ledge, and one does not."""
+    env, algo = Ledge(), ALGOS["ambs"].make(Ledge())
+    cfg = ambs.AMBSConfig(size="tiny", shield="true_dynamics", rule="binomial", shield_rollouts=64)
+    learned = algo.learned(jax.eval_shape(lambda key: algo.init(key, cfg, START), jax.random.key(0)))
+    assert algo.policy.privileged(dataclasses.replace(learned, config=cfg))
+    monkeypatch.setattr(ambs, "chosen", lambda *_: jnp.ones(1))
+    monkeypatch.setattr(ambs, "seen", lambda *_: Latent(jnp.zeros(1), jnp.zeros(1)))
+    latent, state = Latent(jnp.zeros(1), jnp.zeros(1)), env.reset(jax.random.key(0))
+    for horizon, back, expected in ((1, 1.0, 0.0), (2, 1.0, 1.0), (2, -1.0, 0.0)):
+        of = dataclasses.replace(cfg, shield_horizon=horizon, verify_action=True)
+        known = Learned(of, {}, (), ())
+        p = ambs.true_risk(env, known, latent, jnp.array([back]), state, jax.random.key(1))
+        assert p == expected
+
+
 def test_the_executed_action_is_one_of_the_two_and_is_what_is_remembered():
     """And an environment's action does not depend on its neighbours."""
     algo, env = ALGOS["ambs"].make(Corridor()), Corridor()
     sizes: dict[str, Any] = {"num_envs": 4, "replay_ratio": 32, "shield_rollouts": 4}
-    cfg = ambs.AMBSConfig(**ambs.LEVER | sizes)
+    cfg = ambs.AMBSConfig(**ambs.LEDGE | sizes)
     init = jax.jit(lambda key: algo.init(key, cfg, START), compiler_options=FAST)
     learned = algo.learned(init(jax.random.key(0)))
     state = jax.vmap(env.reset)(jax.random.split(jax.random.key(1), 4))
