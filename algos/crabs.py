@@ -21,8 +21,9 @@ from jaxsafe.config import (
 )
 from jaxsafe.learn.acting import Learned
 from jaxsafe.learn.actor_critic import at_every
-from jaxsafe.learn.barrier import (
-    BarrierConfig,
+from jaxsafe.learn.batch import select
+from jaxsafe.learn.certificate import (
+    CertificateConfig,
     Core,
     System,
     begun,
@@ -35,7 +36,6 @@ from jaxsafe.learn.barrier import (
     volume,
     walk,
 )
-from jaxsafe.learn.batch import select
 from jaxsafe.learn.critics import Values, critic_loss, init_all_critics, targets_of
 from jaxsafe.learn.learner import GradientStep, Learner
 from jaxsafe.learn.models import (
@@ -65,7 +65,7 @@ LEAST, MOST = 0.1, 10.0  # adversarial steps for each gradient step, likewise
 
 
 @config
-class CRABSConfig(EnsembleConfig, BarrierConfig, sac.SACConfig):
+class CRABSConfig(EnsembleConfig, CertificateConfig, sac.SACConfig):
     """CRABS: soft actor-critic within a set of states that a learned certificate finds safe.
 
         h(s) = softplus(f(s) - f(s_0)) + B(s) - 1,   C = {s: h(s) < 0}

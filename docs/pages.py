@@ -27,7 +27,7 @@ from jaxsafe.envs.racing import track as racing_track
 from jaxsafe.envs.safety_gym import suite
 from jaxsafe.envs.velocity import config as velocity_config
 from jaxsafe.envs.velocity import suite as velocities
-from jaxsafe.learn.barrier import BarrierConfig
+from jaxsafe.learn.certificate import CertificateConfig
 from jaxsafe.learn.model_based import ModelBasedConfig
 from jaxsafe.learn.off_policy import OffPolicyConfig
 from jaxsafe.learn.offline import OfflineConfig
@@ -425,7 +425,7 @@ def measured(name: str) -> str:
         rows.append(f"| {how} | {ret} | {cost} | {studies.published_cell(run.config, known)} |")
     if not rows and issubclass(ALGOS[name].config, OfflineConfig):
         return "Not run at length yet."
-    if issubclass(ALGOS[name].config, BarrierConfig):
+    if issubclass(ALGOS[name].config, CertificateConfig):
         return "[Short runs](../theory/certificates.md#short-runs). There is no published table."
     if not rows and issubclass(ALGOS[name].config, AMBSConfig):
         return "Not run at length yet; it keeps away from the ledge of tests/toys.py, Ledge."
@@ -447,7 +447,7 @@ def page(name: str) -> str:
     module = row.config.__module__.rsplit(".", 1)[1]
     more = " dataset=data.npz" if issubclass(row.config, OfflineConfig) else ""
     more += PLANNING if issubclass(row.config, ModelBasedConfig) else ""
-    task = "pendulum_upright" if issubclass(row.config, BarrierConfig) else "point_goal1"
+    task = "pendulum_upright" if issubclass(row.config, CertificateConfig) else "point_goal1"
     return f"""# {title.removesuffix(".")}
 
 ```sh

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxsafe.config import Amount, Bounds, Weight, check_values
-from jaxsafe.learn.barrier import interval_barrier
+from jaxsafe.learn.certificate import interval_barrier
 from jaxsafe.types import State
 
 Angle = Annotated[float, Bounds(1e-3, 3.0)]  # rad

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsafe.learn.acting import Player
-from jaxsafe.learn.barrier import interval_barrier
+from jaxsafe.learn.certificate import interval_barrier
 from jaxsafe.learn.steps import Context
 from jaxsafe.types import Algorithm, Env, Policy, Shared, State
 

@@ -29,8 +29,8 @@ from jaxsafe.envs.safety_gym import suite
 from jaxsafe.envs.safety_gym.config import config_from_plain as read_config
 from jaxsafe.envs.safety_gym.config import defaults
 from jaxsafe.envs.velocity.config import VelocityConfig
-from jaxsafe.learn.barrier import BarrierConfig
 from jaxsafe.learn.bill import PriceClockConfig
+from jaxsafe.learn.certificate import CertificateConfig
 from jaxsafe.learn.model_based import ModelBasedConfig
 from jaxsafe.learn.off_policy import OffPolicyConfig
 from jaxsafe.learn.offline import OfflineConfig
@@ -793,7 +793,7 @@ def set_up(row: Row, target: list[str]) -> tuple[str, list[str], int]:
         ConfigError: OmniSafe's planners do not take the environment.
     """
     task = target[0].removeprefix("env=")
-    if issubclass(row.config, BarrierConfig) and not task.startswith("pendulum_"):
+    if issubclass(row.config, CertificateConfig) and not task.startswith("pendulum_"):
         raise ConfigError(f"{target[0]}: CRABS is for SafeInvertedPendulumSwing-v2 alone there")
     if not issubclass(row.config, ModelBasedConfig):
         return "published", target, 1

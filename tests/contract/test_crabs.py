@@ -14,7 +14,7 @@ from toys import START, Corridor, Ticker
 from jaxsafe.algos import ALGOS
 from jaxsafe.config import ConfigError
 from jaxsafe.learn.acting import Player
-from jaxsafe.learn.barrier import interval_barrier
+from jaxsafe.learn.certificate import interval_barrier
 from jaxsafe.types import Shared
 
 ROW = ALGOS["crabs"]

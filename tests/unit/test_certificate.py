@@ -11,8 +11,17 @@ from compiling import FAST
 
 from jaxsafe import envs
 from jaxsafe.config import ConfigError
-from jaxsafe.learn import barrier
-from jaxsafe.learn.barrier import Box, Core, Search, System, certify, guarded, interval_barrier, walk
+from jaxsafe.learn import certificate
+from jaxsafe.learn.certificate import (
+    Box,
+    Core,
+    Search,
+    System,
+    certify,
+    guarded,
+    interval_barrier,
+    walk,
+)
 
 SIZES = {
     "barrier_hidden": (32, 32),
@@ -56,7 +65,7 @@ def line(gains=(1.0, 1.2)):
 
 def at_zero(k, cfg):
     """A core whose f is 0 everywhere."""
-    net = barrier.init_barrier(jax.random.key(0), 1, cfg)
+    net = certificate.init_barrier(jax.random.key(0), 1, cfg)
     return Core(jax.tree.map(jnp.zeros_like, net), jnp.float32(k), ())
 
 
@@ -67,8 +76,8 @@ def test_h_u_and_the_violations_of_a_line_are_those_by_hand():
     np.testing.assert_allclose(h, np.abs(s[:, 0]) - BOUND, atol=1e-6)
     np.testing.assert_allclose(u, 1.2 * np.abs(s[:, 0]) - BOUND + 0.01, atol=1e-6)
     # h < 0 where |s| < 0.307, and u + 0.01 > 0 where |s| > 0.247
-    assert barrier.violating(h, u).tolist() == [False, False, True, True, False, False]
-    assert not barrier.violating(*system.judge(at_zero(0.7, cfg), s, cfg)).any()  # 1.2 - 0.7 < 1
+    assert certificate.violating(h, u).tolist() == [False, False, True, True, False, False]
+    assert not certificate.violating(*system.judge(at_zero(0.7, cfg), s, cfg)).any()  # 1.2 - 0.7 < 1
 
 
 def test_the_loss_of_f_is_the_mean_of_u_less_lam_h_over_the_violations():
@@ -76,12 +85,12 @@ def test_the_loss_of_f_is_the_mean_of_u_less_lam_h_over_the_violations():
     cfg, core = config(), at_zero(0.0, config())
     s = jnp.array([[0.0], [-0.25], [0.3], [-0.8]])
     lower = jax.tree.map(jnp.copy, core.barrier)
-    loss, counts = barrier.barrier_loss(line(), core, s, lower, 0.0, cfg)
+    loss, counts = certificate.barrier_loss(line(), core, s, lower, 0.0, cfg)
     assert counts.tolist() == [False, True, True, False]
     violations = np.array([0.25, 0.3])
     by_hand = 1.2 * violations - BOUND + 0.01 - 1.2 * (violations - BOUND)
     np.testing.assert_allclose(loss(core.barrier), by_hand.mean(), atol=1e-6)
-    kept, _ = barrier.barrier_loss(line(), core, s, lower, 1e3, cfg)
+    kept, _ = certificate.barrier_loss(line(), core, s, lower, 1e3, cfg)
     np.testing.assert_allclose(kept(core.barrier), by_hand.mean(), atol=1e-6)  # h is h_ref still
 
 
@@ -147,9 +156,9 @@ def searches():
     cfg, (_, system) = config(), pendulum()
 
     def run(k):
-        net = barrier.init_barrier(jax.random.key(0), 2, cfg)
-        search = barrier.begun(system, net, jax.random.key(1), cfg)
-        state = barrier.decayed_adam(0.0, 0.0).init(net)
+        net = certificate.init_barrier(jax.random.key(0), 2, cfg)
+        search = certificate.begun(system, net, jax.random.key(1), cfg)
+        state = certificate.decayed_adam(0.0, 0.0).init(net)
         return certify(system, Core(net, k, ()), net, 0.0, state, search, cfg)
 
     return jax.jit(run, compiler_options=FAST)
@@ -188,4 +197,4 @@ def test_a_certified_region_is_never_left_on_the_true_pendulum():
 
 def test_an_environment_without_a_safe_set_is_refused():
     with pytest.raises(ConfigError, match=r"by a method `barrier\(obs\)`; env=pendulum_upright does"):
-        barrier.safe_set(envs.make("car_racing0"))
+        certificate.safe_set(envs.make("car_racing0"))

@@ -47,7 +47,7 @@ EDGE = 1e-2  # of `interval_barrier`, as in the authors' code
 
 
 @config
-class BarrierConfig:
+class CertificateConfig:
     """For algorithms with a barrier certificate."""
 
     barrier_hidden: tuple[Units, ...] = (64, 64)  # Units of f. The paper has 256 and 256.
