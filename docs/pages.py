@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from jaxsafe.algos import ALGOS, Row
+from jaxsafe.algos.ambs import AMBSConfig
 from jaxsafe.envs import CarRacing, make, pendulum
 from jaxsafe.envs.racing import car as racing_car
 from jaxsafe.envs.racing import task as racing
@@ -31,6 +32,7 @@ from jaxsafe.learn.model_based import ModelBasedConfig
 from jaxsafe.learn.off_policy import OffPolicyConfig
 from jaxsafe.learn.offline import OfflineConfig
 from jaxsafe.learn.on_policy import OnPolicyConfig
+from jaxsafe.learn.world_model import WorldModelConfig
 from jaxsafe.report import stats, studies
 from jaxsafe.report import tables as report
 from jaxsafe.report.published import read_published
@@ -59,10 +61,12 @@ FAMILIES = {  # the pages of docs/theory
     "recorded_data": ("bcq", "bcq_lag", "crr", "ccrr", "coptidice"),
     "planning": ("pets", "cce_pets", "rce_pets", "cap_pets", "loop", "safe_loop"),
     "certificates": ("crabs",),
+    "world_models": ("dreamer", "dreamer_lag", "ambs"),
 }
 PLANNING = " env.observation=coordinates env.wrap.action_repeat=5 algo.learn_cost=false"
 LOOPS = {  # the first that an algorithm's config is one of
     ModelBasedConfig: "planning",
+    WorldModelConfig: "world-model",
     OnPolicyConfig: "on-policy",
     OffPolicyConfig: "off-policy",
     OfflineConfig: "offline",
@@ -77,7 +81,7 @@ How families work, step by step: [prices](../theory/prices.md),
 [trust regions](../theory/trust_region.md), [penalties](../theory/penalties.md),
 [budgets in the state](../theory/budgets.md), [values of actions](../theory/actor_critics.md),
 [recorded data](../theory/recorded_data.md), [planning](../theory/planning.md),
-[certificates](../theory/certificates.md).
+[certificates](../theory/certificates.md), [world models](../theory/world_models.md).
 
 The on-policy algorithms share these options:
 
@@ -423,6 +427,8 @@ def measured(name: str) -> str:
         return "Not run at length yet."
     if issubclass(ALGOS[name].config, BarrierConfig):
         return "[Short runs](../theory/certificates.md#short-runs). There is no published table."
+    if not rows and issubclass(ALGOS[name].config, AMBSConfig):
+        return "Not run at length yet; it keeps away from the ledge of tests/toys.py, Ledge."
     if not rows:
         return "Not run at length yet; it learns the small exact problem of tests/toys.py, Lever."
     head = "| 1e7 steps a seed, limit 25 | return, last 10% | cost | published |\n|---|---|---|---|\n"

@@ -106,7 +106,7 @@ def render_episode(
         NoDisplay: this machine has neither EGL nor OSMesa nor a display.
     """
     draw = Renderer(env, **renderer)  # first: an episode is not worth simulating if it cannot be drawn
-    states = run_episode(player, key, length or env.episode_length)
+    states, said = run_episode(player, key, length or env.episode_length)
     steps = len(states.terminated)
     ends = np.flatnonzero(states.ended)
     last = int(ends[0]) if len(ends) else steps - 1
@@ -114,6 +114,9 @@ def render_episode(
     every = every or max(1, round(1 / (FPS * seconds)))
     times = range(0, last + 1, every)
     frames = [draw.frame(jax.tree.map(lambda x, t=t: x[t], states)) for t in times]
+    if "overruled" in said:
+        acts = [said["overruled"][t : t + every].any() for t in times]
+        frames = [with_light(frame) if on else frame for frame, on in zip(frames, acts, strict=True)]
     if label is None:
         return frames
     returns, costs = np.cumsum(states.reward), np.cumsum(states.cost)
@@ -121,6 +124,15 @@ def render_episode(
         captioned(frame, f"{label}   return {returns[t]:.1f}   cost {costs[t]:.0f}")
         for t, frame in zip(times, frames, strict=True)
     ]
+
+
+def with_light(frame: np.ndarray) -> np.ndarray:
+    """The frame with a red light in its upper right corner: a shield overrules the policy."""
+    image, radius = Image.fromarray(frame), max(3, frame.shape[0] // 24)
+    x, y = frame.shape[1] - 2 * radius, 2 * radius
+    box = (x - radius, y - radius, x + radius, y + radius)
+    ImageDraw.Draw(image).ellipse(box, fill=(220, 30, 30), outline="white")
+    return np.asarray(image)
 
 
 def captioned(frame: np.ndarray, text: str) -> np.ndarray:
@@ -151,19 +163,21 @@ def side_by_side(films: Sequence[Sequence[np.ndarray]]) -> list[np.ndarray]:
     return [at(t) for t in range(max(map(len, films)))]
 
 
-def run_episode(player: Player, key: jax.Array, length: int) -> State:
-    """The states of an episode of mean actions on the host, [length + 1, ...], from the reset on."""
+def run_episode(player: Player, key: jax.Array, length: int) -> tuple[State, dict[str, np.ndarray]]:
+    """An episode of mean actions, on the host: its states, [length + 1, ...], from the reset on; and
+    what the policy says beside its actions, [length] by name."""
     reset_key, _ = jax.random.split(key)
 
-    def step(now: Playing, _: None) -> tuple[Playing, State]:
-        action, carry = player.act(now.carry, now.state)
+    def step(now: Playing, _: None) -> tuple[Playing, tuple[State, dict[str, jax.Array]]]:
+        action, carry, said = player.decide(now.carry, now.state)
         state = player.task.step(now.state, action)
-        return Playing(state, carry, now.alive & ~state.ended), state
+        return Playing(state, carry, now.alive & ~state.ended), (state, said)
 
-    def episode() -> State:
+    def episode() -> tuple[State, dict[str, jax.Array]]:
         start = player.start(reset_key)
-        _, rest = jax.lax.scan(step, start, None, length)
-        return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start.state, rest)
+        _, (rest, said) = jax.lax.scan(step, start, None, length)
+        states = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start.state, rest)
+        return states, said
 
     return jax.device_get(jax.jit(episode)())
 

@@ -56,9 +56,15 @@ class Player(NamedTuple):
         Args:
             key: to sample with; None is the mean action.
         """
-        obs = state if self.policy.privileged(self.learned) else state.obs
-        action, carry, _ = self.policy.act(self.learned, carry, obs, key)
+        action, carry, _ = self.decide(carry, state, key)
         return action, carry
+
+    def decide(
+        self, carry: PyTree, state: State, key: jax.Array | None = None
+    ) -> tuple[jax.Array, PyTree, dict[str, Any]]:
+        """As `act`, and what the policy reports beside its action."""
+        obs = state if self.policy.privileged(self.learned) else state.obs
+        return self.policy.act(self.learned, carry, obs, key)
 
 
 def reset_carry(policy: Policy, learned: PyTree, carry: PyTree, first: jax.Array) -> PyTree:

@@ -33,7 +33,7 @@ class StepRecord(NamedTuple):
 
     `real` is false of a reset and of a bad step, which do not count as steps. terminated marks episodes
     that fail with the step. ended marks complete episodes that end with it; episode and length are
-    their sums.
+    their sums. said: what the policy reported beside the action, float [T, N] by name.
     """
 
     real: jax.Array
@@ -45,6 +45,7 @@ class StepRecord(NamedTuple):
     episode: Episode
     length: jax.Array
     bad: Bad
+    said: dict[str, jax.Array]
 
 
 def started(rollout: RolloutState) -> Stepping:
@@ -68,8 +69,10 @@ def arrival_record(stepping: Stepping, action: jax.Array) -> Record:
     )
 
 
-# (carry [N, ...], State of N, first [N], key) -> action [N, A], carry
-Behaviour = Callable[[PyTree, State, jax.Array, jax.Array], tuple[jax.Array, PyTree]]
+# (carry [N, ...], State of N, first [N], key) -> action [N, A], carry, what it says beside it
+Behaviour = Callable[
+    [PyTree, State, jax.Array, jax.Array], tuple[jax.Array, PyTree, dict[str, jax.Array]]
+]
 
 
 def collect_records(
@@ -82,8 +85,8 @@ def collect_records(
     """One step of every environment for each of `keys` [T], or a reset where its episode has ended.
 
     Args:
-        behave: (carry [N, ...], State of N, first [N], key) -> action [N, A], carry. It begins its
-            carry anew where `first` holds.
+        behave: (carry [N, ...], State of N, first [N], key) -> action [N, A], carry, what it says
+            beside the action, float [N] by name. It begins its carry anew where `first` holds.
         describe: what is recorded of where the environments are, and of the actions that they take.
     Returns:
         The environments afterwards, and the records, [T, N, ...].
@@ -91,7 +94,7 @@ def collect_records(
 
     def step(now: Stepping, key: jax.Array) -> tuple[Stepping, tuple[Record, StepRecord]]:
         act_key, reset_key = jax.random.split(key)
-        action, carry = behave(now.rollout.carry, now.rollout.state, now.first, act_key)
+        action, carry, said = behave(now.rollout.carry, now.rollout.state, now.first, act_key)
         record = describe(now, action)
         state = jax.vmap(env.step)(now.rollout.state, record.action)
         rollout = dataclasses.replace(
@@ -117,6 +120,7 @@ def collect_records(
             episode=rollout.episode,
             length=rollout.steps,
             bad=bad,
+            said=said,
         )
         return Stepping(rollout, record.last, terminated, truncated), (record, came_to)
 

@@ -85,8 +85,8 @@ class ReplayConfig:
 
 
 @config
-class OffPolicyConfig(ReplayConfig):
-    """What the off-policy algorithms share."""
+class RoundConfig(ReplayConfig):
+    """What algorithms share that take gradient steps on rows of a replay."""
 
     # Steps of each environment between two rounds of gradient steps.
     learn_every: Amount = 1
@@ -94,6 +94,12 @@ class OffPolicyConfig(ReplayConfig):
     # Transitions of a gradient step, of all devices together. OmniSafe has 256.
     batch_size: Amount = 1024
     n_step: Iterations = 1  # Rewards summed before the critics' value. OmniSafe has 1.
+
+
+@config
+class OffPolicyConfig(RoundConfig):
+    """What the off-policy algorithms share."""
+
     # Units of the hidden layers of each network, as in OmniSafe.
     hidden: tuple[Units, ...] = (256, 256)
     activation: Literal["relu", "tanh"] = "relu"  # Of the hidden layers, as in OmniSafe.
@@ -296,18 +302,21 @@ def off_policy(
 
         def behave(
             carry: PyTree, state: State, first: jax.Array, key: jax.Array
-        ) -> tuple[jax.Array, PyTree]:
+        ) -> tuple[jax.Array, PyTree, dict[str, jax.Array]]:
             explore_key, random_key = jax.random.split(key)
 
-            def at_random(carry: PyTree) -> tuple[jax.Array, PyTree]:
-                shape = (cfg.num_envs, env.action_size)
-                return jax.random.uniform(random_key, shape, minval=-1.0, maxval=1.0), carry
-
-            def chosen(carry: PyTree) -> tuple[jax.Array, PyTree]:
+            def chosen(carry: PyTree) -> tuple[jax.Array, PyTree, dict[str, jax.Array]]:
                 if learner.policy is not None:
                     player = Player(policy, learned, env)
                     return act_in_all(player, carry, state, first, explore_key)
-                return explore(learned, network_inputs(now.normaliser, state.obs), explore_key), carry
+                obs = network_inputs(now.normaliser, state.obs)
+                return explore(learned, obs, explore_key), carry, {}
+
+            def at_random(carry: PyTree) -> tuple[jax.Array, PyTree, dict[str, jax.Array]]:
+                shape = (cfg.num_envs, env.action_size)
+                action = jax.random.uniform(random_key, shape, minval=-1.0, maxval=1.0)
+                silent = {k: jnp.zeros(x.shape) for k, x in jax.eval_shape(chosen, carry)[2].items()}
+                return action, carry, silent
 
             return jax.lax.cond(random, at_random, chosen, carry)
 
@@ -367,10 +376,12 @@ def off_policy(
 
 def act_in_all(
     player: Player, carry: PyTree, state: State, first: jax.Array, key: jax.Array
-) -> tuple[jax.Array, PyTree]:
-    """The actions [N, A] of a policy in N environments, and its carries, begun anew at `first` [N]."""
+) -> tuple[jax.Array, PyTree, dict[str, jax.Array]]:
+    """The actions [N, A] of a policy in N environments, its carries, begun anew at `first` [N], and
+    what it says beside the actions, float [N] by name."""
     carry = reset_carry(player.policy, player.learned, carry, first)
-    return jax.vmap(player.act)(carry, state, jax.random.split(key, len(first)))
+    action, carry, said = jax.vmap(player.decide)(carry, state, jax.random.split(key, len(first)))
+    return action, carry, jax.tree.map(jnp.float32, said)
 
 
 def drawn_transitions(
@@ -409,6 +420,7 @@ def metrics_of_steps(
     return {
         **step_metrics(env, steps, rate, length, axis_name),
         **{f"train/cost_estimate_{n}": rate(charged[..., k]) * length for k, n in enumerate(names)},
+        **{f"train/{name}": rate(x) for name, x in steps.said.items()},
     }
 
 
@@ -449,7 +461,7 @@ def sizes_of(cfg: Any, axis_name: str | None) -> Sizes:
     num_envs = cfg.num_envs * devices
     rows = ring_rows(cfg.replay_size, num_envs, cfg.horizon)
     warm_up = -(-cfg.learning_starts // num_envs)
-    if not isinstance(cfg, OffPolicyConfig):  # no gradient steps on transitions
+    if not isinstance(cfg, RoundConfig):  # no gradient steps on rows of the replay
         return Sizes(1, cfg.horizon, 0, 0, 1, rows, warm_up, False)
     if cfg.horizon % cfg.learn_every:
         choices = [n for n in range(1, cfg.horizon + 1) if cfg.horizon % n == 0]
@@ -482,7 +494,7 @@ def sizes_of(cfg: Any, axis_name: str | None) -> Sizes:
         n_step=cfg.n_step,
         rows=rows,
         warm_up=warm_up,
-        normalises=cfg.obs_normalize,
+        normalises=isinstance(cfg, OffPolicyConfig) and cfg.obs_normalize,
     )
 
 

@@ -4,7 +4,9 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
-from jaxsafe.types import Algorithm
+import numpy as np
+
+from jaxsafe.types import Algorithm, PyTree
 
 NOTHING: Mapping[str, Any] = MappingProxyType({})
 
@@ -22,6 +24,9 @@ class Row(NamedTuple):
         or nothing, where the limit is only drawn in plots.
     lever: options with which it learns Lever, the small exact problem of tests/toys.py, if its
         defaults do not.
+    note: note(cfg), a line to print before training: what its settings promise; '' for nothing.
+    examine: examine(algo, learned, episodes, seed), what else evaluation measures: name -> float
+        [S, N], of N fresh episodes of each of the S policies in `learned`.
     check: check(cfg, data) raises ConfigError for a data set that cannot serve these settings.
     """
 
@@ -33,3 +38,5 @@ class Row(NamedTuple):
     holds: Literal["average", "episode", "nothing"] = "average"
     lever: Mapping[str, Any] = NOTHING
     check: Callable[[Any, Any], None] = lambda cfg, data: None
+    note: Callable[[Any], str] = lambda cfg: ""
+    examine: Callable[[Algorithm, PyTree, int, int], dict[str, np.ndarray]] = lambda *_: {}

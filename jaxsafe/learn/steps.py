@@ -141,11 +141,11 @@ class Trainable(NamedTuple):
 
 
 def descend_each(
-    loss: Callable[[dict[str, PyTree]], tuple[jax.Array, Metrics]],
+    loss: Callable[[dict[str, PyTree]], tuple[jax.Array, dict[str, Any]]],
     nets: Trainable,
     optimisers: dict[str, optax.GradientTransformation],
     axis_name: str | None = None,
-) -> tuple[Trainable, Metrics]:
+) -> tuple[Trainable, dict[str, Any]]:
     """`nets` after one step down `loss` of the networks that have `optimisers`, each alone.
 
     Args:
@@ -155,7 +155,7 @@ def descend_each(
     grads, metrics = pmean(jax.grad(loss, has_aux=True)(trained), axis_name)
     params, states = {}, {}
     for name, optimiser in optimisers.items():
-        change, states[name] = optimiser.update(grads[name], nets.opt_state[name])
+        change, states[name] = optimiser.update(grads[name], nets.opt_state[name], trained[name])
         params[name] = optax.apply_updates(trained[name], change)
     return Trainable(nets.params | params, nets.opt_state | states), metrics
 

@@ -39,6 +39,7 @@ def evaluate(run: RunPolicies, num: int, seed: int, data: PyTree = ()) -> list[S
     policies = len(settings.configs) * settings.train.num_seeds
     memory.check_episodes(run.env, num, policies)
     episodes = run_episodes(run.algo, run.learned, num, seed)
+    examined = settings.row.examine(run.algo, run.learned, num, seed)
     tables = list(run_folder.by_setting(run_folder.read_metrics(run.folder)).values())
     cost_names = run.algo.task(jax.tree.map(lambda x: x[0], run.learned)).cost_names
     seeds, by_setting = settings.train.num_seeds, []
@@ -46,6 +47,7 @@ def evaluate(run: RunPolicies, num: int, seed: int, data: PyTree = ()) -> list[S
         of_setting = Episodes(*(x[i * seeds : (i + 1) * seeds] for x in episodes))
         limits, metrics = limits_of(member.config), tables[i] if i < len(tables) else {}
         found = measures(of_setting, cost_names, limits)
+        found |= {name: x[i * seeds : (i + 1) * seeds] for name, x in examined.items()}
         rows = summary(settings.env_name, found, float(member.config.cost_limit), metrics)
         if settings.train.dataset is not None:
             rows |= dsrl_scores(settings.env_name, rows, float(member.config.cost_limit))

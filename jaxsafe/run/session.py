@@ -182,6 +182,8 @@ def run(session: Session, report: Reporter, finish: Finish) -> int:
             to_wandb = wandb_callback(session.folder, settings.plain(), program.members)
             hooks = hooks._replace(callbacks=(*hooks.callbacks, to_wandb))
     report.line(greeting(session))
+    for line in dict.fromkeys(filter(None, map(settings.row.note, settings.configs))):
+        report.line(line)
     if line := about_replay(program, train):
         report.line(line)
     outcome = loop.train(program, train, session.folder, report, hooks)

@@ -38,7 +38,7 @@ def test_evaluated_and_filmed_it_remembers(trained):
     run = open_run(trained, ("env=toys:Corridor",))
     whole = run_episodes(run.algo, run.learned, 2, 0)
     player = run.one(0).player
-    states = render.run_episode(player, jax.random.key(0), run.env.episode_length)
+    states, _ = render.run_episode(player, jax.random.key(0), run.env.episode_length)
     assert np.isfinite(whole.ret).all() and np.isfinite(states.obs).all()
     state, forgetful, mindful = player.task.reset(jax.random.key(0)), player.begin(), player.begin()
     for _ in range(3):

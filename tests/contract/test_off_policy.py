@@ -280,7 +280,7 @@ def test_the_last_observation_of_an_episode_has_a_row_and_the_next_row_is_a_rese
     ts = start("sac", env=env, num_envs=5, horizon=40, learn_every=40, replay_ratio=1, batch_size=200,
                replay_size=400, stagger=False)  # fmt: skip
     keys = jax.random.split(jax.random.key(1), 40)
-    behave = lambda carry, state, first, key: (jnp.zeros((5, 1)), carry)  # noqa: E731
+    behave = lambda carry, state, first, key: (jnp.zeros((5, 1)), carry, {})  # noqa: E731
     _, (rows, steps) = jax.jit(lambda x: collect_records(env, behave, x, keys))(ts.stepping)
     name, clock, life = np.moveaxis(np.asarray(rows.obs), -1, 0)
     last = np.asarray(rows.terminated | rows.truncated)

@@ -160,13 +160,20 @@ def test_panels_stand_side_by_side_and_a_short_film_waits_at_its_end():
 
 
 def test_a_caption_says_what_an_episode_has_earned_and_cost(display, monkeypatch):
-    said = []
+    said, size = [], {"width": 64, "height": 48}
     monkeypatch.setattr(render, "captioned", lambda frame, text: said.append(text) or frame)
     env, _ = reset("point_goal0", num_steps=4)
     player = reflex(lambda obs: jnp.array([1.0, 0.0]), env)
-    states = render.run_episode(player, jax.random.key(3), 4)
-    monkeypatch.setattr(render, "run_episode", lambda *args: states)
-    render.render_episode(env, player, jax.random.key(3), every=2, label="cpo", width=64, height=48)
+    states, told = render.run_episode(player, jax.random.key(3), 4)
+    assert told == {}
+    shield = {"overruled": np.array([False, False, False, True])}  # and a light says where it acts
+    monkeypatch.setattr(render, "run_episode", lambda *args: (states, shield))
+    frames = render.render_episode(env, player, jax.random.key(3), every=2, label="cpo", **size)
+    plain = render.Renderer(env, **size)
+    for frame, t, lit in zip(frames, (0, 2, 4), (False, True, False), strict=True):
+        state = jax.tree.map(lambda x, t=t: x[t], states)
+        assert (frame != plain.frame(state)).any() == lit
+    assert (frames[1][6, -6] == [220, 30, 30]).all()
     returns = np.cumsum(states.reward)
     assert said == [f"cpo   return {returns[t]:.1f}   cost 0" for t in (0, 2, 4)]
     frame = np.zeros((48, 200, 3), np.uint8)

@@ -178,7 +178,7 @@ def test_a_row_says_whether_what_the_environment_reports_made_it_jump():
     stepping = started(init_rollout(env, jax.random.key(0), 2, stagger=False))
 
     def behave(carry, state, first, key):
-        return jnp.zeros((2, 1)), carry
+        return jnp.zeros((2, 1)), carry, {}
 
     ticks = record_by(dataclasses.replace(Config(), jump="ticks"))  # it reports a tick of each step
     run = jax.jit(lambda x: collect_records(env, behave, x, keys, ticks), compiler_options=FAST)

@@ -1,0 +1,534 @@
+"""AMBS: Dreamer with a shield. Where its dreams look unsafe, a safe policy acts instead."""
+
+import dataclasses
+import math
+import operator
+from typing import Annotated, Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsafe.algos import dreamer
+from jaxsafe.config import Amount, Bounds, ConfigError, Iterations, Share, Weight, config, nearest
+from jaxsafe.learn.acting import Learned, Player, Playing
+from jaxsafe.learn.constraints import Costs
+from jaxsafe.learn.dreaming import (
+    Behaviour,
+    Memory,
+    Outcome,
+    Scene,
+    chosen,
+    dreaming_learner,
+    dreaming_policy,
+    fixed,
+    moved,
+    no_range,
+    seen,
+)
+from jaxsafe.learn.off_policy import off_policy
+from jaxsafe.learn.replay import Record
+from jaxsafe.learn.row import Row
+from jaxsafe.learn.world_model import CHANCE, critic_of, dream_returns, read, world_of
+from jaxsafe.nn.rssm import Latent
+from jaxsafe.nn.two_hot import BINS, two_hot_mean
+from jaxsafe.types import Algorithm, Env, Metrics, Policy, PyTree, State
+
+ROUNDING = 1e-5  # a sum of costs that is above a bound by less is at the bound
+
+
+@config
+class AMBSConfig(dreamer.DreamerConfig):
+    """AMBS: Dreamer with a shield. Where its dreams look unsafe, a safe policy acts instead.
+
+        p(s)  = share of m dreams of pi from s with  R > C discount^T,   R = sum of discounted costs
+        act by pi_safe if  p(s) > delta - eps,   else by pi
+        or, with rule=binomial, if  P(B <= m p(s)) > confidence,   B binomial: m draws at delta
+        c     = C where a step has a violation, else 0;   y says whether it has none
+        R     = c_1 + discount k_1 (c_2 + .. c_H + discount k_H min_i V_i(s_H)),   H < T
+        V_i   : returns of c under pi, cut at the first violation, discount k y
+        pi_safe climbs -c,   pi climbs Dreamer's A, with  w A + penalty_coef A_pen
+        penl    w = 1
+        plpg    w = exp(min(0, -c_{t+1} + V_safe(s_{t+1}) - V_safe(s_t))), at least 1e-6
+        copt    w = 1 - sigmoid(kappa (R_t - C discount^T)), without gradient
+        none    w = 1, and no A_pen
+
+    A_pen is the advantage of -c under pi, scaled as Dreamer's. A violation i steps ahead costs
+    discount^(i-1) C, so R tells whether there is one within T steps. The dreams have only H steps. V_i
+    stand for the rest. The shield acts in training, evaluation and films. What is dreamed begins with
+    actions of pi that are drawn anew, unless `verify_action` has the proposed one dreamed first.
+
+    With `shield=true_dynamics` the simulator takes the place of the dreams: pi goes on for T steps in m
+    copies of it. They foresee its random numbers, too, and only the actions differ. It shows what a
+    learned model costs. The policy then needs the simulator wherever it acts.
+
+    What the shield guarantees: if the model is exact, m dreams are at least ln(1 / confidence) / (2
+    eps^2), and C and V_i are known, then where it lets pi act, pi keeps the probability of a violation
+    within T steps below delta, wrong with a probability of `confidence` at most. What it does not: the
+    model and the critics are learned, and the bound says nothing of the safe policy.
+
+    Source: Goodall and Belardinelli (2023), "Approximate Model-Based Shielding for Safe Reinforcement
+    Learning", arXiv:2308.00707, and (2024), "Leveraging Approximate Model-based Shielding for
+    Probabilistic Safety Guarantees in Continuous Environments", arXiv:2402.00816; the penalties are
+    from their code.
+    Differs from it: Dreamer is the later one. An end of the episode also ends the costs that V_i
+    foresee. Time limits are no ends (`limit_ends=true` has them). Mean actions are shielded, too.
+    """
+
+    # The undiscounted cost that an episode may have. It is only drawn in plots.
+    cost_limit: Weight = 0.0
+    # How the actor learns. backprop: by the gradient of returns through the model, as in the authors'
+    # code. reinforce: from its actions' advantages.
+    actor_grad: Literal["reinforce", "backprop"] = "backprop"
+    # How the task's policy learns to avoid what the shield hides from it: see above.
+    penalty: Literal["penl", "plpg", "copt", "none"] = "plpg"
+    # The weight of A_pen. The authors have 1 with penl and copt, and 0.8 with plpg.
+    penalty_coef: Weight = 0.8
+    # Costs of the environment that are violations where they are above 0. []: `cost`.
+    labels: tuple[str, ...] = ()
+    violation_cost: Annotated[float, Bounds(1e-3, 1e6)] = 10.0  # C, as in the paper.
+    # Where the shield looks ahead: in the model's dreams, or in copies of the simulator.
+    shield: Literal["dreams", "true_dynamics"] = "dreams"
+    # By which bound it decides. hoeffding: as in the paper. binomial: exact, so fewer dreams do.
+    rule: Literal["hoeffding", "binomial"] = "hoeffding"
+    shield_rollouts: Amount = 512  # m, dreams of the shield at each step, as in the paper.
+    shield_horizon: Iterations = 30  # T, steps within which a violation counts, as in the paper.
+    # Delta, the probability of a violation that is still let through, as in the paper.
+    delta: Share = 0.1
+    # The error of the estimate that `hoeffding` allows for, as in the paper.
+    eps: Annotated[float, Bounds(1e-6, 1)] = 0.09
+    # The probability that the estimate is further off, as in the paper.
+    confidence: Annotated[float, Bounds(1e-12, 1)] = 0.01
+    # Whether the dreams begin with the proposed action. The authors' draw theirs anew.
+    verify_action: bool = False
+    kappa: Weight = 10.0  # How sharply copt decides, as in the authors' code.
+
+
+# ---- what a violation is -----------------------------------------------------------------------
+
+
+def violated(env: Env, rows: Costs, cfg: Any) -> jax.Array:
+    """Where a row has a violation, bool [...].
+
+    Raises:
+        ConfigError: a label that the environment does not have.
+    """
+    for name in cfg.labels:
+        if name not in env.cost_names:
+            hint = nearest(name, env.cost_names) if env.cost_names else "; the environment has none"
+            raise ConfigError(f"labels: unknown cost {name!r}{hint}")
+    if not cfg.labels:
+        return rows.cost > 0
+    return (rows.costs[..., [env.cost_names.index(name) for name in cfg.labels]] > 0).any(-1)
+
+
+def targets(env: Env, rows: Record, cfg: Any) -> dict[str, jax.Array]:
+    bad = violated(env, rows, cfg)
+    return {"cost": cfg.violation_cost * bad, "safe": 1.0 - bad}
+
+
+def clipped(cost: jax.Array, cfg: Any) -> jax.Array:
+    """A predicted cost or value of costs, within [0, C]."""
+    return jnp.clip(cost, 0.0, cfg.violation_cost)
+
+
+def threshold(cfg: Any) -> jax.Array:
+    """C discount^T: what a violation costs in step T + 1, and less than one before that costs."""
+    return cfg.violation_cost * cfg.discount**cfg.shield_horizon
+
+
+# ---- learning ----------------------------------------------------------------------------------
+
+
+class Advantages(NamedTuple):
+    """Of the task's policy, float [H, S]: in reward and in -c, scaled; and what else penalties read.
+
+    cost, value_safe: float [H + 1, S], c and V_safe. returns_c: float [H, S], R_t of a dream.
+    """
+
+    reward: jax.Array
+    penalty: jax.Array
+    cost: jax.Array
+    value_safe: jax.Array
+    returns_c: jax.Array
+
+
+def penalised(found: Advantages, cfg: Any) -> jax.Array:
+    """What the task's policy climbs, float [H, S]."""
+    match cfg.penalty:
+        case "none":
+            return found.reward
+        case "penl":
+            weight = 1.0
+        case "plpg":
+            change = -found.cost[1:] + found.value_safe[1:] - found.value_safe[:-1]
+            weight = jnp.clip(jnp.exp(jnp.minimum(change, 0.0)), 1e-6, 1.0)
+        case "copt":
+            unsafe = jax.nn.sigmoid(cfg.kappa * (found.returns_c - threshold(cfg)))
+            weight = 1.0 - fixed(unsafe)
+    return weight * found.reward + cfg.penalty_coef * found.penalty
+
+
+def learn(trained: dict[str, PyTree], memory: PyTree, scene: Scene, key: jax.Array) -> Outcome:
+    cfg, axis_name = scene.cfg, scene.axis_name
+    discount = cfg.discount
+    actors = jax.tree.map(lambda *x: jnp.stack(x), trained["actor"], trained["safe"])
+    both = jax.vmap(scene.dream)(actors, jax.random.split(key))  # in one program
+    task_dreams, safe_dreams = (jax.tree.map(operator.itemgetter(i), both) for i in range(2))
+
+    # the safe policy
+    dreams = safe_dreams
+    cost = clipped(dreams.read["cost"], cfg)
+    judged = scene.judge("critic_safe", dreams, -cost, discount)
+    range_safe = moved(memory["safe"], judged.returns, axis_name)
+    loss = scene.actor_loss(dreams, judged.advantage / range_safe.scale)
+    loss += scene.critic_loss(trained, "critic_safe", dreams, judged.returns)
+    metrics: Metrics = {"train/value_safe": scene.over_dreams(judged.value[:-1])}
+
+    # the task's policy
+    dreams = task_dreams
+    cost = clipped(dreams.read["cost"], cfg)
+    earned = scene.judge("critic_r", dreams, dreams.read["reward"], discount)
+    paid = scene.judge("critic_p", dreams, -cost, discount)
+    range_r = moved(memory["reward"], earned.returns, axis_name)
+    range_p = moved(memory["penalty"], paid.returns, axis_name)
+    value_c = safety_value(scene.params, dreams.features, cfg)
+    found = Advantages(
+        reward=earned.advantage / range_r.scale,
+        penalty=paid.advantage / range_p.scale,
+        cost=cost,
+        value_safe=scene.value(scene.params["critic_safe"], dreams.features),
+        returns_c=dream_returns(cost, value_c, dreams.read["cont"], discount=discount, decay=1.0),
+    )
+    actor_loss = scene.actor_loss(dreams, penalised(found, cfg))
+    critic_loss = scene.critic_loss_with_rows(
+        trained, "critic_r", dreams, earned.returns, scene.batch.rows.reward, discount
+    )
+    lasts = dreams.read["cont"] * dreams.read["safe"]
+    until = dream_returns(cost, value_c, lasts, discount=discount, decay=cfg.td_lambda)
+    first, second = (scene.critic_loss(trained, name, dreams, clipped(until, cfg)) for name in PAIR)
+    critic_loss_c = first + second
+    loss += actor_loss + critic_loss + critic_loss_c
+    loss += scene.critic_loss(trained, "critic_p", dreams, paid.returns)
+    metrics |= {
+        "train/actor_loss": actor_loss,
+        "train/critic_loss": critic_loss,
+        "train/critic_loss_c": critic_loss_c,
+        "train/entropy": scene.over_dreams(dreams.entropy),
+        "train/value": scene.over_dreams(earned.value[:-1]),
+        "train/value_c": scene.over_dreams(value_c[:-1]),
+        "train/return_scale": range_r.scale,
+    }
+    return Outcome(loss, {"reward": range_r, "penalty": range_p, "safe": range_safe}, metrics)
+
+
+PAIR = ("critic_c1", "critic_c2")
+shielded_behaviour = Behaviour(
+    learn=learn,
+    memory=lambda cfg: {name: no_range() for name in ("reward", "penalty", "safe")},
+    actors=("actor", "safe"),
+    critics=("critic_r", "critic_p", "critic_safe", *PAIR),
+    heads=(("cost", BINS), ("safe", CHANCE)),
+    targets=targets,
+)
+
+
+def safety_value(params: dict[str, PyTree], features: jax.Array, cfg: Any) -> jax.Array:
+    """min_i V_i within [0, C], float [...]: the discounted cost until the first violation."""
+
+    def value(name: str) -> jax.Array:
+        logits: Any = critic_of(cfg).apply(params[name], features)
+        return two_hot_mean(logits)
+
+    return clipped(jnp.minimum(*map(value, PAIR)), cfg)
+
+
+# ---- the shield --------------------------------------------------------------------------------
+
+
+def risk(env: Env, learned: Learned, latent: Latent, proposed: jax.Array, key: jax.Array) -> jax.Array:
+    """p, the share of dreams of the task's policy from `latent` that have a violation within T steps,
+    float [].
+
+    proposed: float [A], with which dreams begin where `verify_action` is set.
+    """
+    cfg, params = learned.config, learned.params
+    world = world_of(env, shielded_behaviour.all_heads, cfg)
+    rollouts = (cfg.shield_rollouts,)
+    start = jax.tree.map(lambda x: jnp.broadcast_to(x, (*rollouts, *x.shape)), latent)
+
+    def step(now: Latent, x: tuple[jax.Array, jax.Array]) -> tuple[Latent, Any]:
+        h, key = x
+        act_key, model_key = jax.random.split(key)
+        action = chosen(env, learned, "actor", now, act_key)
+        action = jnp.where((h == 0) & cfg.verify_action, proposed, action)
+        after: Any = world.apply(params["model"], now, action, model_key, method="imagine")
+        says = read(world, params["model"], after.features)
+        return after, (clipped(says["cost"], cfg), says["cont"] > 0.5)
+
+    keys = jax.random.split(key, cfg.imagine_steps)
+    last, (cost, alive) = jax.lax.scan(step, start, (jnp.arange(cfg.imagine_steps), keys))
+    value = safety_value(params, last.features, cfg)
+    return unsafe(cost, alive, value, cfg).mean()
+
+
+def unsafe(cost: jax.Array, alive: jax.Array, value: jax.Array, cfg: Any) -> jax.Array:
+    """Which dreams have a violation within T steps: R > C discount^T, bool [m].
+
+    Args:
+        cost, alive: of the H states that are dreamed, float and bool [H, m].
+        value: the cost that follows the last one, float [m].
+    """
+
+    def backward(later: jax.Array, x: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
+        cost, alive = x
+        return cost + cfg.discount * alive * later, None
+
+    total = jax.lax.scan(backward, value, (cost, alive), reverse=True)[0]
+    return total > (1 + ROUNDING) * threshold(cfg)
+
+
+class Ahead(NamedTuple):
+    """A copy of the simulator that runs ahead: where the policy thinks that it is, the state; whether
+    there was a violation, and whether the episode still runs, bool []."""
+
+    latent: Latent
+    state: State
+    hit: jax.Array
+    alive: jax.Array
+
+
+def true_risk(
+    env: Env, learned: Learned, latent: Latent, proposed: jax.Array, state: State, key: jax.Array
+) -> jax.Array:
+    """p as of `risk`, in copies of the simulator in place of dreams."""
+    cfg = learned.config
+
+    def step(now: Ahead, x: tuple[jax.Array, jax.Array]) -> tuple[Ahead, None]:
+        h, key = x
+        act_key, latent_key = jax.random.split(key)
+        action = chosen(env, learned, "actor", now.latent, act_key)
+        action = jnp.where((h == 0) & cfg.verify_action, proposed, action)
+        after = env.step(now.state, action)
+        memory = Memory(now.latent, action)
+        latent = seen(env, shielded_behaviour, learned, memory, after.obs, latent_key)
+        hit = now.hit | (now.alive & violated(env, after, cfg))
+        return Ahead(latent, after, hit, now.alive & ~after.ended), None
+
+    def ahead(key: jax.Array) -> jax.Array:
+        start = Ahead(latent, state, jnp.bool_(False), jnp.bool_(True))
+        steps = jnp.arange(cfg.shield_horizon), jax.random.split(key, cfg.shield_horizon)
+        return jax.lax.scan(step, start, steps)[0].hit
+
+    return jax.vmap(ahead)(jax.random.split(key, cfg.shield_rollouts)).mean()
+
+
+def overrules(p: jax.Array, cfg: Any) -> jax.Array:
+    """Whether the shield acts where a share `p` of the dreams is unsafe, bool []. A `delta` above 1
+    turns it off."""
+    if cfg.rule == "hoeffding":
+        return p > cfg.delta - cfg.eps
+    m = cfg.shield_rollouts
+    unsafe = jnp.round(p * m)
+    # P(B <= unsafe), of a binomial with m draws at delta
+    likely = jax.scipy.special.betainc(
+        jnp.maximum(m - unsafe, 1.0), unsafe + 1, 1 - jnp.minimum(cfg.delta, 1.0)
+    )
+    return (jnp.where(unsafe < m, likely, 1.0) > cfg.confidence) & (cfg.delta <= 1)
+
+
+def shielded(env: Env, policy: Policy) -> Policy:
+    """`policy`, under a shield: where what it proposes looks unsafe, the safe policy acts instead. What
+    is remembered is the action that is taken."""
+
+    def privileged(learned: Learned) -> bool:
+        return learned.config.shield == "true_dynamics"
+
+    def act(
+        learned: Learned, carry: Memory, obs: Any, key: jax.Array | None
+    ) -> tuple[jax.Array, Memory, dict[str, Any]]:
+        keys: Any = (None, None) if key is None else jax.random.split(key)
+        backup_key, dream_key = (None, jax.random.key(0)) if key is None else jax.random.split(keys[1])
+        in_simulator = privileged(learned)
+        proposed, after, said = policy.act(learned, carry, obs.obs if in_simulator else obs, keys[0])
+        if in_simulator:
+            p = true_risk(env, learned, after.latent, proposed, obs, dream_key)
+        else:
+            p = risk(env, learned, after.latent, proposed, dream_key)
+        overruled = overrules(p, learned.config)
+        action = jnp.where(overruled, chosen(env, learned, "safe", after.latent, backup_key), proposed)
+        said = {**said, "overruled": overruled, "risk": p}
+        return action, after._replace(action=action), said
+
+    return policy._replace(act=act, privileged=privileged)
+
+
+def make(env: Env, axis_name: str | None = None) -> Algorithm:
+    policy = shielded(env, dreaming_policy(env, shielded_behaviour))
+    return off_policy(env, dreaming_learner(env, shielded_behaviour, policy), axis_name=axis_name)
+
+
+# ---- what is guaranteed ------------------------------------------------------------------------
+
+
+def required_rollouts(
+    eps: float, confidence: float, *, one_sided: bool = False, learned: bool = False
+) -> int:
+    """The dreams after which an estimated probability is off by `eps` at most, but for a probability of
+    `confidence`.
+
+        m >= ln(2 / confidence) / (2 eps^2)
+
+    Args:
+        one_sided: only too low an estimate counts: 1 in place of 2.
+        learned: half of `eps` is left for the model, whose probabilities of the next state may be off
+            by eps / T in total variation. m is 4 times as large.
+    """
+    share = 0.5 if learned else 1.0
+    return math.ceil(math.log((1 if one_sided else 2) / confidence) / (2 * (share * eps) ** 2))
+
+
+def note(cfg: Any) -> str:
+    """What the shield guarantees with these settings, in one line."""
+    m, eps, confidence = cfg.shield_rollouts, float(cfg.eps), float(cfg.confidence)
+    counts = np.arange(m + 1)
+    decides = np.asarray(overrules(jnp.asarray(counts / m, jnp.float32), cfg))
+    least = counts[decides][0] if decides.any() else "none"
+    what = "dreams" if cfg.shield == "dreams" else "copies of the simulator"
+    line = f"shield: overrules from {least} of {m} {what} with a violation"
+    line += f" within {cfg.shield_horizon} steps"
+    goal = f"P < {float(cfg.delta):g} with confidence {1 - confidence:g}"
+    unknown = "; how wrong the learned model is, nobody knows" if cfg.shield == "dreams" else ""
+    if cfg.rule == "binomial":
+        return f"{line}: {goal}, if the model is exact{unknown}"
+    exact = required_rollouts(eps, confidence, one_sided=True)
+    off = required_rollouts(eps, confidence, one_sided=True, learned=True)
+    enough = "enough" if m >= exact else "too few"
+    return (
+        f"{line}. {goal} takes {exact} with an exact model ({m} are {enough}), and {off} with a model "
+        f"that is off by {eps:g} / {cfg.shield_horizon} a step at most{unknown}"
+    )
+
+
+# ---- evaluation --------------------------------------------------------------------------------
+
+
+class Course(NamedTuple):
+    """An episode of T steps, [T] each: whether it still runs; p, and whether the shield overruled; the
+    reward, and whether the step had a violation; whether the episode failed with it."""
+
+    alive: jax.Array
+    risk: jax.Array
+    overruled: jax.Array
+    reward: jax.Array
+    violation: jax.Array
+    failed: jax.Array
+
+
+def course(player: Player, key: jax.Array) -> Course:
+    """An episode of sampled actions."""
+    reset_key, act_key = jax.random.split(key)
+    env, cfg = player.task, player.learned.config
+
+    def step(now: Playing, t: jax.Array) -> tuple[Playing, Course]:
+        sample_key = jax.random.fold_in(act_key, t)
+        action, carry, said = player.decide(now.carry, now.state, sample_key)
+        state = env.step(now.state, action)
+        found = Course(
+            now.alive,
+            said["risk"],
+            said["overruled"] & now.alive,
+            jnp.where(now.alive, state.reward, 0.0),
+            violated(env, state, cfg) & now.alive,
+            state.terminated & now.alive,
+        )
+        return Playing(state, carry, now.alive & ~state.ended), found
+
+    return jax.lax.scan(step, player.start(reset_key), jnp.arange(env.episode_length))[1]
+
+
+def brier_score(found: Course, horizon: int) -> jax.Array:
+    """The mean of (p_t - e_t)^2, float []: e_t is 1 if one of the next `horizon` steps had a violation.
+    Steps whose episode ran out of time before that was known do not count; NaN if none counts."""
+
+    def backward(
+        later: tuple[jax.Array, jax.Array], x: tuple[jax.Array, ...]
+    ) -> tuple[tuple[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
+        """Steps until the next violation, and until nothing more is known, this step included."""
+        violation, failed, alive = x
+        until = jnp.where(violation, 1, later[0] + 1)
+        known = jnp.where(failed, horizon, jnp.where(alive, later[1] + 1, 0))
+        return (until, known), (until, known)
+
+    start = jnp.int32(horizon), jnp.int32(0)
+    series = (found.violation, found.failed, found.alive)
+    until, known = jax.lax.scan(backward, start, series, reverse=True)[1]
+    happened = until <= horizon
+    counts = found.alive & (happened | (known >= horizon))
+    total = jnp.where(counts, (found.risk - happened) ** 2, 0.0).sum()
+    return jnp.where(counts.any(), total / jnp.maximum(counts.sum(), 1), jnp.nan)
+
+
+def examine(algo: Algorithm, learned: PyTree, episodes: int, seed: int) -> dict[str, np.ndarray]:
+    """What the shield does in fresh episodes of sampled actions, and what they are without it: float
+    [S, N] by name, of N episodes of each of the S policies in `learned`."""
+    keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), 0x736869), episodes)
+    horizon = learned.config.shield_horizon
+
+    def of_one(learned: PyTree, delta: jax.Array) -> dict[str, jax.Array]:
+        learned = dataclasses.replace(learned, config=dataclasses.replace(learned.config, delta=delta))
+        player = Player(algo.policy, learned, algo.task(learned))
+        found = jax.vmap(lambda key: course(player, key))(keys)
+        steps = jnp.maximum(found.alive.sum(1), 1)
+        return {
+            "override rate": found.overruled.sum(1) / steps,
+            "violations": found.violation.sum(1).astype(jnp.float32),
+            "return": found.reward.sum(1),
+            "Brier score": jax.vmap(lambda x: brier_score(x, horizon))(found),
+        }
+
+    play = jax.jit(jax.vmap(of_one))
+    delta = learned.config.delta
+    shielded, bare = (
+        jax.tree.map(np.asarray, play(learned, x)) for x in (delta, jnp.full_like(delta, jnp.inf))
+    )
+    return {
+        "override rate": shielded["override rate"],
+        "violations": shielded["violations"],
+        "violations, no shield": bare["violations"],
+        "return, no shield": bare["return"],
+        "Brier score": bare["Brier score"],
+    }
+
+
+# ---- rows --------------------------------------------------------------------------------------
+
+# sacktock/AMBS @5184901, README: penalties and their weights
+PENALTIES: dict[str, dict[str, Any]] = {
+    "plpg": {"penalty": "plpg", "penalty_coef": 0.8},
+    "penl": {"penalty": "penl", "penalty_coef": 1.0},
+    "copt": {"penalty": "copt", "penalty_coef": 1.0},
+}
+# its settings of Safety Gym's vectors, for env.wrap.action_repeat=2; the nearest size to its own
+AUTHORS: dict[str, Any] = {
+    "num_envs": 8, "horizon": 128, "learn_every": 2, "stagger": False, "replay_ratio": 64,
+    "n_step": 63, "learning_starts": 1024, "model_lr": 1e-4, "lr": 3e-5, "critic_lr": 3e-5,
+    "dyn_scale": 0.5, "replay_value": 0.0, "limit_ends": True, "size": "12m",
+}  # fmt: skip
+TRUE: dict[str, Any] = {"shield": "true_dynamics", "rule": "binomial", "shield_rollouts": 64}
+# for a problem of a ledge, some steps away
+LEDGE: dict[str, Any] = dreamer.LEVER | {
+    "discount": 0.9, "imagine_steps": 6, "shield_rollouts": 32, "shield_horizon": 4, "eps": 0.05,
+}  # fmt: skip
+
+ROWS = {
+    "ambs": Row(
+        AMBSConfig,
+        make,
+        "Dreamer with a shield that dreams ahead, and a safe policy",
+        {name: AUTHORS | options for name, options in PENALTIES.items()} | {"true_dynamics": TRUE},
+        holds="nothing",
+        note=note,
+        examine=examine,
+    ),
+}

@@ -1,0 +1,214 @@
+"""DreamerV3, which learns in the dreams of a world model; and with a multiplier on cost."""
+
+from functools import partial
+from typing import Annotated, Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxsafe.config import Bounds, Weight, config
+from jaxsafe.learn.batch import pmean
+from jaxsafe.learn.dreaming import (
+    Behaviour,
+    Outcome,
+    Range,
+    Scene,
+    dreaming_learner,
+    fixed,
+    moved,
+    no_range,
+)
+from jaxsafe.learn.off_policy import off_policy
+from jaxsafe.learn.row import Row
+from jaxsafe.learn.world_model import Dreams, WorldModelConfig
+from jaxsafe.nn.two_hot import BINS
+from jaxsafe.types import Algorithm, Env, Metrics, PyTree
+
+
+@config
+class DreamerConfig(WorldModelConfig):
+    """DreamerV3: an actor that learns in the dreams of a world model, blind to cost.
+
+        model      h_t = f(h_{t-1}, z_{t-1}, a_{t-1}),   z_t ~ q(h_t, x_t),   in dreams z_t ~ p(h_t)
+        L_model  = -log p(x_t, r_t, k_t | h_t, z_t) + max(1, KL(sg q || p)) + 0.1 max(1, KL(q || sg p))
+        R_t      = r_{t+1} + discount k_{t+1} ((1 - td_lambda) V_{t+1} + td_lambda R_{t+1}),   R_H = V_H
+        L_critic = E[u_t (-log p_V(R_t) - log p_V(V'_t))],   u_t = k_0 discount k_1 .. discount k_t
+        L_actor  = -E[u_t (sg (R_t - V_t) / S log pi(a_t) + entropy_coef H(pi))]
+        S        = max(1, P95(R) - P5(R)),   running percentiles;   V' <- V' + tau (V - V')
+
+    x is the observation after symlog, r the reward, and k says whether the episode goes on. Rewards and
+    values are distributions over 255 fixed numbers (two-hot). Dreams of H steps begin at every replayed
+    row. With `actor_grad=backprop` the actor climbs u_t ((R_t - V_t) / S + entropy_coef H) itself,
+    through the model. The policy remembers h and z, which begin anew with each episode.
+
+    Source: Hafner et al. (2025), "Mastering Diverse Control Tasks through World Models", Nature 640,
+    arXiv:2301.04104, and the authors' code.
+    Differs from it: replayed sequences begin with an empty memory, k is learned without the discount,
+    and the model learns nothing from the critics. Numbers have 32 bits. The defaults are for vectors:
+    many environments, small networks, larger learning rates, and fewer gradient steps.
+    """
+
+
+@config
+class DreamerLagConfig(DreamerConfig):
+    """Dreamer-Lagrangian: Dreamer whose actor pays for cost in its dreams, by an augmented Lagrangian.
+
+        L_actor <- L_actor + E[u_t psi(R_c_t - d)],   d = cost_limit / (T (1 - cost_discount))
+        psi(g)   = lam g + mu g^2 / 2  if lam + mu g > 0,   else -lam^2 / (2 mu)
+        lam     <- max(0, lam + mu E[R_c - d]),   mu <- max(mu (1 + mu_growth), mu_least)
+
+    at each gradient step. R_c are TD(lambda) returns of the predicted cost, which has a critic of its
+    own. T is the time limit, so d is the discounted cost of a steady stream of `cost_limit` an episode.
+    With `actor_grad=reinforce` the term is max(0, lam + mu g) (R_c - V_c) log pi, and only log pi has a
+    gradient. The rest is as in Dreamer.
+
+    Source: the baseline of Goodall and Belardinelli (2024), "Leveraging Approximate Model-based
+    Shielding for Probabilistic Safety Guarantees in Continuous Environments", arXiv:2402.00816, as in
+    their code; the augmented Lagrangian is that of As et al. (2022), "Constrained Policy Optimization
+    via Bayesian World Models", arXiv:2201.09802.
+    Differs from it: the head of cost gives a number, not a probability, and Dreamer is the later one.
+    mu is 1 from the second step on, as in the code, so lam moves by the whole violation each time;
+    `mu_least=0` is the paper's.
+    """
+
+    # The undiscounted cost that an episode may have. In 1,000 steps it is d = 1, as in AMBS's code.
+    cost_limit: Weight = 3.0
+    # How the actor learns. backprop: by the gradient of returns through the model, as in AMBS's code.
+    # reinforce: from its actions' advantages.
+    actor_grad: Literal["reinforce", "backprop"] = "backprop"
+    lam_init: Weight = 0.01  # The multiplier at first, as in AMBS's code.
+    mu_init: Annotated[float, Bounds(1e-12, 1e6)] = 5e-9  # mu at first, as in AMBS's code.
+    mu_growth: Weight = 1e-6  # The growth of mu at each gradient step, as in AMBS's code.
+    # mu is at least this from the second step on, as in AMBS's code.
+    mu_least: Weight = 1.0
+
+
+# ---- without constraint ------------------------------------------------------------------------
+
+
+class Wishes(NamedTuple):
+    """What the actor of a step dreamed, how much that earned, the losses of both, and metrics."""
+
+    dreams: Dreams
+    range: Range
+    loss: jax.Array
+    metrics: Metrics
+
+
+def learn_reward(trained: dict[str, PyTree], past: Range, scene: Scene, key: jax.Array) -> Wishes:
+    cfg = scene.cfg
+    dreams = scene.dream(trained["actor"], key)
+    judged = scene.judge("critic_r", dreams, dreams.read["reward"], cfg.discount)
+    now = moved(past, judged.returns, scene.axis_name)
+    actor_loss = scene.actor_loss(dreams, judged.advantage / now.scale)
+    critic_loss = scene.critic_loss_with_rows(
+        trained, "critic_r", dreams, judged.returns, scene.batch.rows.reward, cfg.discount
+    )
+    metrics = {
+        "train/actor_loss": actor_loss,
+        "train/critic_loss": critic_loss,
+        "train/entropy": scene.over_dreams(dreams.entropy),
+        "train/value": scene.over_dreams(judged.value[:-1]),
+        "train/return_scale": now.scale,
+    }
+    return Wishes(dreams, now, actor_loss + critic_loss, metrics)
+
+
+def learn(trained: dict[str, PyTree], memory: PyTree, scene: Scene, key: jax.Array) -> Outcome:
+    found = learn_reward(trained, memory["range"], scene, key)
+    return Outcome(found.loss, {"range": found.range}, found.metrics)
+
+
+blind = Behaviour(learn=learn, memory=lambda cfg: {"range": no_range()})
+
+
+# ---- with a multiplier -------------------------------------------------------------------------
+
+
+class Augmented(NamedTuple):
+    """An augmented Lagrangian: lam and mu, float []."""
+
+    lam: jax.Array
+    mu: jax.Array
+
+    def psi(self, g: jax.Array) -> jax.Array:
+        """The penalty of violations `g` [...]. Its slope is `price`."""
+        least = -(self.lam**2) / (2 * self.mu)
+        return jnp.where(self.price(g) > 0, self.lam * g + self.mu * g**2 / 2, least)
+
+    def price(self, g: jax.Array) -> jax.Array:
+        return jnp.maximum(0.0, self.lam + self.mu * g)
+
+    def raised(self, violation: jax.Array, cfg: Any) -> "Augmented":
+        """After a step whose mean violation was `violation`, float []."""
+        mu = jnp.maximum(self.mu * (1 + cfg.mu_growth), cfg.mu_least)
+        return Augmented(jnp.maximum(0.0, self.lam + self.mu * violation), mu)
+
+
+def discounted_limit(env: Env, cfg: Any) -> jax.Array:
+    """d, the discounted cost of a steady stream of `cost_limit` an episode, float []."""
+    return cfg.cost_limit / (env.episode_length * jnp.maximum(1 - cfg.cost_discount, 1e-6))
+
+
+def learn_priced(trained: dict[str, PyTree], memory: PyTree, scene: Scene, key: jax.Array) -> Outcome:
+    cfg, dual = scene.cfg, memory["dual"]
+    found = learn_reward(trained, memory["range"], scene, key)
+    dreams = found.dreams
+    costs = scene.judge("critic_c", dreams, dreams.read["cost"], cfg.cost_discount)
+    violation = costs.returns - discounted_limit(scene.env, cfg)
+    penalty = dual.psi(violation)
+    if cfg.actor_grad == "reinforce":
+        penalty = fixed(dual.price(violation) * costs.advantage) * dreams.log_prob
+    critic_loss = scene.critic_loss_with_rows(
+        trained, "critic_c", dreams, costs.returns, scene.batch.rows.cost, cfg.cost_discount
+    )
+    mean_violation = fixed(scene.over_dreams(violation))
+    metrics = {
+        "train/critic_loss_c": critic_loss,
+        "train/value_c": scene.over_dreams(costs.value[:-1]),
+        "train/dream_violation": mean_violation,
+        "train/lam": dual.lam,
+    }
+    dual = dual.raised(pmean(mean_violation, scene.axis_name), cfg)
+    loss = found.loss + scene.over_dreams(dreams.weight[:-1] * penalty) + critic_loss
+    return Outcome(loss, {"range": found.range, "dual": dual}, found.metrics | metrics)
+
+
+priced = Behaviour(
+    learn=learn_priced,
+    memory=lambda cfg: {"range": no_range(), "dual": Augmented(cfg.lam_init, cfg.mu_init)},
+    critics=("critic_r", "critic_c"),
+    heads=(("cost", BINS),),
+    targets=lambda env, rows, cfg: {"cost": rows.cost},
+)
+
+
+# ---- rows --------------------------------------------------------------------------------------
+
+
+def make(env: Env, axis_name: str | None = None, behaviour: Behaviour = blind) -> Algorithm:
+    return off_policy(env, dreaming_learner(env, behaviour), axis_name=axis_name)
+
+
+# for a problem of two levers, whose next signs nobody can foresee
+LEVER: dict[str, Any] = {
+    "num_envs": 16, "horizon": 16, "learn_every": 8, "replay_ratio": 8, "batch_size": 128, "n_step": 7,
+    "replay_size": 8192, "learning_starts": 256, "size": "tiny", "imagine_steps": 4, "discount": 0.5,
+    "cost_discount": 0.5, "model_lr": 3e-3, "lr": 3e-3, "critic_lr": 3e-3, "lr_warmup": 10,
+}  # fmt: skip
+
+ROWS = {
+    "dreamer": Row(
+        DreamerConfig,
+        make,
+        "an actor that learns in the dreams of a world model, no constraint",
+        holds="nothing",
+        lever=LEVER,
+    ),
+    "dreamer_lag": Row(
+        DreamerLagConfig,
+        partial(make, behaviour=priced),
+        "Dreamer with an augmented Lagrangian on the cost of its dreams",
+        lever=LEVER | {"mu_least": 0.05},  # with 1 the multiplier overshoots, and costs stay near 1.4
+    ),
+}

@@ -1,0 +1,306 @@
+"""Learning a world model from sequences of rows, and dreaming with it.
+
+A row of the replay describes the arrival at an observation, and then the action taken from it. So the
+latent of row t is that of obs_t. It follows from the latent of row t - 1 and the action of row t - 1.
+It foretells reward_t, the cost of that step, and whether the episode goes on from obs_t. Where row t is
+the first of an episode, what came before is forgotten.
+"""
+
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from jaxsafe.config import Amount, Iterations, Norm, Rate, Share, Weight, config
+from jaxsafe.learn.off_policy import RoundConfig
+from jaxsafe.learn.replay import Record
+from jaxsafe.learn.sequences import SequenceBatch
+from jaxsafe.nn.gaussian import Gaussian, entropy, log_prob, sample
+from jaxsafe.nn.rssm import (
+    SIZES,
+    Beliefs,
+    Head,
+    Latent,
+    VectorDecoder,
+    VectorEncoder,
+    WorldModel,
+    kl,
+)
+from jaxsafe.nn.two_hot import BINS, two_hot_loss, two_hot_mean
+from jaxsafe.types import Env, Metrics, PyTree
+
+CHANCE = 1  # outputs of a head that gives a probability; one that gives a number has BINS
+STD = (0.1, 1.0)  # range of the actor's standard deviation, as in the authors' code
+
+
+@config
+class WorldModelConfig(RoundConfig):
+    """What algorithms with a world model share."""
+
+    # Environments side by side, of all devices together. The authors have 16 and fewer.
+    num_envs: Amount = 64
+    # Steps of each environment between two rounds of gradient steps, of 1,024 environment steps in all.
+    learn_every: Amount = 16
+    # Rows replayed for each environment step. The authors have 32 to 1024.
+    replay_ratio: Amount = 32
+    batch_size: Amount = 1024  # Rows of a gradient step, of all devices together, as in the paper.
+    # Steps of a replayed sequence. It has a row more: 32. The authors have 64.
+    n_step: Iterations = 31
+    # Environment steps with random actions and without learning.
+    learning_starts: Amount = 5_000
+    # The discount of rewards: 1 - 1/333, as in the paper.
+    discount: Share = 0.997
+    cost_discount: Share = 0.997  # The discount of costs.
+    # The networks' size: millions of parameters, if pictures are observed. The paper's is 200m.
+    size: Literal["tiny", "1m", "12m", "25m", "50m", "100m", "200m"] = "1m"
+    model_lr: Rate = 3e-4  # The model's learning rate, by LaProp. The authors have 4e-5.
+    lr: Rate = 3e-4  # The actor's learning rate, by LaProp. The authors have 4e-5.
+    critic_lr: Rate = 3e-4  # The critics' learning rate, by LaProp. The authors have 4e-5.
+    # Gradient steps in which the learning rates rise to their values, as in the authors' code.
+    lr_warmup: Iterations = 1000
+    # The longest gradient of an array, as a share of the array's own length, as in the authors' code.
+    clip: Norm = 0.3
+    dyn_scale: Weight = 1.0  # The weight of the prior's loss, as in the paper.
+    rep_scale: Weight = 0.1  # The weight of the posterior's loss, as in the paper.
+    free_nats: Weight = 1.0  # Nats below which neither loss is lowered further, as in the paper.
+    # Whether running out of time is learned as an end, as the code of AMBS does. A time limit that is
+    # not observed is no end, so the default is not to.
+    limit_ends: bool = False
+    imagine_steps: Iterations = 15  # Steps of a dream, as in the paper.
+    td_lambda: Share = 0.95  # How far the returns of dreams reach: 0 is one step. As in the paper.
+    # How the actor learns. reinforce: from its actions' advantages, as in the paper. backprop: by the
+    # gradient of returns through the model.
+    actor_grad: Literal["reinforce", "backprop"] = "reinforce"
+    entropy_coef: Weight = 3e-4  # The weight of the actor's entropy, as in the paper.
+    # The share of a critic that its slow copy takes on at each step, as in the paper.
+    tau: Share = 0.02
+    # The weight of the critics' loss on replayed rewards, as in the authors' code.
+    replay_value: Weight = 0.3
+
+
+# ---- networks ----------------------------------------------------------------------------------
+
+
+def world_of(env: Env, heads: dict[str, int], cfg: Any) -> WorldModel:
+    """The model of an environment whose observations are vectors.
+
+    heads: name -> BINS for a number, CHANCE for a probability.
+    """
+    size = SIZES[cfg.size]
+    decoder = VectorDecoder(size, env.obs_size)
+    return WorldModel(size, VectorEncoder(size), decoder, tuple(heads.items()))
+
+
+def actor_of(env: Env, cfg: Any) -> Head:
+    size = SIZES[cfg.size]
+    return Head(size.layers, size.units, 2 * env.action_size, scale=0.01)
+
+
+def critic_of(cfg: Any) -> Head:
+    size = SIZES[cfg.size]
+    return Head(size.layers, size.units, BINS, scale=0.0)
+
+
+def policy_of(outputs: jax.Array) -> Gaussian:
+    """The action distribution [..., A] of an actor's outputs [..., 2 A]. Environments clip actions."""
+    mean, std = jnp.split(outputs, 2, axis=-1)
+    low, high = STD
+    return Gaussian(jnp.tanh(mean), jnp.log(low + (high - low) * jax.nn.sigmoid(std + 2)))
+
+
+def laprop(lr: jax.Array | float, cfg: Any) -> optax.GradientTransformation:
+    """RMSProp, then momentum, on gradients no longer than a share of the arrays they belong to.
+
+    Source: Ziyin, Wang and Ueda (2020), "LAProp: Separating Momentum and Adaptivity in Adam",
+        arXiv:2002.04839; Brock et al. (2021), "High-Performance Large-Scale Image Recognition Without
+        Normalization", arXiv:2102.06171, for the clip, here of whole arrays.
+    """
+    steps = optax.chain(
+        optax.scale_by_rms(0.999, eps=1e-20, bias_correction=True),
+        optax.ema(0.9),
+        optax.scale_by_schedule(lambda count: -lr * jnp.minimum(1.0, (count + 1) / cfg.lr_warmup)),
+    )
+    return optax.chain(clip_by_share(cfg.clip), optax.flatten(steps))  # as one array: a small program
+
+
+def clip_by_share(share: jax.Array | float, least: float = 1e-3) -> optax.GradientTransformation:
+    """Shortens the gradient of each array to `share` times the array's length, which counts as `least`
+    at least."""
+
+    def clip(grads: PyTree, params: PyTree) -> PyTree:
+        def one(grad: jax.Array, param: jax.Array) -> jax.Array:
+            length = jnp.sqrt(jnp.sum(grad**2))
+            longest = share * jnp.maximum(least, jnp.sqrt(jnp.sum(param**2)))
+            return grad * jnp.minimum(1.0, longest / jnp.maximum(length, 1e-30))
+
+        return jax.tree.map(one, grads, params)
+
+    return optax.stateless(clip)
+
+
+# ---- the model's loss --------------------------------------------------------------------------
+
+
+def filtered(
+    world: WorldModel, params: PyTree, rows: Record, key: jax.Array | None
+) -> tuple[Latent, Beliefs]:
+    """The latents of the rows [T, B], the likeliest ones where `key` is None, and what was believed of
+    them. The first row of each sequence remembers nothing."""
+    embedded: Any = world.apply(params, rows.obs, method="embed")
+    first = rows.first.at[0].set(True)
+    came_by = jnp.roll(rows.action, 1, axis=0)  # row t came of the action of row t - 1
+
+    def step(latent: Latent, x: Any) -> tuple[Latent, tuple[Latent, Beliefs]]:
+        action, embedded, first, key = x
+        latent, action = jax.tree.map(lambda x: jnp.where(first[:, None], 0.0, x), (latent, action))
+        found: Any = world.apply(params, latent, action, embedded, key, method="observe")
+        return found[0], found
+
+    nothing = jax.tree.map(
+        lambda x: jnp.zeros((rows.first.shape[1], *x.shape)), world.apply({}, method="start")
+    )
+    keys = None if key is None else jax.random.split(key, len(rows.first))
+    return jax.lax.scan(step, nothing, (came_by, embedded, first, keys))[1]
+
+
+def model_loss(
+    world: WorldModel,
+    params: PyTree,
+    batch: SequenceBatch,
+    targets: dict[str, jax.Array],
+    key: jax.Array,
+    cfg: Any,
+) -> tuple[jax.Array, tuple[Latent, Metrics]]:
+    """This device's share of the loss; the latents [T, B], and metrics.
+
+        L = -log p(x, targets | h, z) + dyn max(free, KL(sg q || p)) + rep max(free, KL(q || sg p))
+
+    targets: for each head, float [T, B].
+    """
+    latents, (prior, posterior) = filtered(world, params, batch.rows, key)
+    features, fixed = latents.features, jax.lax.stop_gradient
+
+    def mean(x: jax.Array) -> jax.Array:
+        return (batch.weight * x.mean(0)).sum()
+
+    decoded = world.apply(params, features, method="decode")
+    read: Any = world.apply(params, features, method="read")
+    losses = {"obs": mean(world.decoder.loss(decoded, batch.rows.obs))}
+    losses |= {name: mean(head_loss(read[name], target)) for name, target in targets.items()}
+    dyn = mean(jnp.maximum(cfg.free_nats, kl(fixed(posterior), prior)))
+    rep = mean(jnp.maximum(cfg.free_nats, kl(posterior, fixed(prior))))
+    metrics = {f"train/model_{name}_loss": loss for name, loss in losses.items()}
+    metrics |= {"train/model_kl": mean(kl(posterior, prior))}
+    total = sum(losses.values()) + cfg.dyn_scale * dyn + cfg.rep_scale * rep
+    return total, (latents, metrics)
+
+
+def head_loss(outputs: jax.Array, target: jax.Array) -> jax.Array:
+    """-log p(target), float [...], of a head's outputs [..., BINS] or [..., CHANCE]."""
+    if outputs.shape[-1] == BINS:
+        return two_hot_loss(outputs, target)
+    return optax.sigmoid_binary_cross_entropy(outputs[..., 0], target)
+
+
+def read(world: WorldModel, params: PyTree, features: jax.Array) -> dict[str, jax.Array]:
+    """What the heads say, float [...]: the mean of numbers, and probabilities."""
+    outputs: Any = world.apply(params, features, method="read")
+    return {
+        name: two_hot_mean(x) if x.shape[-1] == BINS else jax.nn.sigmoid(x[..., 0])
+        for name, x in outputs.items()
+    }
+
+
+def goes_on(rows: Record, cfg: Any) -> jax.Array:
+    """The target of the head `cont`: 1 where an episode goes on, float [T, B]."""
+    return 1.0 - (rows.last if cfg.limit_ends else rows.terminated)
+
+
+# ---- dreams ------------------------------------------------------------------------------------
+
+
+class Dreams(NamedTuple):
+    """What a policy does in the model, from S latents, for H steps.
+
+    features: float [H + 1, S, F]. action: float [H, S, A].
+    log_prob, entropy: float [H, S], of the actions, as functions of the actor alone.
+    read: what the heads say, float [H + 1, S] each.
+    weight: float [H + 1, S], without gradient: how likely the dream still goes on, discounted.
+    """
+
+    features: jax.Array
+    action: jax.Array
+    log_prob: jax.Array
+    entropy: jax.Array
+    read: dict[str, jax.Array]
+    weight: jax.Array
+
+
+def dream(
+    world: WorldModel,
+    params: PyTree,
+    actor: Callable[[PyTree, jax.Array], Gaussian],
+    actor_params: PyTree,
+    start: Latent,
+    alive: jax.Array,
+    key: jax.Array,
+    cfg: Any,
+) -> Dreams:
+    """Dreams from `start` [S, ...]. With `actor_grad` 'backprop' they are functions of the actor.
+
+    Args:
+        actor: (its parameters, features) -> the action distribution.
+        alive: float [S], 1 where the episode goes on at the start.
+    """
+    fixed = jax.lax.stop_gradient
+    params = fixed(params)
+    player = actor_params if cfg.actor_grad == "backprop" else fixed(actor_params)
+
+    def step(latent: Latent, key: jax.Array) -> tuple[Latent, tuple[jax.Array, jax.Array]]:
+        act_key, model_key = jax.random.split(key)
+        action = sample(actor(player, fixed(latent.features)), act_key)
+        after: Any = world.apply(params, latent, action, model_key, method="imagine")
+        return after, (latent.features, action)
+
+    keys = jax.random.split(key, cfg.imagine_steps)
+    last, (features, action) = jax.lax.scan(step, fixed(start), keys)
+    dist = actor(actor_params, fixed(features))
+    features = jnp.concatenate([features, last.features[None]])
+    says = read(world, params, features)
+    says["cont"] = says["cont"].at[0].set(alive)
+    return Dreams(
+        features=features,
+        action=action,
+        log_prob=log_prob(dist, fixed(action)),
+        entropy=entropy(dist),
+        read=says,
+        weight=fixed(jnp.cumprod(says["cont"].at[1:].multiply(cfg.discount), axis=0)),
+    )
+
+
+def dream_returns(
+    reward: jax.Array,
+    value: jax.Array,
+    cont: jax.Array,
+    *,
+    discount: jax.Array | float,
+    decay: jax.Array | float,
+) -> jax.Array:
+    """TD(lambda) returns of the first H states, float [H, S].
+
+        R_t = r_{t+1} + discount k_{t+1} ((1 - decay) V_{t+1} + decay R_{t+1}),   R_H = V_H
+
+    Args:
+        reward, value, cont: float [H + 1, S], of each state; `cont` is k, the probability that the
+            episode goes on from there.
+    """
+
+    def backward(later: jax.Array, x: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
+        reward, value, cont = x
+        now = reward + discount * cont * ((1 - decay) * value + decay * later)
+        return now, now
+
+    after = (reward[1:], value[1:], cont[1:])
+    return jax.lax.scan(backward, value[-1], after, reverse=True)[1]

@@ -1,0 +1,264 @@
+"""DreamerV3's networks: a recurrent state-space model, and the heads that read its latent state.
+
+    memory       h_t = f(h_{t-1}, z_{t-1}, a_{t-1})
+    posterior    z_t ~ q(z_t | h_t, x_t),   where x_t is observed
+    prior        z_t ~ p(z_t | h_t),        in imagination
+
+f is a gated recurrent unit whose weights are blocks on the diagonal. z_t is `latents` one-hot draws
+from `classes` each. Every draw is uniform with a probability of 1%, and its gradient is that of the
+probabilities (straight-through). Heads read the features [h_t, z_t].
+
+Source: Hafner et al. (2025), "Mastering Diverse Control Tasks through World Models", Nature 640,
+    arXiv:2301.04104; sizes, the recurrent unit and initial weights are from the authors' code.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from jaxsafe.nn.two_hot import symlog
+
+UNIFORM = 0.01  # the probability that a draw of a latent is uniform
+
+
+class Size(NamedTuple):
+    """deter: of h. hidden: units of the layers about it. latents, classes: of z. units, layers: of
+    encoder, decoder, actor and critic. blocks: of the recurrent unit's weights."""
+
+    deter: int
+    hidden: int
+    classes: int
+    units: int
+    latents: int = 32
+    layers: int = 3
+    blocks: int = 8
+
+
+# by the millions of parameters that they have with a picture for observation; `tiny` is for tests
+SIZES = {
+    "tiny": Size(deter=32, hidden=16, classes=4, units=16, latents=4, layers=1, blocks=2),
+    "1m": Size(deter=512, hidden=64, classes=4, units=64),
+    "12m": Size(deter=2048, hidden=256, classes=16, units=256),
+    "25m": Size(deter=3072, hidden=384, classes=24, units=384),
+    "50m": Size(deter=4096, hidden=512, classes=32, units=512),
+    "100m": Size(deter=6144, hidden=768, classes=48, units=768),
+    "200m": Size(deter=8192, hidden=1024, classes=64, units=1024),
+}
+
+
+class Latent(NamedTuple):
+    """What the model remembers: h, float [..., D], and z, float [..., latents classes]."""
+
+    deter: jax.Array
+    stoch: jax.Array
+
+    @property
+    def features(self) -> jax.Array:
+        """What heads read, float [..., F]."""
+        return jnp.concatenate([self.deter, self.stoch], -1)
+
+
+class Beliefs(NamedTuple):
+    """Log probabilities [..., latents, classes] of z before and after the observation is seen."""
+
+    prior: jax.Array
+    posterior: jax.Array
+
+
+# ---- layers ------------------------------------------------------------------------------------
+
+
+def fan_in(scale: float) -> Callable[..., jax.Array]:
+    return nn.initializers.variance_scaling(scale, "fan_in", "truncated_normal")
+
+
+class Hidden(nn.Module):
+    """A linear layer, normalised by its root mean square, then SiLU: float [..., I] -> [..., units]."""
+
+    units: int
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        return nn.silu(nn.RMSNorm(1e-4)(nn.Dense(self.units, kernel_init=fan_in(1.0))(x)))
+
+
+class Head(nn.Module):
+    """Hidden layers and a linear one, float [..., I] -> [..., out]. `scale` is of the last weights.
+    With 0 the outputs are 0 at first."""
+
+    layers: int
+    units: int
+    out: int
+    scale: float = 1.0
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        for _ in range(self.layers):
+            x = Hidden(self.units)(x)
+        last = fan_in(self.scale) if self.scale else nn.initializers.zeros
+        return nn.Dense(self.out, kernel_init=last)(x)
+
+
+class BlockDense(nn.Module):
+    """A linear layer of each block, float [..., blocks, I] -> [..., blocks, out]."""
+
+    out: int
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        shape = (*x.shape[-2:], self.out)
+        init = nn.initializers.variance_scaling(1.0, "fan_in", "truncated_normal", batch_axis=(0,))
+        kernel = self.param("kernel", init, shape)
+        bias = self.param("bias", nn.initializers.zeros, (shape[0], self.out))
+        return jnp.einsum("...bi,bio->...bo", x, kernel) + bias
+
+
+class Memory(nn.Module):
+    """(latent, a) -> the next h, [..., D]: a gated recurrent unit whose weights are blocks.
+
+    u = [W_h h, W_z z, W_a a],   y = SiLU(norm(W_k [h_k, u])) for each block k
+    r, c, g = V_k y_k;   h <- sigmoid(g - 1) tanh(sigmoid(r) c) + (1 - sigmoid(g - 1)) h
+    """
+
+    size: Size
+
+    @nn.compact
+    def __call__(self, latent: Latent, action: jax.Array) -> jax.Array:
+        blocks, width = self.size.blocks, self.size.deter // self.size.blocks
+        parts = (latent.deter, latent.stoch, action)
+        u = jnp.concatenate([Hidden(self.size.hidden)(x) for x in parts], -1)
+
+        def split(x: jax.Array) -> jax.Array:
+            return x.reshape(*x.shape[:-1], blocks, width)
+
+        def join(x: jax.Array) -> jax.Array:
+            return x.reshape(*x.shape[:-2], blocks * width)
+
+        every = jnp.broadcast_to(u[..., None, :], (*u.shape[:-1], blocks, u.shape[-1]))
+        y = join(BlockDense(width)(jnp.concatenate([split(latent.deter), every], -1)))
+        y = nn.silu(nn.RMSNorm(1e-4)(y))
+        reset, candidate, gate = jnp.split(BlockDense(3 * width)(split(y)), 3, axis=-1)
+        keep = 1 - nn.sigmoid(join(gate) - 1)
+        return (1 - keep) * jnp.tanh(nn.sigmoid(join(reset)) * join(candidate)) + keep * latent.deter
+
+
+# ---- categorical latents -----------------------------------------------------------------------
+
+
+def log_probs(logits: jax.Array) -> jax.Array:
+    """Of `logits` [..., classes], with 1% of the uniform distribution mixed in."""
+    p = jax.nn.softmax(logits)
+    return jnp.log((1 - UNIFORM) * p + UNIFORM / logits.shape[-1])
+
+
+def draw(log_p: jax.Array, key: jax.Array | None) -> jax.Array:
+    """One-hot draws from `log_p` [..., latents, classes], or the likeliest classes where `key` is None:
+    float [..., latents classes], with the gradient of the probabilities."""
+    found = log_p.argmax(-1) if key is None else jax.random.categorical(key, log_p)
+    p = jnp.exp(log_p)
+    z = jax.nn.one_hot(found, p.shape[-1]) + p - jax.lax.stop_gradient(p)
+    return z.reshape(*z.shape[:-2], -1)
+
+
+def kl(p: jax.Array, q: jax.Array) -> jax.Array:
+    """KL(p || q), float [...], in nats, of log probabilities [..., latents, classes]."""
+    return (jnp.exp(p) * (p - q)).sum((-2, -1))
+
+
+# ---- the world model ---------------------------------------------------------------------------
+
+
+class VectorEncoder(nn.Module):
+    """Observations [..., O] -> what the posterior sees of them, [..., units]. Large numbers are
+    squeezed by symlog."""
+
+    size: Size
+
+    @nn.compact
+    def __call__(self, obs: jax.Array) -> jax.Array:
+        x = symlog(obs)
+        for _ in range(self.size.layers):
+            x = Hidden(self.size.units)(x)
+        return x
+
+
+class VectorDecoder(nn.Module):
+    """Features [..., F] -> symlog of the observation, [..., O]."""
+
+    size: Size
+    obs_size: int
+
+    @nn.compact
+    def __call__(self, features: jax.Array) -> jax.Array:
+        return Head(self.size.layers, self.size.units, self.obs_size)(features)
+
+    def loss(self, decoded: jax.Array, obs: jax.Array) -> jax.Array:
+        """The squared error of what `__call__` gave, summed over the observation: float [...]."""
+        return ((decoded - symlog(obs)) ** 2).sum(-1)
+
+
+class WorldModel(nn.Module):
+    """The model with its heads. Axes in front of those of one step are free.
+
+    encoder: observation -> float [..., E].
+    decoder: features -> what it makes of them; `decoder.loss(that, obs)` -> float [...].
+    heads: name -> how many numbers it gives.
+    """
+
+    size: Size
+    encoder: nn.Module
+    decoder: nn.Module
+    heads: tuple[tuple[str, int], ...]
+
+    def setup(self) -> None:
+        z = self.size.latents * self.size.classes
+        self.memory = Memory(self.size)
+        self.before = Head(2, self.size.hidden, z)
+        self.after = Head(1, self.size.hidden, z)
+        self.readers = {name: Head(1, self.size.units, out, scale=0.0) for name, out in self.heads}
+
+    def embed(self, obs: Any) -> jax.Array:
+        return self.encoder(obs)
+
+    def observe(
+        self, latent: Latent, action: jax.Array, embedded: jax.Array, key: jax.Array | None
+    ) -> tuple[Latent, Beliefs]:
+        """The latent of an observation that came of `action` from `latent`. `key` None takes the
+        likeliest one."""
+        h = self.memory(latent, within(action))
+        prior = self._beliefs(self.before, h)
+        posterior = self._beliefs(self.after, jnp.concatenate([h, embedded], -1))
+        return Latent(h, draw(posterior, key)), Beliefs(prior, posterior)
+
+    def imagine(self, latent: Latent, action: jax.Array, key: jax.Array) -> Latent:
+        """A latent that may come of `action` from `latent`."""
+        h = self.memory(latent, within(action))
+        return Latent(h, draw(self._beliefs(self.before, h), key))
+
+    def decode(self, features: jax.Array) -> Any:
+        return self.decoder(features)
+
+    def read(self, features: jax.Array) -> dict[str, jax.Array]:
+        """What each head gives, float [..., out]."""
+        return {name: head(features) for name, head in self.readers.items()}
+
+    def everything(self, obs: Any, action: jax.Array) -> Any:
+        """Runs all parts once, which makes their parameters."""
+        latent, _ = self.observe(self.start(), action, self.embed(obs), None)
+        return self.decode(latent.features), self.read(latent.features)
+
+    def start(self) -> Latent:
+        """The latent before the first observation of an episode."""
+        return Latent(jnp.zeros(self.size.deter), jnp.zeros(self.size.latents * self.size.classes))
+
+    def _beliefs(self, head: nn.Module, x: jax.Array) -> jax.Array:
+        logits = head(x)
+        return log_probs(logits.reshape(*logits.shape[:-1], self.size.latents, self.size.classes))
+
+
+def within(action: jax.Array) -> jax.Array:
+    """`action` as environments take it, in [-1, 1]. Its gradient does not vanish at the bounds."""
+    return action / jax.lax.stop_gradient(jnp.maximum(1.0, jnp.abs(action)))

@@ -1,0 +1,59 @@
+"""A run under a shield: resumed, evaluated, and played for a film."""
+
+import json
+import shutil
+
+import jax
+import numpy as np
+import pytest
+from shell import TOY, assert_same_run, typed
+
+from jaxsafe.envs.view import render
+from jaxsafe.run import checkpoint
+from jaxsafe.run.policies import open_run
+
+AMBS = (
+    TOY, "algo=ambs", "num_envs=4", "algo.horizon=8", "algo.learn_every=8", "algo.batch_size=32",
+    "algo.replay_ratio=2", "algo.n_step=3", "algo.replay_size=128", "algo.learning_starts=32",
+    "algo.size=tiny", "algo.imagine_steps=3", "algo.shield_rollouts=4", "algo.shield_horizon=5",
+    "algo.labels=[wall]", "eval_episodes=2", "video=false",
+)  # fmt: skip
+STEPS = 32  # of an update
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    run = tmp_path_factory.mktemp("dreaming") / "run"
+    assert typed("train", *AMBS, f"total_steps={4 * STEPS}", f"run_dir={run}") == 0
+    return run
+
+
+@pytest.mark.slow
+def test_stopped_and_resumed_it_ends_bit_for_bit_as_if_uninterrupted(trained, tmp_path, capsys):
+    run = tmp_path / "run"
+    args = (*AMBS, f"total_steps={4 * STEPS}", "checkpoint_iterations=2", f"run_dir={run}")
+    assert typed("train", *args) == 0
+    said = capsys.readouterr().out
+    assert "shield: overrules from 1 of 4 dreams" in said and "(4 are too few)" in said
+    for kind in ("checkpoints", "policy"):  # as if it had been killed after iteration 2
+        shutil.rmtree(run / kind / "00000004")
+    assert typed("train", *args, "resume=true") == 0
+    assert_same_run(run, trained)
+    carry = checkpoint.load(run / "checkpoints")[0]["stepping.rollout.carry.latent.deter"]
+    assert carry.shape == (1, 4, 32) and carry.any()  # members, environments, memory
+
+
+@pytest.mark.slow
+def test_evaluation_says_what_the_shield_does_and_a_film_has_where(trained):
+    found = json.loads((trained / "evaluation.json").read_text())
+    assert 0 <= found["override rate"]["mean"] <= 1 and found["violations"]["mean"] >= 0
+    assert {"violations, no shield", "return, no shield", "Brier score"} <= found.keys()
+    run = open_run(trained, (TOY,))
+    states, said = render.run_episode(run.one(0).player, jax.random.key(0), 20)
+    assert np.isfinite(states.obs).all() and said["overruled"].shape == (20,)
+
+
+def test_a_label_that_the_environment_does_not_have_is_refused_in_a_line(capsys, tmp_path):
+    args = ("algo.labels=[walls]", "total_steps=64", f"run_dir={tmp_path / 'run'}")
+    assert typed("train", *AMBS, *args) == 2
+    assert "labels: unknown cost 'walls'; did you mean 'wall'?" in capsys.readouterr().err

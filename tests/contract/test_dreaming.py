@@ -1,0 +1,287 @@
+"""What every algorithm with a world model must do, on toys."""
+
+import dataclasses
+import operator
+import os
+import subprocess
+import sys
+from functools import cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from compiling import FAST
+from toys import START, Corridor, Ledge, Lever
+
+from jaxsafe.algos import ALGOS, ambs
+from jaxsafe.config import ConfigError
+from jaxsafe.learn.acting import Player
+from jaxsafe.learn.world_model import WorldModelConfig
+from jaxsafe.types import Env, Shared
+
+NAMES = [name for name, row in ALGOS.items() if issubclass(row.config, WorldModelConfig)]
+TINY: dict[str, Any] = {
+    "num_envs": 4, "horizon": 8, "learn_every": 8, "batch_size": 32, "replay_ratio": 2, "n_step": 3,
+    "replay_size": 4 * 24, "learning_starts": 4 * 10, "size": "tiny", "imagine_steps": 3,
+    "lr_warmup": 1,
+}  # fmt: skip
+# rows whose update is compiled
+COMPILED = ["dreamer_lag", pytest.param("ambs", marks=pytest.mark.slow)]
+
+
+def settings_of(name: str, **settings: Any) -> Any:
+    tiny = TINY | ({"shield_rollouts": 4} if "shield_rollouts" in vars(ALGOS[name].config) else {})
+    return ALGOS[name].config(**tiny | settings)
+
+
+def at(iteration: int, since: int = 0) -> Shared:
+    return Shared(np.int32(iteration), np.int32(since))
+
+
+@cache
+def together(name: str):
+    """Two members: their states at first, and the compiled update, which uses up its argument."""
+    algo, cfg = ALGOS[name].make(Corridor()), settings_of(name)
+    keys = jax.random.split(jax.random.key(3), 2)
+    init = jax.vmap(lambda key: algo.init(key, cfg, START))
+    ts = jax.jit(init, compiler_options=FAST)(keys)
+    update = jax.jit(jax.vmap(algo.update, in_axes=(0, None)), donate_argnums=0)
+    return ts, update.lower(ts, START).compile(FAST)
+
+
+def copy(tree):
+    return jax.tree.map(jnp.copy, tree)
+
+
+def member(tree, i):
+    return jax.tree.map(operator.itemgetter(i), tree)
+
+
+def same(a, b):
+    return [bool((x == y).all()) for x, y in zip(*map(jax.tree.leaves, (a, b)), strict=True)]
+
+
+# ---- every row, by shapes ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("actor_grad", ["reinforce", "backprop"])
+def test_an_update_keeps_the_structure(name, actor_grad):
+    algo, cfg = ALGOS[name].make(Corridor()), settings_of(name, actor_grad=actor_grad)
+    before = jax.eval_shape(lambda: algo.init(jax.random.key(0), cfg, START))
+    after, metrics = jax.eval_shape(algo.update, before, START)
+    assert jax.tree.structure(before) == jax.tree.structure(after)
+    assert jax.tree.leaves(before) == jax.tree.leaves(after)
+    assert all(x.dtype == jnp.float32 and x.shape == () for x in metrics.values())
+    assert {"train/return", "train/cost_estimate", "train/model_kl", "train/nonfinite"} <= {*metrics}
+    assert algo.clocks(cfg) == (32, 2)
+    assert before.normaliser == () and before.replay.obs.shape == (24, 4, 4)
+
+
+def test_a_shield_in_the_simulator_keeps_the_structure_and_sees_the_state():
+    algo, cfg = ALGOS["ambs"].make(Corridor()), settings_of("ambs", shield="true_dynamics")
+    before = jax.eval_shape(lambda: algo.init(jax.random.key(0), cfg, START))
+    after, metrics = jax.eval_shape(algo.update, before, START)
+    assert jax.tree.leaves(before) == jax.tree.leaves(after)
+    assert {"train/overruled", "train/risk"} <= metrics.keys()
+    assert algo.policy.privileged(jax.eval_shape(algo.learned, before))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_published_settings_build(name):
+    algo = ALGOS[name].make(Corridor())
+    for settings in ALGOS[name].published.values():
+        cfg = ALGOS[name].config(**settings)
+        before = jax.eval_shape(lambda key, cfg=cfg: algo.init(key, cfg, START), jax.random.key(0))
+        assert before.params["model"]["params"]["memory"]["BlockDense_0"]["kernel"].shape[0] == 8
+
+
+@pytest.mark.parametrize(
+    "settings, message",
+    [
+        ({"n_step": 4}, r"batch_size=32: expected a multiple of n_step \+ 1 = 5"),
+        ({"batch_size": 24}, "replay_ratio=2.*replay_ratio=3 or batch_size=32"),
+        ({"batch_size": 128, "replay_ratio": 4}, "replay_size=96 holds 24 steps of 4 environments"),
+    ],
+)
+def test_sizes_that_do_not_fit_are_refused(settings, message):
+    algo = ALGOS["dreamer"].make(Corridor())
+    cfg = settings_of("dreamer", **settings)
+    with pytest.raises(ConfigError, match=message):
+        jax.eval_shape(lambda: algo.init(jax.random.key(0), cfg, START))
+
+
+# ---- compiled ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", COMPILED)
+def test_an_update_learns_once_the_warm_up_is_over_and_writes_in_place(name):
+    before, update = together(name)
+    ts = copy(before)
+    for iteration in range(3):
+        ts, metrics = update(ts, at(iteration))
+        assert (metrics["train/nonfinite"] == 0).all()
+        assert (jnp.isnan(metrics["train/critic_loss"]) == (iteration == 0)).all()
+        assert any(same(before.params, ts.params)) or iteration > 0
+    assert not any(same(before.params, ts.params))
+    learned = (ts.params, ts.opt_state, ts.replay)
+    assert all(jnp.isfinite(x).all() for x in jax.tree.leaves(learned))
+    carry = ts.stepping.rollout.carry
+    assert carry.latent.deter.shape == (2, 4, 32) and (carry.latent.deter != 0).any(-1).all()
+    text: Any = update.as_text()
+    shapes = {f"[{','.join(map(str, x.shape))}]" for x in jax.tree.leaves(ts.replay)}
+    made = [line for line in text.splitlines() if any(s in line.partition("(")[0] for s in shapes)]
+    assert any(" dynamic-update-slice(" in line for line in made)
+    assert not any(" copy(" in line for line in made)
+
+
+@pytest.mark.parametrize("name", COMPILED)
+def test_a_member_is_what_it_is_beside_any_other(name):
+    ts, update = together(name)
+    swapped = jax.tree.map(lambda x: x[::-1], ts)
+    here, there = copy(ts), copy(swapped)
+    for iteration in range(3):
+        here, there = update(here, at(iteration))[0], update(there, at(iteration))[0]
+    for x, y in zip(*map(jax.tree.leaves, (here.params, there.params)), strict=True):
+        np.testing.assert_array_equal(x, y[::-1])
+
+
+@pytest.mark.parametrize("name", COMPILED)
+def test_a_resumed_run_acts_by_its_policy_while_it_refills(name):
+    ts, update = together(name)
+    fresh, _ = update(copy(ts), at(0))
+    again, metrics = update(copy(ts), at(40, since=40))
+    assert (fresh.stepping.rollout.carry.action == 0).all()  # at random, by no policy
+    assert (again.stepping.rollout.carry.action != 0).all()
+    assert all(same(ts.params, again.params)) and jnp.isnan(metrics["train/critic_loss"]).all()
+    later, metrics = update(again, at(41, since=40))
+    assert not any(same(ts.params, later.params)) and jnp.isfinite(metrics["train/critic_loss"]).all()
+
+
+@pytest.mark.parametrize("name", COMPILED)
+def test_a_world_that_is_not_finite_costs_the_others_nothing_and_is_counted(name):
+    ts, update = together(name)
+    rollout = ts.stepping.rollout
+    state = dataclasses.replace(
+        rollout.state,
+        physics=rollout.state.physics.at[0, 0].set(jnp.nan),
+        obs=rollout.state.obs.at[0, 0].set(jnp.nan),
+    )
+    stepping = dataclasses.replace(ts.stepping, rollout=dataclasses.replace(rollout, state=state))
+    ts, lost = copy(dataclasses.replace(ts, stepping=stepping)), jnp.zeros(2)
+    for iteration in range(4):
+        ts, metrics = update(ts, at(iteration))
+        assert metrics["train/bad_worlds"].tolist() == [iteration == 0, 0]  # it is reset
+        lost += metrics["train/nonfinite"]
+    assert lost[0] > 0 and lost[1] == 0
+    assert all(jnp.isfinite(x).all() for x in jax.tree.leaves((ts.params, ts.opt_state)))
+
+
+@pytest.mark.parametrize("name", COMPILED)
+def test_the_mean_action_needs_no_key_and_draws_are_spread_about_it(name):
+    algo, ts = ALGOS[name].make(Corridor()), member(together(name)[0], 0)
+    learned = algo.learned(ts)
+    player = Player(algo.policy, learned, algo.task(learned))
+    state = Corridor().reset(jax.random.key(0))
+    act = jax.jit(player.act, compiler_options=FAST)
+    mean, carry = act(player.begin(), state)
+    assert mean.shape == (2,) and (jnp.abs(mean) < 1).all()
+    np.testing.assert_array_equal(mean, act(player.begin(), state)[0])
+    np.testing.assert_array_equal(mean, carry.action)
+    assert (act(carry, state)[0] != mean).any()  # it remembers
+    drawn = jax.vmap(lambda key: player.act(player.begin(), state, key)[0])
+    keys = jax.random.split(jax.random.key(1), 500)
+    draws = jax.jit(drawn, compiler_options=FAST)(keys)
+    np.testing.assert_allclose(draws.mean(0), mean, atol=0.15)
+    assert draws.std(0).min() > 0.5
+
+
+# ---- learning ------------------------------------------------------------------------------------
+
+LIMIT, BEST = 2.5, 14.375  # cost of an episode of Lever, and the best return within it
+
+
+def trained(name: str, updates: int, env: Env, **settings: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return and cost of an episode, of two seeds, over the last quarter of the updates."""
+    algo, cfg = ALGOS[name].make(env), ALGOS[name].config(**{**ALGOS[name].lever, **settings})
+
+    def train(key):
+        ts = algo.init(key, cfg, START)
+        return jax.lax.scan(lambda ts, i: algo.update(ts, Shared(i)), ts, jnp.arange(updates))[1]
+
+    keys = jax.random.split(jax.random.key(0), 2)
+    metrics = jax.jit(jax.vmap(train), compiler_options=FAST)(keys)
+    late = -(updates // 4)
+    ret, cost = (np.asarray(metrics[f"train/{k}"])[:, late:].mean(1) for k in ("return", "cost"))
+    return ret, cost
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("actor_grad", ["reinforce", "backprop"])
+def test_without_a_constraint_all_the_reward_is_taken_and_the_cost_paid(actor_grad):
+    """20 and 10 at best, 12.5 and 5 by chance."""
+    ret, cost = trained("dreamer", 100, Lever(), actor_grad=actor_grad)
+    assert (ret > 18).all() and (cost > 7).all()
+
+
+@pytest.mark.slow
+def test_the_multiplier_holds_the_limit_on_average():
+    """As far as dreams tell: they are held under it, not the episodes."""
+    ret, cost = trained("dreamer_lag", 160, Lever(), cost_limit=LIMIT)
+    assert (cost < LIMIT * 1.25).all()
+    assert (ret > 0.85 * BEST).all()
+
+
+@pytest.mark.slow
+def test_a_shield_keeps_from_a_ledge_that_dreamer_goes_beyond():
+    """8.9 to earn with 9 violations in an episode, 4.8 without."""
+    ret, cost = trained("dreamer", 30, Ledge(), discount=0.9, imagine_steps=6)
+    assert (ret > 8).all() and (cost > 8).all()
+    ret, cost = trained("ambs", 60, Ledge(), **ambs.LEDGE)
+    assert (ret > 3).all() and (cost < 0.3).all()
+
+
+# ---- devices -------------------------------------------------------------------------------------
+
+DEVICES = """
+import sys; sys.path.insert(0, sys.argv[1])
+import jax, jax.numpy as jnp, numpy as np
+from jax.sharding import AxisType, PartitionSpec as P
+from compiling import FAST
+from toys import Corridor
+sys.path.insert(0, sys.argv[1] + "/contract")
+from test_dreaming import ALGOS, START, at, settings_of
+
+mesh = jax.make_mesh((2,), ("devices",), axis_types=(AxisType.Auto,))
+def split(fn):
+    def one(x, iteration):
+        return jax.tree.map(lambda y: y[None], fn(jax.tree.map(lambda y: y[0], x), iteration))
+    spec = P("devices")
+    sharded = jax.shard_map(one, mesh=mesh, in_specs=(spec, P()), out_specs=spec, check_vma=False)
+    return jax.jit(sharded, compiler_options=FAST)
+
+for name in sys.argv[2:]:
+    algo, cfg = ALGOS[name].make(Corridor(), "devices"), settings_of(name)
+    keys = jnp.stack([jax.random.key(0)] * 2)
+    ts = split(lambda key, shared: algo.init(key, cfg, shared))(keys, START)
+    update = split(algo.update)
+    for i in range(4):
+        ts, metrics = update(ts, at(i))
+        for x in jax.tree.leaves((ts.params, ts.opt_state, ts.lost_time, metrics)):
+            np.testing.assert_array_equal(x[0], x[1])  # the devices agree
+    rings = np.asarray(ts.replay.obs)
+    assert rings.shape[2] == 4 and (rings[0] != rings[1]).any()  # each with a ring of its own
+    print(name, "ok")
+"""
+
+
+@pytest.mark.slow
+def test_two_devices_keep_the_same_parameters():
+    env = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
+    here = os.path.dirname(os.path.dirname(__file__))
+    command = [sys.executable, "-c", DEVICES, here, "ambs"]
+    out = subprocess.run(command, env=env, capture_output=True, text=True)
+    assert out.returncode == 0, out.stderr[-3000:]
+    assert out.stdout.split() == ["ambs", "ok"]

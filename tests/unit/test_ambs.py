@@ -1,0 +1,328 @@
+"""The shield by hand: what a dream counts for, what is learned of it, and where it overrules."""
+
+import dataclasses
+from functools import partial
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+from compiling import FAST
+from toys import START, Corridor, Ledge
+
+from jaxsafe.algos import ALGOS, ambs
+from jaxsafe.config import ConfigError
+from jaxsafe.learn.acting import Learned, Player
+from jaxsafe.learn.off_policy import act_in_all
+from jaxsafe.learn.world_model import dream, dream_returns
+from jaxsafe.nn.gaussian import Gaussian
+from jaxsafe.nn.rssm import Latent
+
+CFG = ambs.AMBSConfig(discount=1 - 1 / 333)
+
+
+# ---- the bounds --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "eps, confidence, rollouts",
+    [(0.1, 0.05, 185), (0.1, 0.01, 265), (0.09, 0.01, 328), (0.05, 0.01, 1060), (0.02, 0.05, 4612),
+     (0.01, 0.05, 18445)],
+)  # fmt: skip
+def test_the_dreams_that_an_estimate_takes(eps, confidence, rollouts):
+    assert ambs.required_rollouts(eps, confidence) == rollouts
+
+
+def test_one_side_takes_fewer_dreams_and_a_learned_model_four_times_as_many():
+    assert ambs.required_rollouts(0.09, 0.01, one_sided=True) == 285
+    assert ambs.required_rollouts(0.09, 0.01, learned=True) == 1309
+    assert ambs.required_rollouts(0.09, 0.01, one_sided=True, learned=True) == 1138
+    line = ambs.note(CFG)
+    assert "from 6 of 512 dreams" in line and "285 with an exact model (512 are enough)" in line
+    assert "and 1138 with" in line
+    assert "too few" in ambs.note(dataclasses.replace(CFG, shield_rollouts=200))
+
+
+@pytest.mark.parametrize("rollouts, allowed", [(44, 0), (64, 1), (128, 5), (256, 14), (512, 35)])
+def test_the_exact_bound_allows_more_than_hoeffdings(rollouts, allowed):
+    cfg = dataclasses.replace(CFG, rule="binomial", shield_rollouts=rollouts)
+    shares = jnp.arange(rollouts + 1) / rollouts
+    overruled = np.asarray(ambs.overrules(shares, cfg))
+    np.testing.assert_array_equal(overruled, np.arange(rollouts + 1) > allowed)
+    exact = scipy.stats.binom.cdf(np.arange(rollouts + 1), rollouts, cfg.delta) > cfg.confidence
+    np.testing.assert_array_equal(overruled, exact)
+    assert not ambs.overrules(shares, dataclasses.replace(cfg, delta=jnp.inf)).any()
+    assert f"from {allowed + 1} of {rollouts} dreams" in ambs.note(cfg)
+
+
+def test_a_chain_that_is_a_little_off_is_at_most_as_much_off_as_the_bound_says():
+    """|mu - mu'| <= alpha T / 2, where each step is off by alpha in total variation."""
+    rng, steps, alpha = np.random.default_rng(0), 30, 0.02
+    for _ in range(20):
+        chain, other = (rng.dirichlet(np.ones(6), 6) for _ in range(2))
+        shares = alpha / np.abs(other - chain).sum(1, keepdims=True)
+        near = chain + shares * (other - chain)
+        safe = [np.linalg.matrix_power(p[:5, :5], steps).sum(1) for p in (chain, near)]
+        assert np.abs(safe[0] - safe[1]).max() <= alpha * steps / 2
+
+
+# ---- what a dream counts for -------------------------------------------------------------------
+
+
+def one_dream(costs: dict[int, float], value: float = 0.0, ends: int = 99, steps: int = 40) -> bool:
+    """Whether a dream is unsafe that costs so much in these steps, from 1 on, and ends after one."""
+    cost = (
+        jnp.zeros((steps, 1))
+        .at[jnp.array([k - 1 for k in costs] or [0]), 0]
+        .set(jnp.array([*costs.values()] or [0.0]))
+    )
+    alive = (jnp.arange(1, steps + 1) < ends)[:, None]
+    return bool(ambs.unsafe(cost, alive, jnp.array([value]), CFG)[0])
+
+
+def test_a_violation_counts_within_the_horizon_and_not_a_step_later():
+    np.testing.assert_allclose(ambs.threshold(CFG), 9.13725, rtol=1e-5)
+    assert [k for k in range(1, 36) if one_dream({k: 10.0})] == [*range(1, 31)]
+
+
+def test_costs_add_up_and_end_with_the_episode():
+    assert one_dream({1: 3.2, 2: 3.2, 3: 3.2}) and not one_dream({1: 3.0, 2: 3.0, 3: 3.0})
+    assert not one_dream({1: 3.2, 2: 3.2, 3: 3.2}, ends=1)
+    assert one_dream({5: 10.0}, ends=5) and not one_dream({5: 10.0}, ends=4)
+    assert not one_dream({})
+
+
+def test_the_critics_stand_for_the_steps_that_are_not_dreamed():
+    """V counts from 10 discount^30 / discount^15 = 9.5589 on."""
+    assert one_dream({}, value=9.56, steps=15) and not one_dream({}, value=9.558, steps=15)
+
+
+def test_six_of_512_unsafe_dreams_overrule_and_five_do_not():
+    overruled = ambs.overrules(jnp.array([5, 6]) / 512, jax.tree.map(jnp.float32, CFG))
+    assert overruled.tolist() == [False, True]
+
+
+def test_the_value_of_costs_ends_with_the_first_violation():
+    """C at step 1, and nothing of what comes after: the target is C."""
+    cost, value = jnp.array([[0.0], [10.0], [10.0]]), jnp.full((3, 1), 7.0)
+    safe = jnp.array([[1.0], [0.0], [0.0]])
+    until = dream_returns(cost, value, safe, discount=CFG.discount, decay=CFG.td_lambda)
+    np.testing.assert_array_equal(until, [[10.0], [10.0]])
+
+
+def test_labels_say_which_costs_are_violations():
+    costs = jnp.array([[0.0, 0.0], [2.0, 0.0], [0.0, 1.0]])
+    rows: Any = SimpleNamespace(cost=costs.sum(-1), costs=costs)
+    env = Corridor(cost_names=("wall", "floor"))
+    labelled = partial(dataclasses.replace, CFG)
+    assert ambs.violated(env, rows, CFG).tolist() == [False, True, True]
+    assert ambs.violated(env, rows, labelled(labels=("floor",))).tolist() == [False, False, True]
+    both = ambs.targets(env, rows, labelled(labels=("floor", "wall")))
+    np.testing.assert_array_equal(both["cost"], [0, 10, 10])
+    np.testing.assert_array_equal(both["safe"], [1, 0, 0])
+    with pytest.raises(ConfigError, match="labels: unknown cost 'wal'; did you mean 'wall'"):
+        ambs.violated(env, rows, labelled(labels=("wal",)))
+
+
+# ---- the penalties -----------------------------------------------------------------------------
+
+
+def advantages(key: jax.Array, shape: tuple[int, ...] = (4, 3)) -> ambs.Advantages:
+    keys, states = jax.random.split(key, 5), (shape[0] + 1, *shape[1:])
+    shapes = (shape, shape, states, states, shape)
+    return ambs.Advantages(*(jax.random.normal(k, s) for k, s in zip(keys, shapes, strict=True)))
+
+
+def test_the_weights_by_hand():
+    """Of an advantage of 1, at changes of V_safe - c by 0, -1, 3 and -50, and sums of costs."""
+    ones, zero = jnp.ones((4, 1)), jnp.zeros((4, 1))
+    value = jnp.array([[0.0], [0.0], [-1.0], [2.0], [2.0]])
+    cost = jnp.array([[9.0], [0.0], [0.0], [0.0], [50.0]])
+    returns_c = jnp.array([[0.0], [9.13725], [10.0], [5.0]])
+    found = ambs.Advantages(ones, zero, cost, value, returns_c)
+    got = {name: ambs.penalised(found, dataclasses.replace(CFG, penalty=name))[:, 0] for name in NAMES}
+    np.testing.assert_allclose(got["plpg"], [1, np.exp(-1), 1, 1e-6], rtol=1e-5)
+    np.testing.assert_allclose(got["copt"], [1, 0.5, 1.8e-4, 1], atol=1e-4)
+    np.testing.assert_array_equal(got["penl"], [1, 1, 1, 1])
+
+
+NAMES = ("penl", "plpg", "copt", "none")
+
+
+def test_without_a_weight_penl_is_dreamer():
+    found = advantages(jax.random.key(0))
+    for name in ("penl", "none"):
+        cfg = dataclasses.replace(CFG, penalty=name, penalty_coef=0.0)
+        np.testing.assert_array_equal(ambs.penalised(found, cfg), found.reward)
+    cfg = dataclasses.replace(CFG, penalty="none", penalty_coef=5.0)
+    np.testing.assert_array_equal(ambs.penalised(found, cfg), found.reward)
+
+
+class Slope:
+    """A smooth model: a state rolls on by the action; it earns x and costs x^2."""
+
+    def apply(self, params: Any, *args: Any, method: str) -> Any:
+        return getattr(self, method)(*args)
+
+    def imagine(self, latent, action, key):
+        return Latent(0.9 * latent.deter + 0.3 * action, latent.stoch)
+
+    def read(self, features):
+        return {"cont": jnp.ones((*features.shape[:-1], 1)), "cost": features[..., :1] ** 2}
+
+
+@pytest.mark.parametrize("penalty", ["penl", "plpg", "copt"])
+def test_the_gradients_of_the_penalties_are_those_of_finite_differences(penalty):
+    """Of an actor's two numbers, through a dream of five steps. copt's factor has none: it is kept. The
+    actor does not look at the state, whose own gradient stops before an actor, as in the authors' code.
+    """
+    cfg = dataclasses.replace(CFG, penalty=penalty, imagine_steps=5, actor_grad="backprop", kappa=1.0)
+    start = Latent(jnp.array([[0.2], [-0.4], [0.7]]), jnp.zeros((3, 1)))
+    world: Any = Slope()
+
+    def actor(params, features):
+        shape = (*features.shape[:-1], 1)
+        return Gaussian(jnp.full(shape, params[0]), jnp.full(shape, params[1]))
+
+    def climbed(params, factor=None):
+        dreams = dream(world, {}, actor, params, start, jnp.ones(3), jax.random.key(0), cfg)
+        x, cost = dreams.features[..., 0], dreams.read["cost"]
+        discounts = {"discount": cfg.discount, "decay": 0.95}
+        cont = jnp.full(x.shape, 0.9)
+        earned = dream_returns(x, jnp.sin(x), cont, **discounts) - jnp.sin(x)[:-1]
+        paid = dream_returns(-cost, jnp.cos(x), cont, **discounts) - jnp.cos(x)[:-1]
+        found = ambs.Advantages(earned, paid, cost, -x, 9 + cost[1:])
+        if factor is not None:  # copt's, without the gradient that it does not have
+            return (factor * found.reward + cfg.penalty_coef * found.penalty).sum(), None
+        kept = 1 - jax.nn.sigmoid(cfg.kappa * (found.returns_c - ambs.threshold(cfg)))
+        return ambs.penalised(found, cfg).sum(), kept
+
+    params = jnp.array([0.5, -0.2])
+    value, factor = climbed(params)
+    grad = jax.grad(lambda p: climbed(p)[0])(params)
+    fixed = factor if penalty == "copt" else None
+    np.testing.assert_allclose(climbed(params, fixed)[0], value, rtol=1e-5)
+    h = 1e-2
+    by_hand = [
+        (climbed(params + h * e, fixed)[0] - climbed(params - h * e, fixed)[0]) / (2 * h)
+        for e in jnp.eye(2)
+    ]
+    assert jnp.abs(grad).min() > 1e-2
+    np.testing.assert_allclose(grad, by_hand, rtol=5e-3, atol=5e-3)
+
+
+# ---- the shield --------------------------------------------------------------------------------
+
+
+class Chain:
+    """States 0 .. 5 in `deter`. A step goes one up with probability `up`, or stays; 5 is unsafe."""
+
+    up = 0.3
+
+    def apply(self, params: Any, *args: Any, method: str) -> Any:
+        return getattr(self, method)(*args)
+
+    def imagine(self, latent, action, key):
+        goes = jax.random.bernoulli(key, self.up, latent.deter.shape)
+        return Latent(jnp.minimum(latent.deter + goes, 5), latent.stoch)
+
+    def exact(self, state: int, steps: int) -> float:
+        """The probability that 5 is reached within so many steps."""
+        safe = (1 - self.up) * np.eye(5) + self.up * np.eye(5, k=1)
+        return 1 - np.linalg.matrix_power(safe, steps)[state].sum()
+
+
+def test_on_a_known_chain_it_overrules_where_the_bound_says(monkeypatch):
+    """With eps for the error of 512 dreams: always above delta, and never below delta - 2 eps."""
+    chain, cfg = Chain(), dataclasses.replace(CFG, shield_horizon=15, delta=0.8)
+    monkeypatch.setattr(ambs, "world_of", lambda *_: chain)
+    monkeypatch.setattr(ambs, "chosen", lambda *_: jnp.zeros(2))
+    monkeypatch.setattr(ambs, "safety_value", lambda params, features, cfg: jnp.zeros(len(features)))
+    says = lambda world, params, x: {  # noqa: E731
+        "cost": 10.0 * (x[:, 0] == 5), "cont": jnp.ones(len(x))
+    }  # fmt: skip
+    monkeypatch.setattr(ambs, "read", says)
+    learned = Learned(cfg, {"model": ()}, (), ())
+
+    @jax.jit
+    def estimates(state):
+        latent = Latent(jnp.array([state], jnp.float32), jnp.zeros(1))
+        keys = jax.random.split(jax.random.key(0), 200)
+        one = lambda key: ambs.risk(Corridor(), learned, latent, jnp.zeros(2), key)  # noqa: E731
+        return jax.vmap(one)(keys)
+
+    overruled = []
+    for state in range(5):
+        exact, found = chain.exact(state, 15), np.asarray(estimates(state))  # 0.48, 0.70, 0.87, ..
+        assert (np.abs(found - exact) > cfg.eps).mean() <= cfg.confidence
+        overruled.append((found > cfg.delta - cfg.eps).mean())
+    assert overruled[0] == 0 and overruled[2:] == [1, 1, 1]
+    assert 0 < overruled[1] < 1  # between the two bounds it may do either
+
+
+def test_in_the_simulator_it_knows_what_comes(monkeypatch):
+    """Two steps to the right go beyond the ledge, and one does not."""
+    env, algo = Ledge(), ALGOS["ambs"].make(Ledge())
+    cfg = ambs.AMBSConfig(size="tiny", shield="true_dynamics", rule="binomial", shield_rollouts=64)
+    learned = algo.learned(jax.eval_shape(lambda key: algo.init(key, cfg, START), jax.random.key(0)))
+    assert algo.policy.privileged(dataclasses.replace(learned, config=cfg))
+    monkeypatch.setattr(ambs, "chosen", lambda *_: jnp.ones(1))
+    monkeypatch.setattr(ambs, "seen", lambda *_: Latent(jnp.zeros(1), jnp.zeros(1)))
+    latent, state = Latent(jnp.zeros(1), jnp.zeros(1)), env.reset(jax.random.key(0))
+    for horizon, back, expected in ((1, 1.0, 0.0), (2, 1.0, 1.0), (2, -1.0, 0.0)):
+        of = dataclasses.replace(cfg, shield_horizon=horizon, verify_action=True)
+        known = Learned(of, {}, (), ())
+        p = ambs.true_risk(env, known, latent, jnp.array([back]), state, jax.random.key(1))
+        assert p == expected
+
+
+def test_the_executed_action_is_one_of_the_two_and_is_what_is_remembered():
+    """And an environment's action does not depend on its neighbours."""
+    algo, env = ALGOS["ambs"].make(Corridor()), Corridor()
+    sizes: dict[str, Any] = {"num_envs": 4, "replay_ratio": 32, "shield_rollouts": 4}
+    cfg = ambs.AMBSConfig(**ambs.LEDGE | sizes)
+    init = jax.jit(lambda key: algo.init(key, cfg, START), compiler_options=FAST)
+    learned = algo.learned(init(jax.random.key(0)))
+    state = jax.vmap(env.reset)(jax.random.split(jax.random.key(1), 4))
+
+    @jax.jit
+    def acted(delta, state):
+        at = dataclasses.replace(learned.config, delta=delta, eps=jnp.float32(0))
+        player = Player(algo.policy, dataclasses.replace(learned, config=at), env)
+        carry = jax.tree.map(lambda x: jnp.zeros((4, *x.shape)), player.begin())
+        return act_in_all(player, carry, state, jnp.ones(4, bool), jax.random.key(2))
+
+    task, memory, said = acted(jnp.float32(jnp.inf), state)
+    safe, memory_safe, said_safe = acted(jnp.float32(-1), state)
+    assert not said["overruled"].any() and said_safe["overruled"].all()
+    assert (task != safe).all()
+    np.testing.assert_array_equal(memory.action, task)
+    np.testing.assert_array_equal(memory_safe.action, safe)
+    np.testing.assert_array_equal(memory.latent.features, memory_safe.latent.features)
+    np.testing.assert_array_equal(said["risk"], said_safe["risk"])
+    others = jax.tree.map(lambda x: x.at[1:].set(x[:1]), state.obs)
+    alone = acted(jnp.float32(jnp.inf), dataclasses.replace(state, obs=others))
+    np.testing.assert_array_equal(alone[0][0], task[0])
+    assert (alone[0][1:] != task[1:]).any()
+
+
+# ---- evaluation --------------------------------------------------------------------------------
+
+
+def test_the_brier_score_by_hand():
+    """Six steps, a violation in step 4, a horizon of 2: e = 0 0 1 1, and then nothing is known but of
+    step 5, after which two steps are left."""
+    yes, no = jnp.ones(6, bool), jnp.zeros(6, bool)
+    violation = no.at[3].set(True)
+    risk = jnp.array([0.0, 0.5, 1.0, 0.5, 0.2, 0.9])
+    found = ambs.Course(yes, risk, no, risk, violation, no)
+    errors = [0.0, 0.25, 0.0, 0.25, 0.04]
+    np.testing.assert_allclose(ambs.brier_score(found, 2), np.mean(errors), rtol=1e-6)
+    failed = found._replace(failed=no.at[5].set(True))  # then it is known that no violation follows
+    np.testing.assert_allclose(ambs.brier_score(failed, 2), np.mean([*errors, 0.81]), rtol=1e-6)
+    short = found._replace(alive=yes.at[4:].set(False))
+    np.testing.assert_allclose(ambs.brier_score(short, 2), np.mean(errors[:4]), rtol=1e-6)
+    assert jnp.isnan(ambs.brier_score(found._replace(violation=no), 9))

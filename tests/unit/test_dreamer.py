@@ -1,0 +1,46 @@
+"""Dreamer's losses by hand, and the augmented Lagrangian."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from toys import Corridor
+
+from jaxsafe.algos import dreamer
+
+CFG = dreamer.DreamerLagConfig()
+
+
+def test_the_multiplier_rises_by_the_violation_from_the_second_step_on():
+    """lam_0 + mu_0 + n, where every step violates by 1; and it falls to 0, no further."""
+    dual = dreamer.Augmented(jnp.float32(0.01), jnp.float32(5e-9))
+    for n in range(5):
+        dual = dual.raised(jnp.float32(1.0), CFG)
+        np.testing.assert_allclose(dual.lam, 0.01 + n, rtol=1e-5)
+        np.testing.assert_allclose(dual.mu, 1 + 1e-6 * n, rtol=1e-6)
+    for _ in range(5):
+        dual = dual.raised(jnp.float32(-1.5), CFG)
+    assert dual.lam == 0
+    paper = dataclasses.replace(CFG, mu_least=0.0, mu_growth=0.5)
+    dual = dreamer.Augmented(jnp.float32(1.0), jnp.float32(2.0)).raised(jnp.float32(0.5), paper)
+    np.testing.assert_allclose(dual, (2.0, 3.0))
+
+
+def test_the_penalty_is_smooth_where_it_ends():
+    dual = dreamer.Augmented(jnp.float32(0.6), jnp.float32(2.0))  # ends at g = -0.3
+    g = jnp.array([-5.0, -0.3, -0.2, 0.0, 1.0])
+    np.testing.assert_allclose(dual.psi(g), [-0.09, -0.09, -0.08, 0.0, 1.6], rtol=1e-5, atol=1e-7)
+    slope = jax.vmap(jax.grad(dual.psi))(g)
+    np.testing.assert_allclose(slope, dual.price(g), atol=1e-6)
+    np.testing.assert_allclose(slope, [0, 0, 0.2, 0.6, 2.6], atol=1e-6)
+    none = dreamer.Augmented(jnp.float32(0.0), jnp.float32(1.0))
+    assert jax.grad(none.psi)(-1e-3) == 0
+
+
+def test_the_limit_of_an_episode_is_that_of_a_steady_stream_of_cost():
+    """2 in 20 steps are 0.1 a step, which come to 0.1 / (1 - 0.75) discounted."""
+    cfg = dataclasses.replace(CFG, cost_limit=2.0, cost_discount=0.75)
+    np.testing.assert_allclose(dreamer.discounted_limit(Corridor(), cfg), 0.4)
+    env = Corridor(episode_length=1000)
+    np.testing.assert_allclose(dreamer.discounted_limit(env, CFG), 1.0, rtol=1e-4)

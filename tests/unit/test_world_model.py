@@ -1,0 +1,337 @@
+"""DreamerV3's parts by hand, and that every number meets the latent it belongs to."""
+
+import dataclasses
+from functools import cache, partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from compiling import FAST
+from toys import START, Corridor, Ticker
+
+from jaxsafe.algos import ALGOS, dreamer
+from jaxsafe.learn import world_model
+from jaxsafe.learn.acting import Player
+from jaxsafe.learn.dreaming import Range, moved
+from jaxsafe.learn.next_step_rollout import collect_records, started
+from jaxsafe.learn.off_policy import act_in_all
+from jaxsafe.learn.replay import Record, Source, Span
+from jaxsafe.learn.rollout import init_rollout
+from jaxsafe.learn.sequences import SequenceBatch, drawn_sequences
+from jaxsafe.nn import rssm, two_hot
+
+THREE: dict[str, Any] = dreamer.LEVER | {"num_envs": 3, "replay_ratio": 16, "stagger": False}
+
+# ---- two-hot -----------------------------------------------------------------------------------
+
+
+def test_a_fixed_value_is_one_hot_and_others_are_mixtures_of_their_neighbours():
+    of_values = two_hot.two_hot(jnp.asarray(two_hot.VALUES))
+    np.testing.assert_array_equal(of_values, np.eye(two_hot.BINS))
+    low, high = two_hot.VALUES[127], two_hot.VALUES[128]  # 0, and e^(20 / 127) - 1
+    np.testing.assert_allclose([low, high], [0, np.expm1(20 / 127)], rtol=1e-6)
+    between = two_hot.two_hot(jnp.asarray(high / 4))
+    np.testing.assert_allclose(between[127:129], [0.75, 0.25], rtol=1e-6)
+    assert (between > 0).sum() == 2
+    np.testing.assert_array_equal(two_hot.two_hot(jnp.array([-1e12, 1e12])).argmax(-1), [0, 254])
+
+
+@pytest.mark.parametrize("x", [0.0, 1e-3, -0.3, 1.0, -17.5, 1e4])
+def test_the_mean_of_a_two_hot_is_the_number(x):
+    logits = jnp.log(two_hot.two_hot(jnp.float32(x)) + 1e-30)
+    np.testing.assert_allclose(two_hot.two_hot_mean(logits), x, rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(two_hot.symexp(two_hot.symlog(jnp.float32(x))), x, rtol=1e-5)
+
+
+def test_equal_logits_are_exactly_0_and_cost_the_logarithm_of_their_number():
+    logits = jnp.full((3, two_hot.BINS), 0.7)
+    assert (two_hot.two_hot_mean(logits) == 0).all()
+    loss = two_hot.two_hot_loss(logits, jnp.array([0.0, 2.5, -900.0]))
+    np.testing.assert_allclose(loss, np.log(two_hot.BINS), rtol=1e-6)
+
+
+def test_symlog_by_hand():
+    x = jnp.array([0.0, np.e - 1, 1 - np.e, np.e**3 - 1])
+    np.testing.assert_allclose(two_hot.symlog(x), [0, 1, -1, 3], rtol=1e-6)
+
+
+# ---- latents -----------------------------------------------------------------------------------
+
+
+def test_a_hundredth_of_each_draw_is_uniform():
+    log_p = rssm.log_probs(jnp.array([[100.0, 0.0, 0.0, 0.0]]))
+    np.testing.assert_allclose(jnp.exp(log_p), [[0.9925, 0.0025, 0.0025, 0.0025]], rtol=1e-5)
+
+
+def test_a_draw_is_one_hot_and_has_the_gradient_of_its_probabilities():
+    logits = jax.random.normal(jax.random.key(0), (5, 3, 4))
+    weight = jax.random.normal(jax.random.key(1), (5, 12))
+
+    def drawn(logits):
+        return (weight * rssm.draw(rssm.log_probs(logits), jax.random.key(2))).sum()
+
+    def expected(logits):
+        return (weight * jnp.exp(rssm.log_probs(logits)).reshape(5, 12)).sum()
+
+    z = rssm.draw(rssm.log_probs(logits), jax.random.key(2)).reshape(5, 3, 4)
+    np.testing.assert_allclose(np.sort(z, -1)[..., -1], 1, rtol=1e-6)
+    np.testing.assert_allclose(z.sum(-1), 1, rtol=1e-6)
+    np.testing.assert_allclose(jax.grad(drawn)(logits), jax.grad(expected)(logits), atol=1e-6)
+    likeliest = rssm.draw(rssm.log_probs(logits), None).reshape(5, 3, 4)
+    np.testing.assert_array_equal(likeliest.argmax(-1), logits.argmax(-1))
+
+
+def test_the_divergence_of_latents_is_summed_over_them():
+    p, q = jnp.log(jnp.array([[0.5, 0.5], [0.9, 0.1]])), jnp.log(jnp.array([[0.25, 0.75], [0.9, 0.1]]))
+    np.testing.assert_allclose(rssm.kl(p, q), 0.5 * np.log(2) + 0.5 * np.log(2 / 3), rtol=1e-5)
+    assert rssm.kl(p, p) == 0
+
+
+# ---- returns, percentiles, steps ---------------------------------------------------------------
+
+
+def test_the_returns_of_dreams_by_hand():
+    """R_1 = 3 + .5 * .5 * 6 = 4.5 and R_0 = 2 + .5 * 1 * (.25 * 4 + .75 * 4.5) = 4.1875."""
+    reward, value, cont = ([[9.0], [2.0], [3.0]], [[7.0], [4.0], [6.0]], [[0.1], [1.0], [0.5]])
+    args = (jnp.array(x) for x in (reward, value, cont))
+    got = world_model.dream_returns(*args, discount=0.5, decay=0.75)
+    np.testing.assert_allclose(got, [[4.1875], [4.5]])
+
+
+def test_returns_are_scaled_by_their_running_percentiles_but_never_magnified():
+    returns = jnp.arange(101.0)  # P5 = 5, P95 = 95
+    one = moved(Range(jnp.float32(0), jnp.float32(0)), returns, None)
+    np.testing.assert_allclose(one, [0.05, 0.95], rtol=1e-5)
+    assert one.scale == 1
+    two = moved(one, returns, None)
+    np.testing.assert_allclose(two.scale, 0.9 * (1 + 0.99), rtol=1e-5)
+
+
+def test_only_long_gradients_are_shortened_array_by_array():
+    params = {"a": jnp.array([3.0, 4.0]), "b": jnp.zeros(2)}
+    grads = {"a": jnp.array([0.9, 1.2]), "b": jnp.array([3.0, 4.0])}  # lengths 1.5 and 5
+    clip = world_model.clip_by_share(0.3)
+    got: Any
+    got, _ = clip.update(grads, clip.init(params), params)
+    np.testing.assert_allclose(got["a"], grads["a"], rtol=1e-6)  # just within 0.3 * 5
+    np.testing.assert_allclose(jnp.linalg.norm(got["b"]), 0.3 * 1e-3, rtol=1e-5)
+
+
+def test_steps_rise_to_the_learning_rate_and_forget_the_size_of_gradients():
+    cfg = dreamer.DreamerConfig(lr_warmup=4, clip=1e9)
+    rule = world_model.laprop(0.1, cfg)
+    state, params = rule.init(jnp.ones(2)), jnp.ones(2)
+    for step in range(6):
+        change: Any
+        change, state = rule.update(jnp.array([1e-4, -50.0]), state, params)
+        lr = 0.1 * min(1, (step + 1) / 4)
+        np.testing.assert_allclose(change, [-lr, lr], rtol=1e-4)
+
+
+# ---- what meets what ---------------------------------------------------------------------------
+
+
+class Glass:
+    """A model one can look through: its latent is the observation, what was observed before, and the
+    action in between. It stands for `WorldModel` in `filtered` and in the policy."""
+
+    def apply(self, params: Any, *args: Any, method: str) -> Any:
+        return getattr(self, method)(*args)
+
+    def embed(self, obs):
+        return obs
+
+    def start(self):
+        return rssm.Latent(jnp.zeros(4), jnp.zeros(3))  # name, clock, life before; action; all now
+
+    def observe(self, latent, action, embedded, key):
+        before = jnp.concatenate([latent.stoch, action], -1)
+        nothing = jnp.zeros((*embedded.shape[:-1], 1, 1))
+        return rssm.Latent(before, embedded), rssm.Beliefs(nothing, nothing)
+
+
+GLASS: Any = Glass()
+
+
+@dataclasses.dataclass(frozen=True)
+class Echo(Ticker):
+    """A ticker that earns its name, its clock and the action."""
+
+    def step(self, state, action):
+        after = super().step(state, action)
+        return dataclasses.replace(after, reward=state.obs[0] + 10 * state.obs[1] + action[0])
+
+
+def echoed(latents: rssm.Latent) -> jax.Array:
+    """The reward that a latent of `Glass` foretells."""
+    name, clock, _, action = jnp.moveaxis(latents.deter, -1, 0)
+    return name + 10 * clock + action
+
+
+@cache
+def recorded(env: Any, steps: int) -> Record:
+    """Rows [T, N] of three environments with random actions, of the loop's own rollout."""
+
+    def behave(carry, state, first, key):
+        return jax.random.uniform(key, (3, 1), minval=-1.0), carry, {}
+
+    def play(key):
+        stepping = started(init_rollout(env, key, 3, stagger=False))
+        return collect_records(env, behave, stepping, jax.random.split(key, steps))[1][0]
+
+    return jax.jit(play, compiler_options=FAST)(jax.random.key(1))
+
+
+def test_a_reward_meets_the_latent_of_the_observation_that_it_came_with():
+    """And a reward a step late, an observation a step late or a forgotten start is noticed."""
+    rows = recorded(Echo(episode_length=5, lives=(3, 9)), 24)
+    source = Source(rows, Span(jnp.int32(0), jnp.int32(24)), (), 64 * 8, 7)
+    batch, _ = drawn_sequences(jax.random.key(2), source, None, None)
+    assert batch.rows.first[1:].any() and batch.rows.terminated.any() and batch.rows.truncated.any()
+
+    def worst(rows: Any, **changes: Any) -> jax.Array:
+        """The largest error where there was a step: not in a sequence's first row, nor at a start."""
+        rows = rows.replace(**changes)
+        latents, _ = world_model.filtered(GLASS, {}, rows, None)
+        known = ~batch.rows.first[1:]
+        return jnp.where(known, jnp.abs(echoed(latents)[1:] - rows.reward[1:]), 0).max()
+
+    rows: Any = batch.rows
+    assert worst(rows) < 1e-5
+    assert worst(rows, reward=jnp.roll(rows.reward, -1, axis=0)) > 1
+    assert worst(rows, obs=jnp.roll(rows.obs, 1, axis=0)) > 1
+    assert worst(rows, action=jnp.roll(rows.action, 1, axis=0)) > 0.5
+
+    latents, _ = world_model.filtered(GLASS, {}, rows, None)
+    starts = rows.first.at[0].set(True)
+    assert (latents.deter[starts] == 0).all()  # nothing is remembered
+    forgotten: Any = rows.replace(first=jnp.zeros_like(rows.first))
+    latents, _ = world_model.filtered(GLASS, {}, forgotten, None)
+    assert (jnp.abs(latents.deter[starts]) > 0).any()
+
+    cfg = dreamer.DreamerConfig()
+    cont = world_model.goes_on(rows, cfg)
+    np.testing.assert_array_equal(cont, ~rows.terminated)
+    ends = world_model.goes_on(rows, dataclasses.replace(cfg, limit_ends=True))
+    np.testing.assert_array_equal(ends, ~rows.last)
+
+
+def test_the_policy_remembers_what_the_model_learns_from():
+    """Acting through episodes and their ends, and going through the rows, give the same latents."""
+    env = Ticker(episode_length=5, lives=(3, 9))
+    algo, cfg = ALGOS["dreamer"].make(env), dreamer.DreamerConfig(**THREE)
+    ts = jax.jit(lambda key: algo.init(key, cfg, START), compiler_options=FAST)(jax.random.key(0))
+    learned = algo.learned(ts)
+    player = Player(algo.policy, learned, env)
+    act = lambda learned, carry, obs, key: algo.policy.act(learned, carry, obs, None)  # noqa: E731
+    likeliest = player._replace(policy=algo.policy._replace(act=act))
+
+    @jax.jit
+    def both(stepping, keys):
+        def behave(carry, state, first, key):
+            return act_in_all(likeliest, carry, state, first, key)
+
+        def step(stepping, key):
+            stepping, (rows, _) = collect_records(env, behave, stepping, key[None])
+            row = jax.tree.map(lambda x: x[0], rows)
+            return stepping, (row, stepping.rollout.carry.latent)
+
+        return jax.lax.scan(step, stepping, keys)[1]
+
+    rows, acted = both(ts.stepping, jax.random.split(jax.random.key(1), 16))
+    assert rows.first[1:].any()
+    world = world_model.world_of(env, dreamer.blind.all_heads, cfg)
+    latents, _ = world_model.filtered(world, learned.params["model"], rows, None)
+    np.testing.assert_allclose(acted.features, latents.features, atol=1e-5)
+    late = rows.replace(action=jnp.roll(rows.action, 1, axis=0))
+    other, _ = world_model.filtered(world, learned.params["model"], late, None)
+    assert jnp.abs(other.features - latents.features).max() > 1e-3
+
+
+@cache
+def tiny() -> tuple[rssm.WorldModel, Any]:
+    """The smallest model of Ticker, and its parameters."""
+    cfg = dreamer.DreamerConfig(size="tiny")
+    world = world_model.world_of(Ticker(), dreamer.blind.all_heads, cfg)
+    init = jax.jit(partial(world.init, method="everything"), compiler_options=FAST)
+    return world, init(jax.random.key(0), jnp.zeros(3), jnp.zeros(1))
+
+
+def test_a_sequence_that_begins_anew_is_two_sequences():
+    rows = recorded(Ticker(episode_length=5), 12)
+    begins = int(jnp.argmax(rows.first[1:, 0])) + 1
+    world, params = tiny()
+    through = jax.jit(lambda rows: world_model.filtered(world, params, rows, None)[0])
+    whole, alone = through(rows), through(jax.tree.map(lambda x: x[begins:], rows))
+    np.testing.assert_array_equal(whole.features[begins:, 0], alone.features[:, 0])
+
+
+def test_divergences_below_a_nat_are_left_alone():
+    """The prior then has no gradient at all."""
+    rows = recorded(Ticker(episode_length=5), 12)
+    cfg = dreamer.DreamerConfig(size="tiny")
+    world, params = tiny()
+    batch = SequenceBatch(rows, jnp.full(3, 1 / 3))
+
+    def loss(params, free):
+        of = dataclasses.replace(cfg, free_nats=free)
+        return world_model.model_loss(world, params, batch, {}, jax.random.key(1), of)[0]
+
+    grads = jax.jit(jax.grad(loss), compiler_options=FAST)
+    spared, paid = grads(params, 100.0)["params"]["before"], grads(params, 0.0)["params"]["before"]
+    assert all((x == 0).all() for x in jax.tree.leaves(spared))
+    assert any((x != 0).any() for x in jax.tree.leaves(paid))
+
+
+@pytest.mark.slow
+def test_the_model_foresees_a_deterministic_toy():
+    """A point mass: ten steps ahead, unseen, within a quarter of the error of standing still."""
+    env, cfg = Corridor(), dreamer.DreamerConfig(size="tiny", lr_warmup=20, free_nats=0.3)
+    env = dataclasses.replace(env, dt=0.2, half_width=2.0)
+    world = world_model.world_of(env, {"reward": two_hot.BINS}, cfg)
+    rule = world_model.laprop(5e-3, cfg)
+
+    def play(key):  # 16 sequences of 16 rows
+        reset_key, act_key = jax.random.split(key)
+        action = jnp.repeat(jax.random.uniform(act_key, (4, 16, 2), minval=-1.0), 4, axis=0)
+        state = jax.vmap(env.reset)(jax.random.split(reset_key, 16))
+        step = lambda s, a: (jax.vmap(env.step)(s, a), (s.obs, s.reward))  # noqa: E731
+        obs, reward = jax.lax.scan(step, state, action)[1]
+        no = jnp.zeros((16, 16), bool)
+        return Record(obs, action, reward, reward, reward[..., None], no, no, no)
+
+    def improve(now, key):
+        params, opt_state = now
+        rows = play(key)
+        batch = SequenceBatch(rows, jnp.full(16, 1 / 16))
+        loss = lambda params: world_model.model_loss(  # noqa: E731
+            world, params, batch, {"reward": rows.reward}, key, cfg
+        )
+        grads = jax.grad(loss, has_aux=True)(params)[0]
+        change, opt_state = rule.update(grads, opt_state, params)
+        return (optax.apply_updates(params, change), opt_state), None
+
+    @jax.jit
+    def trained(key):
+        begin = world.init(key, jnp.zeros(4), jnp.zeros(2), method="everything")
+        end: Any = jax.lax.scan(improve, (begin, rule.init(begin)), jax.random.split(key, 900))[0]
+        params = end[0]
+        rows = play(jax.random.key(9))
+        latents, _ = world_model.filtered(world, params, rows, None)
+        seen = jax.tree.map(lambda x: x[5], latents)
+
+        def blind(latent, x):
+            after: Any = world.apply(params, latent, *x, method="imagine")
+            decoded: Any = world.apply(params, after.features, method="decode")
+            return after, two_hot.symexp(decoded)
+
+        keys = jax.random.split(jax.random.key(3), 10)
+        foreseen = jax.lax.scan(blind, seen, (rows.action[5:15], keys))[1]
+        return foreseen, rows.obs[6:16], rows.obs[5]
+
+    foreseen, came, stood = trained.lower(jax.random.key(0)).compile(FAST)(jax.random.key(0))
+    error, still = (jnp.sqrt(((x - came) ** 2).mean((1, 2))) for x in (foreseen, stood))
+    assert error[-1] < 0.25 * still[-1], (error, still)
