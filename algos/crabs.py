@@ -1,7 +1,7 @@
 """CRABS: soft actor-critic within a set of states that a learned certificate finds safe."""
 
 import math
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -107,6 +107,9 @@ class CRABSConfig(EnsembleConfig, CertificateConfig, sac.SACConfig):
     networks are small, and so are the searches. `preset=published` has the sizes of the code.
     """
 
+    TAKES_PICTURES: ClassVar = False
+
+    encoder: Literal["none"] = "none"  # There are no pictures: the models learn vectors.
     # Environments side by side, of all devices together. The paper has 1.
     num_envs: Amount = 12
     horizon: Amount = 40  # Steps of each environment in an update. Four updates have those of a refit.

@@ -101,20 +101,20 @@ def options_of(args: argparse.Namespace) -> dict[str, Any]:
     return {"engine": args.engine, **awake, **vision}
 
 
-def measure(name: str, num_envs: int | None, args: argparse.Namespace) -> dict:
-    """A row; without `num_envs` those of the algorithm, or 256."""
+def measure(name: str, wanted: int | None, args: argparse.Namespace) -> dict:
+    """A row, of so many environments as are `wanted`, or as the algorithm has, or 256."""
     env, warmup = envs.make(name, **options_of(args)), args.warmup
     if args.algo:
         config: Any = algos.ALGOS[args.algo].config
-        sees = args.vision and issubclass(config, EncoderConfig)
-        given = {"num_envs": num_envs, "horizon": args.horizon, "encoder": "cnn" if sees else None}
+        sees = args.vision and issubclass(algos.ALGOS[args.algo].config, EncoderConfig)
+        given = {"num_envs": wanted, "horizon": args.horizon, "encoder": "cnn" if sees else None}
         cfg = config(**{k: v for k, v in given.items() if v})
         num_envs, horizon = cfg.num_envs, cfg.horizon
         if isinstance(cfg, ReplayConfig):  # until then it only fills its replay
             warmup = max(warmup, -(-cfg.learning_starts // num_envs) + horizon)
         state, fn = training(env, args.algo, cfg, args.seeds, args.devices)
     else:
-        num_envs, horizon = num_envs or 256, args.horizon or 100
+        num_envs, horizon = wanted or 256, args.horizon or 100
         state, fn = stepping(env, num_envs, args.seeds, horizon)
     before = max(1, -(-warmup // horizon))
     compile_time, runs = timed(fn, state, before=before, repeats=args.repeats)
