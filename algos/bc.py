@@ -12,6 +12,7 @@ from jaxsafe.config import Bounds, ConfigError, Units, Weight, config
 from jaxsafe.learn.acting import Learned
 from jaxsafe.learn.conventions import Convention
 from jaxsafe.learn.learner import GradientStep, Learner
+from jaxsafe.learn.observations import EncoderConfig, blank, observation_like
 from jaxsafe.learn.offline import (
     DataSet,
     Draw,
@@ -30,7 +31,7 @@ from jaxsafe.types import Algorithm, Env, Metrics, PyTree
 
 
 @config
-class BCConfig(OfflineConfig):
+class BCConfig(EncoderConfig, OfflineConfig):
     """BC: behaviour cloning, which imitates a data set and is blind to cost.
 
         minimise_theta  E_{(s, a) in data}[ |mu_theta(s) - a|^2 ],    mu_theta(s) = tanh(f_theta(s))
@@ -98,17 +99,17 @@ class VAEBCConfig(VAEConfig, OfflineConfig):
 # ---- regression ----------------------------------------------------------------------------------
 
 
-def init(key: jax.Array, obs_size: int, action_size: int, cfg: Any) -> Trainable:
-    actor = coarse_mlp(cfg, action_size).init(key, jnp.zeros(obs_size))
-    return Trainable({"actor": actor}, {"actor": adam(cfg.lr, cfg).init(actor)})
+def learner(env: Env) -> Learner:
+    def init(key: jax.Array, obs_size: int, action_size: int, cfg: Any) -> Trainable:
+        obs = blank(observation_like(env)) if cfg.encoder == "cnn" else jnp.zeros(obs_size)
+        actor = coarse_mlp(cfg, action_size).init(key, obs)
+        return Trainable({"actor": actor}, {"actor": adam(cfg.lr, cfg).init(actor)})
 
-
-def learner(action_size: int) -> Learner:
-    def mu(actor: PyTree, obs: jax.Array, cfg: Any) -> jax.Array:
-        out: Any = coarse_mlp(cfg, action_size).apply(actor, obs)
+    def mu(actor: PyTree, obs: PyTree, cfg: Any) -> jax.Array:
+        out: Any = coarse_mlp(cfg, env.action_size).apply(actor, obs)
         return jnp.tanh(out)
 
-    def act(learned: Learned, obs: jax.Array, key: jax.Array | None) -> jax.Array:
+    def act(learned: Learned, obs: PyTree, key: jax.Array | None) -> jax.Array:
         return mu(learned.params["actor"], obs, learned.config)
 
     def step(
@@ -162,9 +163,9 @@ def vae_loss(vae: PyTree, batch: Transitions, key: jax.Array, cfg: Any) -> tuple
     return error + cfg.kl_weight * divergence, metrics
 
 
-def autoencoder(action_size: int) -> Learner:
+def autoencoder(env: Env) -> Learner:
     def act(learned: Learned, obs: jax.Array, key: jax.Array | None) -> jax.Array:
-        shape, cfg = (*obs.shape[:-1], 2 * action_size), learned.config
+        shape, cfg = (*obs.shape[:-1], 2 * env.action_size), learned.config
         z = jnp.zeros(shape) if key is None else draw_latent(key, shape, cfg)
         return jnp.clip(decode(learned.params["vae"], obs, z, cfg), -1.0, 1.0)
 
@@ -182,11 +183,11 @@ def autoencoder(action_size: int) -> Learner:
 def make(
     env: Env,
     axis_name: str | None = None,
-    learner_of: Callable[[int], Learner] = learner,
+    learner_of: Callable[[Env], Learner] = learner,
     draw: Draw = anywhere,
 ) -> Algorithm:
     """`axis_name` splits nothing here: there are no environments."""
-    return offline(env, learner_of(env.action_size), draw=draw)
+    return offline(env, learner_of(env), draw=draw)
 
 
 # OmniSafe @15603dd, configs/offline: common to all; an iteration is ours

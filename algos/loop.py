@@ -2,7 +2,7 @@
 
 import math
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -54,6 +54,9 @@ class LOOPConfig(ModelBasedConfig, sac.SACConfig):
     action.
     """
 
+    TAKES_PICTURES: ClassVar = False
+
+    encoder: Literal["none"] = "none"  # There are no pictures: the model learns vectors.
     # Environments side by side, of all devices together. OmniSafe has 1.
     num_envs: Amount = 64
     horizon: Amount = 10  # Steps of each environment in an update. Two updates have those of a refit.

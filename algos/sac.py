@@ -164,7 +164,8 @@ NAVIGATION: dict[str, Any] = OMNISAFE | {"alpha_init": 1e-5, "lr": 5e-6, "critic
 PARALLEL: dict[str, Any] = {"num_envs": 64, "replay_ratio": 256, "batch_size": 4096, "tau": 0.005}
 # A price that OmniSafe moves at every step by 1e-5 moves by 0.2 in 20,000 steps; likewise the others.
 LAG: dict[str, Any] = {
-    "dual_starts": 200_000, "dual_lr": 0.2, "dual_damping": 0.0, "cost_reduce": "one",
+    "dual_starts": 200_000, "dual_lr": 0.2, "dual_damping": 0.0, "dual_eps": 1e-8,
+    "cost_reduce": "one",
     "cost_floor": False, "price_unit": "reward", "cost_normalize": True,
 }  # fmt: skip
 LAG_NAVIGATION: dict[str, Any] = LAG | {"dual_lr": 0.01, "lam_init": 0.0, "cost_normalize": False}
@@ -184,7 +185,8 @@ LEVER: dict[str, Any] = {
 }  # fmt: skip
 # Its states are all worth the same, so that Q_r has no deviation to measure prices in.
 LEVER_LAG: dict[str, Any] = {
-    "price_unit": "reward", "dual_every": 2560, "dual_lr": 0.015, "lam_init": 1.3,
+    "price_unit": "reward", "dual_every": 2560, "dual_lr": 0.015, "dual_eps": 1e-8,
+    "lam_init": 1.3,
 }  # fmt: skip
 LEVER_PID: dict[str, Any] = {
     "price_unit": "reward", "dual_every": 2560, "lam_init": 1.2, "pid_kp": 0.2, "pid_ki": 0.03,

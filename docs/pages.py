@@ -20,13 +20,14 @@ from typing import Annotated, Any
 
 from jaxsafe.algos import ALGOS, Row
 from jaxsafe.algos.ambs import AMBSConfig
-from jaxsafe.envs import CarRacing, make
+from jaxsafe.envs import CarRacing, make, pendulum
 from jaxsafe.envs.racing import car as racing_car
 from jaxsafe.envs.racing import task as racing
 from jaxsafe.envs.racing import track as racing_track
 from jaxsafe.envs.safety_gym import suite
 from jaxsafe.envs.velocity import config as velocity_config
 from jaxsafe.envs.velocity import suite as velocities
+from jaxsafe.learn.barrier import BarrierConfig
 from jaxsafe.learn.model_based import ModelBasedConfig
 from jaxsafe.learn.off_policy import OffPolicyConfig
 from jaxsafe.learn.offline import OfflineConfig
@@ -60,6 +61,7 @@ FAMILIES = {  # the pages of docs/theory
     "recorded_data": ("bcq", "bcq_lag", "crr", "ccrr", "coptidice"),
     "planning": ("pets", "cce_pets", "rce_pets", "cap_pets", "loop", "safe_loop"),
     "world_models": ("dreamer", "dreamer_lag", "ambs"),
+    "certificates": ("crabs",),
 }
 PLANNING = " env.observation=coordinates env.wrap.action_repeat=5 algo.learn_cost=false"
 LOOPS = {  # the first that an algorithm's config is one of
@@ -79,7 +81,8 @@ How families work, step by step: [prices](../theory/prices.md),
 [trust regions](../theory/trust_region.md), [penalties](../theory/penalties.md),
 [budgets in the state](../theory/budgets.md), [values of actions](../theory/actor_critics.md),
 [recorded data](../theory/recorded_data.md), [planning](../theory/planning.md),
-[world models](../theory/world_models.md).
+[world models](../theory/world_models.md),
+[certificates](../theory/certificates.md).
 
 The on-policy algorithms share these options:
 
@@ -128,11 +131,13 @@ ENVIRONMENTS = """# Environments
 
 A name is a robot and a task: `point_goal1`, `car_push2`, `doggo_button1`. Safety Gym's ids, as in
 `Safexp-PointGoal1-v0`, work too. Goal, Button and Push are the suite's 27 tasks. Run, Circle and the
-grids are the original's tests. Vision is not there yet. The six [velocity tasks](velocity.md) are
+grids are the original's tests. [`env.observe_vision=true`](../howto/pixels.md)
+adds what a camera on the robot sees. The six [velocity tasks](velocity.md) are
 Safety-Gymnasium's: `ant_velocity` is `SafetyAntVelocity-v1`. So are
 [`point_circle1`, `point_run0`](../howto/safety_gymnasium.md) and their like. `seditor_point_goal1` and
 its like are [SEditor's tasks](../howto/seditor.md). So are `car_racing0` and `car_racing1`, which are
-[stand-ins](racing.md) for car racing in Box2D.
+[stand-ins](racing.md) for car racing in Box2D. The four [pendulums](pendulum.md), such as
+`pendulum_upright`, are those of CRABS.
 
 Every other option of Safety Gym's Engine is `env.OPTION`.
 [`env.rules`](../howto/safety_gymnasium.md) takes Safety-Gymnasium's rules where they differ.
@@ -229,7 +234,7 @@ python scripts/train.py env=car_racing1 algo=seditor video=false
 ```
 
 There are no pictures of these tasks yet, neither to see nor to learn from. `jaxsafe render` refuses
-them. The version that learns from pixels comes with vision.
+them. The version that learns from pixels is not there.
 
 ## Sizes
 
@@ -271,6 +276,48 @@ Places are in the car's frame, x to the front and y to the left.
 ## Options
 
 {options}
+
+`env.wrap` is [that of every environment](README.md).
+"""
+PENDULUM = """# pendulum
+
+Four tasks in which one unsafe step ends the episode. They are for algorithms that allow no violation at
+all, such as [`crabs`](../algorithms/crabs.md). Their ids in the code of CRABS work, too.
+
+```sh
+python scripts/train.py env=pendulum_upright algo=crabs video=false
+```
+
+## Sizes
+
+{table}
+
+- Episodes always begin at the same state.
+- A safe state has a `barrier` of at most 1. `env.barrier(obs)` gives it. It is 0 in the middle of the
+  safe set, and grows fast outside of it.
+- `pendulum_move` and `pendulum_swing` are one environment: `env.task` and `env.threshold` make them.
+  `env.task=upright` pays for standing still. A run on it makes a safe start for the others.
+- There are no pictures of these tasks.
+
+## The environments
+
+{about}
+
+### `pendulum_upright`, `pendulum_tilt`
+
+{pendulum}
+
+### `pendulum_move`, `pendulum_swing`
+
+{cart}
+
+## Options of `pendulum_upright` and `pendulum_tilt`
+
+{pendulum_options}
+
+## Options of `pendulum_move` and `pendulum_swing`
+
+{cart_options}
 
 `env.wrap` is [that of every environment](README.md).
 """
@@ -379,6 +426,8 @@ def measured(name: str) -> str:
         rows.append(f"| {how} | {ret} | {cost} | {studies.published_cell(run.config, known)} |")
     if not rows and issubclass(ALGOS[name].config, OfflineConfig):
         return "Not run at length yet."
+    if issubclass(ALGOS[name].config, BarrierConfig):
+        return "[Short runs](../theory/certificates.md#short-runs). There is no published table."
     if not rows and issubclass(ALGOS[name].config, AMBSConfig):
         return "Not run at length yet; it keeps away from the ledge of tests/toys.py, Ledge."
     if not rows:
@@ -399,10 +448,11 @@ def page(name: str) -> str:
     module = row.config.__module__.rsplit(".", 1)[1]
     more = " dataset=data.npz" if issubclass(row.config, OfflineConfig) else ""
     more += PLANNING if issubclass(row.config, ModelBasedConfig) else ""
+    task = "pendulum_upright" if issubclass(row.config, BarrierConfig) else "point_goal1"
     return f"""# {title.removesuffix(".")}
 
 ```sh
-python scripts/train.py env=point_goal1 algo={name}{more}
+python scripts/train.py env={task} algo={name}{more}
 ```
 
 {text}
@@ -589,6 +639,31 @@ def racing_page() -> str:
     )
 
 
+def pendulum_page() -> str:
+    made = {name: make(name) for name in pendulum.ROWS}
+    ids = {ours: theirs for theirs, ours in pendulum.ALIASES.items()}
+    pays = ["-angle^2", "-(angle + 0.41)^2", "place^2", "angle^2"]
+    rows = ["| | " + " | ".join(f"`{name}`" for name in made) + " |", "|---|" + "---|" * len(made)]
+    for head, cells in {
+        "id": [f"`{ids[name]}`" for name in made],
+        "reward": pays,
+        "unsafe": [f"angle beyond {env.threshold} rad" for env in made.values()],
+        "or": ["", "", *[f"cart beyond {pendulum.RAIL} m"] * 2],
+        "observation": [str(env.obs_size) for env in made.values()],
+        "steps of an episode": [str(env.episode_length) for env in made.values()],
+    }.items():
+        rows.append(f"| {head} | {' | '.join(cells)} |")
+    kinds = pendulum.Pendulum, pendulum.CartPendulum
+    return PENDULUM.format(
+        table="\n".join(rows),
+        about=prose(pendulum.__doc__ or "")[1],
+        pendulum="\n\n".join(prose(kinds[0].__doc__ or "")),
+        cart="\n\n".join(prose(kinds[1].__doc__ or "")),
+        pendulum_options=settings(kinds[0], "env"),
+        cart_options=settings(kinds[1], "env"),
+    )
+
+
 def algorithms() -> str:
     """The index of the algorithms' pages."""
     lines = [f"| [`{name}`]({name}.md) | {row.summary} |" for name, row in ALGOS.items()]
@@ -610,6 +685,7 @@ def pages() -> dict[Path, str]:
     text = ENVIRONMENTS + "\n".join(lines) + "\n"
     found[HERE / "environments" / "velocity.md"] = velocity_page()
     found[HERE / "environments" / "racing.md"] = racing_page()
+    found[HERE / "environments" / "pendulum.md"] = pendulum_page()
     return found | {HERE / "environments" / "README.md": text}
 
 

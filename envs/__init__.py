@@ -1,5 +1,6 @@
-"""Environments: Safety Gym's, velocity tasks, racing, those that a user registers, and wrappers."""
+"""Environments: Safety Gym's, velocity tasks, racing, pendulums, a user's own, and wrappers."""
 
+from jaxsafe.envs.pendulum import CartPendulum, Pendulum
 from jaxsafe.envs.racing.task import CarRacing
 from jaxsafe.envs.registry import (
     ALIASES,
@@ -22,6 +23,8 @@ __all__ = [
     "ALIASES",
     "ENVS",
     "CarRacing",
+    "CartPendulum",
+    "Pendulum",
     "SafetyGym",
     "SafetyGymConfig",
     "Velocity",

@@ -61,9 +61,20 @@ def check_state(state: Any, env: Env, where: str) -> None:
     }
     found = {field: getattr(state, field) for field in expected if not field.startswith("info")}
     found |= {f"info[{name!r}]": x for name, x in state.info.items()}
+    if isinstance(state.obs, dict):
+        check_picture(state.obs, where)
+        found["obs"] = state.obs["vector"]
     for field, like in expected.items():
         if form(found[field]) != form(like):
             raise ConfigError(f"{where}: {field} is {form(found[field])}, expected {form(like)}")
+
+
+def check_picture(obs: dict[str, Any], where: str) -> None:
+    if obs.keys() != {"vector", "vision"}:
+        raise ConfigError(f"{where}: obs has {', '.join(obs)}, expected vector and vision")
+    vision = obs["vision"]
+    if vision.dtype != jnp.uint8 or vision.ndim != 3:
+        raise ConfigError(f"{where}: obs['vision'] is {form(vision)}, expected uint8[H, W, C]")
 
 
 def form(x: Any) -> str:

@@ -1,4 +1,4 @@
-"""Environments by name: Safety Gym's, the velocity tasks, racing, and those that `register` adds.
+"""Environments by name: Safety Gym's, velocity tasks, racing, pendulums, and what `register` adds.
 
 `make("car_push1")` and `make("Safexp-CarPush1-v0")` are the same environment.
 """
@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import Any, Literal
 
 from jaxsafe.config import ConfigError, convert, from_dict, import_object, nearest, shown
+from jaxsafe.envs import pendulum
 from jaxsafe.envs.check import check_env
 from jaxsafe.envs.engines.choose import ENGINES
 from jaxsafe.envs.racing import task as racing
@@ -26,7 +27,7 @@ SUITE = suite.suite()
 OURS: dict[str, Any] = {**SUITE, **suite.circles_and_runs(), **suite.seditor()}
 # name -> options that differ from Safety Gym's defaults, the config of a velocity task, or a function
 # that makes another environment
-ENVS: dict[str, Any] = {**OURS, **velocities.suite(), **racing.ROWS}
+ENVS: dict[str, Any] = {**OURS, **velocities.suite(), **racing.ROWS, **pendulum.ROWS}
 Config = SafetyGymConfig | VelocityConfig
 PLAIN = (type(None), bool, int, float, str, list, tuple, dict)
 ANY_ENV = "wrap"  # the option that every environment has
@@ -34,7 +35,7 @@ OF_MAKE = ("engine", ANY_ENV)  # options of our environments that are no field o
 ALIASES: dict[str, str] = {suite.alias(name): name for name in SUITE}
 ALIASES |= {suite.their_id(name): name for name in [*suite.circles_and_runs(), *suite.ruled()]}
 ALIASES |= {alias: name for alias, (name, _) in velocities.aliases().items()}
-ALIASES |= racing.ALIASES
+ALIASES |= racing.ALIASES | pendulum.ALIASES
 # options that an alias stands for, beside a name
 IMPLIED: dict[str, dict[str, Any]] = {a: options for a, (_, options) in velocities.aliases().items()}
 IMPLIED |= {suite.their_id(name): {"rules": "safety_gymnasium"} for name in suite.ruled()}

@@ -47,6 +47,11 @@ class Wrapper:
         """See SafetyGym."""
         return getattr(self.env, "observed_cost", None)
 
+    @property
+    def barrier(self) -> Callable[[jax.Array], jax.Array] | None:
+        """At most 1 where an observation is safe, if the environment says: see Pendulum."""
+        return getattr(self.env, "barrier", None)
+
     def reset(self, key: jax.Array) -> State:
         return self.env.reset(key)
 
@@ -142,8 +147,14 @@ class FrameStack(Wrapper):
 
     @property
     def observed_cost(self) -> Callable[[jax.Array], jax.Array] | None:
-        newest = super().observed_cost
-        return None if newest is None else lambda obs: newest(obs[..., : self.env.obs_size])
+        return self.of_newest(super().observed_cost)
+
+    @property
+    def barrier(self) -> Callable[[jax.Array], jax.Array] | None:
+        return self.of_newest(super().barrier)
+
+    def of_newest(self, told: Callable[[jax.Array], jax.Array] | None) -> Any:
+        return None if told is None else lambda obs: told(obs[..., : self.env.obs_size])
 
     def reset(self, key: jax.Array) -> State:
         state = self.env.reset(key)

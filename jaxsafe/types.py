@@ -17,7 +17,8 @@ class State:
     """One environment after a reset or a step. No batch axis: callers `vmap`.
 
     physics: pytree, all that the next step needs, the random key included.
-    obs: float [obs_size], of the state after the step.
+    obs: of the state after the step: float [obs_size], or a dict of that, 'vector', and a picture,
+        'vision', uint8 [height, width, channels].
     reward: float []. Zero after a reset.
     cost: float [], what the learner constrains: the sum over the episode is held under the limit.
     costs: float [K], one entry for each of `env.cost_names`. Safety Gym's `cost` is the indicator
@@ -29,7 +30,7 @@ class State:
     """
 
     physics: PyTree
-    obs: jax.Array
+    obs: Any
     reward: jax.Array
     cost: jax.Array
     costs: jax.Array

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsafe.learn.acting import Player
+from jaxsafe.learn.barrier import interval_barrier
 from jaxsafe.learn.steps import Context
 from jaxsafe.types import Algorithm, Env, Policy, Shared, State
 
@@ -55,6 +56,9 @@ class Corridor:
     action_size: int = 2
     episode_length: int = 20
     cost_names: tuple[str, ...] = ("wall",)
+
+    def barrier(self, obs: jax.Array) -> jax.Array:
+        return interval_barrier(obs[..., 1], self.half_width)
 
     def reset(self, key: jax.Array) -> State:
         position = jax.random.uniform(key, (2,), minval=-0.1, maxval=0.1)
@@ -187,6 +191,43 @@ class Lever:
         noise = 0.5 * jax.random.rademacher(noise_key, (), jnp.float32)
         reward = u[0] * (2 - u[0]) + u[1] + noise
         return State(key, obs, reward, u[0], u[:1], jnp.bool_(False), {})
+
+
+@dataclass(frozen=True)
+class Patch:
+    """A picture with a green patch, at whose column to point, and a red one to keep away from.
+
+    Observation: `vision` uint8 [8, 8, 3] and `vector` [1], the share of the episode that is left.
+    Action [1]: a column, from -1 (left) to 1 (right). Reward: 1 - |a - green|. Cost: 1 if |a - red| is
+    below 0.25.
+    Both are at -0.8, -0.4, 0.4 or 0.8, drawn anew at each step. The best return of an episode of 5
+    steps is 5; without eyes it is 2.
+    """
+
+    obs_size: int = 1
+    action_size: int = 1
+    episode_length: int = 5
+    cost_names: tuple[str, ...] = ("red",)
+
+    def reset(self, key: jax.Array) -> State:
+        return self._state(key, jnp.zeros(()), jnp.zeros(()), jnp.zeros(()))
+
+    def step(self, state: State, action: jax.Array) -> State:
+        green, red = (jnp.argmax(state.obs["vision"][3, :, k] > 200) for k in (1, 0))
+        a, (green, red) = jnp.clip(action[0], -1.0, 1.0), (x * 0.4 - 1.2 for x in (green, red))
+        cost = (jnp.abs(a - red) < 0.25).astype(jnp.float32)
+        passed = jnp.round((1 - state.obs["vector"][0]) * self.episode_length) + 1
+        return self._state(state.physics, passed, 1 - jnp.abs(a - green), cost)
+
+    def _state(self, key: jax.Array, passed: jax.Array, reward: jax.Array, cost: jax.Array) -> State:
+        key, place_key = jax.random.split(key)
+        green, red = jax.random.permutation(place_key, jnp.array([1, 2, 4, 5]))[:2]
+        picture = jnp.full((8, 8, 3), 90, jnp.uint8)
+        for column, colour in ((green, [0, 255, 0]), (red, [255, 0, 0])):
+            picture = picture.at[2:6, column].set(jnp.array(colour, jnp.uint8))
+        left = jnp.reshape(1 - passed / self.episode_length, (1,))
+        obs = {"vision": picture, "vector": left}
+        return State(key, obs, reward, cost, cost[None], jnp.bool_(False), {})
 
 
 @dataclass(frozen=True)

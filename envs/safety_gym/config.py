@@ -90,7 +90,7 @@ class SafetyGymConfig:
     observe_pillars: bool = False
     observe_buttons: bool = False
     observe_gremlins: bool = False
-    observe_vision: bool = False
+    observe_vision: bool = False  # a dict: vision, uint8 [height, width, 3], and vector, all else
     observe_qpos: bool = False
     observe_qvel: bool = False
     observe_ctrl: bool = False
@@ -103,9 +103,11 @@ class SafetyGymConfig:
     render_lidar_size: Size = 0.025
     render_lidar_offset_init: Distance = 0.5
     render_lidar_offset_delta: Distance = 0.06
-    vision_size: Pixels = (60, 40)  # these three: not read before vision is available
-    vision_render: bool = True
-    vision_render_size: Pixels = (300, 200)
+    vision_size: Pixels = (60, 40)  # of the picture that is observed
+    vision_render: bool = True  # films and the live view show that picture beside the scene
+    vision_render_size: Pixels = (300, 200)  # how large they show it
+    # ours: vision, on the robot; vision_back, of Point and Car; fixednear, fixedfar, track
+    vision_camera: str = "vision"
     # Lidar and compass
     lidar_num_bins: Annotated[int, Bounds(1, 1000)] = 10
     lidar_max_dist: Size | None = None  # null: exp(-lidar_exp_gain distance) instead of linear
@@ -262,8 +264,6 @@ def check_config(cfg: SafetyGymConfig) -> None:
     check_values(cfg, "env.")
     if cfg.rules == "safety_gymnasium":
         check_rules(cfg)
-    if cfg.observe_vision:
-        raise ConfigError("env.observe_vision=true: vision is not available yet; use the lidars")
     if cfg.task not in TASKS:
         raise ConfigError(f"env.task={cfg.task!r}{nearest(cfg.task, TASKS)}")
     if cfg.observation == "coordinates" and cfg.task != "goal":

@@ -47,6 +47,11 @@ GROUP = {
 }
 MOCAPS = ("gremlins", "pillars", "walls", "buttons")  # in the order of their mocap ids
 MJX_LIMITS = {"max_geom_pairs": 16, "max_contact_points": 48}  # nearest pairs a type, deepest contacts
+HALF = math.sqrt(0.5)
+BACK = {  # where a robot's rear camera is in its frame: level, and turned away from its front
+    "point": {"pos": (0, 0, 0.15), "quat": (HALF, HALF, HALF, HALF)},
+    "car": {"pos": (0, 0, 0.2), "quat": (HALF, HALF, 0, 0)},
+}
 FREES = ("vases", "gremlins", "box")  # in the order of their free joints
 
 
@@ -155,7 +160,7 @@ def build(cfg: SafetyGymConfig, mjx: bool = False, drawn: bool = False) -> Scene
     )
     if drawn:
         light(spec, floor)
-        add_cameras(spec)
+        add_cameras(spec, cfg)
     add_free_objects(spec, cfg)
     for i in range(cfg.gremlins_num):
         half = cfg.half_height(cfg.gremlins_size) if drawn else None
@@ -386,15 +391,21 @@ def light(spec: mujoco.MjSpec, floor: mujoco.MjsGeom, squares: int = 10) -> None
         pos=(0, 0, 4),
         dir=(0.3, 0.4, -1),
         diffuse=(0.5, 0.5, 0.5),
-        specular=(0.1, 0.1, 0.1),
+        specular=(0, 0, 0),
         castshadow=False,
     )
 
 
-def add_cameras(spec: mujoco.MjSpec) -> None:
-    """Those of the original."""
+def add_cameras(spec: mujoco.MjSpec, cfg: SafetyGymConfig) -> None:
+    """Those of the original and, of Safety-Gymnasium, `vision_back` and Car's `vision`."""
     down = (np.cos(np.pi / 8), np.sin(np.pi / 8), 0, 0)  # half of up's right angle to the horizon
     for name, pos in (("fixednear", (0, -2, 2)), ("fixedfar", (0, -5, 5))):
         spec.worldbody.add_camera(name=name, pos=pos, quat=down)
     track = mujoco.mjtCamLight.mjCAMLIGHT_TRACK
     spec.body("robot").add_camera(name="track", pos=(0, -2, 2), quat=down, mode=track)
+    robot = built_in(cfg.robot_base)
+    if robot and robot.stem in BACK:
+        spec.body("robot").add_camera(name="vision_back", fovy=90, **BACK[robot.stem])
+    if robot and robot.stem == "car" and cfg.rules == "safety_gymnasium":
+        camera = spec.camera("vision")
+        camera.pos, camera.fovy = (0, 0, 0.2), 90

@@ -25,11 +25,11 @@ from jaxsafe.envs import engines
 from jaxsafe.envs.engines import Engine, Physics, Readings
 from jaxsafe.envs.safety_gym import costs as constraints
 from jaxsafe.envs.safety_gym import layout as layouts
-from jaxsafe.envs.safety_gym import observe, rewards, sleeping
+from jaxsafe.envs.safety_gym import observe, rewards, sight, sleeping
 from jaxsafe.envs.safety_gym import scene as scenes
 from jaxsafe.envs.safety_gym.arena import Arena, World
 from jaxsafe.envs.safety_gym.config import SafetyGymConfig
-from jaxsafe.types import State
+from jaxsafe.types import PyTree, State
 
 MAX_VALUE = 1e10  # MuJoCo's mjMAXVAL: beyond it a state is bad
 
@@ -47,7 +47,8 @@ class SafetyGym:
     """One task. Pure functions `reset(key)` and `step(state, action)`; callers `vmap`.
 
     Observation float [obs_size]: the components of `observation_spec` in its order, which is that of
-    their names (a dict of them if `observation_flatten` is False) unless `rules` says otherwise.
+    their names (a dict of them if `observation_flatten` is False) unless `rules` says otherwise. With
+    `observe_vision` a dict: 'vector' is that, and 'vision' the picture, uint8 [height, width, 3].
     Action float [action_size] in [-1, 1], clipped.
     `observation_spec` has the shape of each component, in their order. `cost` is what Safety Gym
     calls `cost`; `costs` are its parts, `cost_names` their names.
@@ -81,6 +82,7 @@ class SafetyGym:
                 if name not in self.arena.sensors:
                     raise ConfigError(f"env.observation=coordinates: the robot has no sensor {name}")
         self.cost_names = constraints.cost_names(cfg)
+        self._picture = sight.make_sight(self.arena) if cfg.observe_vision else None
 
         def shown(key: jax.Array) -> dict[str, jax.Array]:
             world, ctrl = self.begin(key)
@@ -184,7 +186,7 @@ class SafetyGym:
         zero = jnp.zeros(())
         return State(
             physics=world,
-            obs=observe.observe(self.arena, world, readings, ctrl, self.ray_slack),
+            obs=self._observed(world, readings, ctrl),
             reward=zero,
             cost=zero,
             costs=jnp.zeros(len(self.cost_names)),
@@ -224,7 +226,7 @@ class SafetyGym:
         if cfg.continue_goal and self.arena.goal_kind:
             moved, found = self._next_goal(moved, drive.goal_key, success)
             terminated = success & ~found & cfg.terminate_resample_failure
-        obs = observe.observe(self.arena, moved, readings, drive.ctrl, self.ray_slack)
+        obs = self._observed(moved, readings, drive.ctrl)
 
         bad = ~jnp.stack(
             [(jnp.abs(x) < MAX_VALUE).all() for x in (physics.qpos, physics.qvel, physics.warmstart)]
@@ -245,6 +247,13 @@ class SafetyGym:
             },
             truncated=truncated & ~bad,
         )
+
+    def _observed(self, world: World, readings: Readings, ctrl: jax.Array) -> PyTree:
+        obs: Any = observe.observe(self.arena, world, readings, ctrl, self.ray_slack)
+        if self._picture is None:
+            return obs
+        parts = {"vector": obs} if self.config.observation_flatten else obs
+        return {**parts, "vision": self._picture(world)}
 
     # Goals -----------------------------------------------------------------------------------------
 

@@ -134,7 +134,7 @@ def lay_out_page(playback: Playback, title: str, frame: Frame) -> None:
     ui.keyboard(on_key, repeating=False, ignore=["input", "select"])
     with ui.row(wrap=False):
         with ui.column():
-            picture = ui.interactive_image().style("width: 640px; height: 480px")
+            picture = ui.interactive_image().style("min-width: 640px; height: 480px")
             lidars = ui.html(sanitize=False)
         with ui.column():
             ui.label(title).classes("text-h6")

@@ -57,7 +57,8 @@ class Renderer:
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
 
     def frame(self, state: State) -> np.ndarray:
-        """The picture of one environment's state: uint8 [height, width, 3]."""
+        """The picture of one environment's state, uint8 [height, width, 3]; where the policy sees a
+        picture, with that one to the right."""
         stage, every = self.stage, mujoco.mjtCatBit.mjCAT_ALL.value
         stage.move(state.physics)
         mujoco.mjv_updateScene(
@@ -68,7 +69,9 @@ class Renderer:
         pixels = np.empty((self._rect.height, self._rect.width, 3), np.uint8)
         mujoco.mjr_render(self._rect, self._geoms, self._context)
         mujoco.mjr_readPixels(pixels, None, self._rect, self._context)
-        return pixels[::-1].copy()  # OpenGL's first row is at the bottom
+        frame = pixels[::-1].copy()  # OpenGL's first row is at the bottom
+        seen = stage.seen(state)
+        return frame if seen is None else beside(frame, seen)
 
 
 def named_camera(model: mujoco.MjModel, name: str) -> mujoco.MjvCamera:
@@ -138,6 +141,15 @@ def captioned(frame: np.ndarray, text: str) -> np.ndarray:
     font = ImageFont.load_default(16)
     ImageDraw.Draw(line).text((8, CAPTION / 2), text, "black", font, anchor="lm")
     return np.vstack([np.asarray(line), frame])
+
+
+def beside(frame: np.ndarray, panel: np.ndarray) -> np.ndarray:
+    """`frame` and, to the right, `panel`; what is lower ends in white."""
+    height = max(len(frame), len(panel))
+    left, right = (
+        np.pad(x, ((0, height - len(x)), (0, 0), (0, 0)), constant_values=255) for x in (frame, panel)
+    )
+    return np.hstack([left, np.full((height, GAP, 3), 255, np.uint8), right])
 
 
 def side_by_side(films: Sequence[Sequence[np.ndarray]]) -> list[np.ndarray]:

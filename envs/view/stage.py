@@ -10,6 +10,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from PIL import Image
 
 from jaxsafe.config import ConfigError
 from jaxsafe.envs import engines
@@ -20,6 +21,7 @@ from jaxsafe.envs.safety_gym.task import SafetyGym
 from jaxsafe.envs.velocity.task import Velocity
 from jaxsafe.envs.velocity.task import World as VelocityWorld
 from jaxsafe.envs.wrap import innermost
+from jaxsafe.learn.observations import vector_of
 from jaxsafe.types import State
 
 # Rows of the halo, from the lowest up.
@@ -74,6 +76,16 @@ class Stage:
             place = self.data.body("robot").xpos
             self._add(geoms, "cost", SPHERE, (0.25, 0, 0), place, faded(RED, 0.5))
 
+    def seen(self, state: State) -> np.ndarray | None:
+        """What the policy sees, as large as the config has it: uint8 [height, width, 3]. None where it
+        sees no picture, or where that is not to be shown."""
+        cfg = self.env.config
+        if not (cfg.observe_vision and cfg.vision_render):
+            return None
+        newest = np.asarray(state.obs["vision"])[..., :3]  # of several frames
+        size = cfg.vision_render_size
+        return np.asarray(Image.fromarray(newest).resize(size, Image.Resampling.NEAREST))
+
     def _mark_halo(self, geoms: mujoco.MjvScene, obs: Any) -> None:
         """Rows of spheres above the robot, one a kind that is seen.
 
@@ -122,6 +134,9 @@ class Runway:
         self.data.qpos[:] = world.physics.qpos
         mujoco.mj_forward(self.model, self.data)
 
+    def seen(self, state: State) -> None:
+        """Robots here see no picture."""
+
     def mark(self, geoms: mujoco.MjvScene, state: State) -> None:
         """The light of a cost."""
         if state.cost > 0:
@@ -163,10 +178,10 @@ def lidar_angles(cfg: SafetyGymConfig) -> np.ndarray:
 
 def split(obs: Any, spec: dict[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
     """Components of an observation by name, each flat; what follows them is left out."""
-    if isinstance(obs, dict):
+    if isinstance(obs, dict) and "vector" not in obs:
         return {name: np.asarray(value).reshape(-1) for name, value in obs.items()}
     ends = np.cumsum([int(np.prod(shape)) for shape in spec.values()], dtype=int)
-    return dict(zip(spec, np.split(np.asarray(obs), ends), strict=False))
+    return dict(zip(spec, np.split(np.asarray(vector_of(obs)), ends), strict=False))
 
 
 def colour(name: str) -> tuple[float, ...]:

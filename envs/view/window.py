@@ -19,7 +19,7 @@ def has_display() -> bool:
 
 def open_window(playback: Playback) -> None:
     """Play in MuJoCo's own viewer until its window is closed."""
-    import mujoco.viewer
+    import mujoco.viewer  # it needs a display
 
     stage, presses = Stage(playback.env), dict[str, float]()
 
@@ -54,6 +54,9 @@ def open_window(playback: Playback) -> None:
                 stage.mark(marks, state)
             names, values = zip(*figures(playback).items(), strict=True)
             viewer.set_texts((None, None, "\n".join(names), "\n".join(values)))
+            if (seen := stage.seen(state)) is not None:
+                height, width, _ = seen.shape
+                viewer.set_images((mujoco.MjrRect(0, 0, width, height), seen))
             viewer.sync()
 
         playback.play(show, lambda: not viewer.is_running())

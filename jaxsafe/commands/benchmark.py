@@ -18,6 +18,7 @@ import sys
 import time
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +27,7 @@ import numpy as np
 from jaxsafe import algos, envs
 from jaxsafe.commands.guard import guarded
 from jaxsafe.config import Amount, ConfigError, Devices, Iterations, Period
+from jaxsafe.learn.observations import EncoderConfig
 from jaxsafe.learn.off_policy import ReplayConfig
 from jaxsafe.learn.rollout import collect, init_rollout, memoryless
 from jaxsafe.run import run_folder
@@ -59,7 +61,8 @@ def stepping(env, num_envs: int, seeds: int, horizon: int):
         rollout, key = state
         key, next_key = jax.random.split(key)
         rollout, trajectory = collect(env, memoryless(policy), rollout, key, horizon)
-        return (rollout, next_key), trajectory.reward.sum() + trajectory.obs.sum()
+        seen = sum(x.sum(dtype=jnp.float32) for x in jax.tree.leaves(trajectory.obs))
+        return (rollout, next_key), trajectory.reward.sum() + seen
 
     def init(key):
         reset_key, key = jax.random.split(key)
@@ -91,14 +94,21 @@ def memory() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
+def options_of(args: argparse.Namespace) -> dict[str, Any]:
+    """What environments are made with."""
+    awake = {} if args.awake is None else {"awake": args.awake}
+    vision = {"observe_vision": True, "vision_size": args.vision} if args.vision else {}
+    return {"engine": args.engine, **awake, **vision}
+
+
 def measure(name: str, num_envs: int | None, args: argparse.Namespace) -> dict:
     """A row; without `num_envs` those of the algorithm, or 256."""
-    options = {} if args.awake is None else {"awake": args.awake}
-    env = envs.make(name, engine=args.engine, **options)
-    warmup = args.warmup
+    env, warmup = envs.make(name, **options_of(args)), args.warmup
     if args.algo:
-        given = {"num_envs": num_envs, "horizon": args.horizon}
-        cfg = algos.ALGOS[args.algo].config(**{k: v for k, v in given.items() if v})
+        config: Any = algos.ALGOS[args.algo].config
+        sees = args.vision and issubclass(config, EncoderConfig)
+        given = {"num_envs": num_envs, "horizon": args.horizon, "encoder": "cnn" if sees else None}
+        cfg = config(**{k: v for k, v in given.items() if v})
         num_envs, horizon = cfg.num_envs, cfg.horizon
         if isinstance(cfg, ReplayConfig):  # until then it only fills its replay
             warmup = max(warmup, -(-cfg.learning_starts // num_envs) + horizon)
@@ -114,6 +124,7 @@ def measure(name: str, num_envs: int | None, args: argparse.Namespace) -> dict:
         "env": name,
         "engine": env.engine,
         "awake": args.awake,
+        "vision": args.vision,
         "algo": args.algo,
         "num_envs": num_envs,
         "num_seeds": args.seeds,
@@ -158,8 +169,9 @@ def versions() -> dict[str, str]:
 
 def show(row: dict) -> str:
     what = row["algo"] or "steps"
+    what += " {}x{}".format(*row["vision"]) if row["vision"] else ""
     return (
-        f"{row['env']:<16} {row['engine']:<5} {what:<8} {row['num_seeds']:>3} x {row['num_envs']:<6} "
+        f"{row['env']:<16} {row['engine']:<5} {what:<13} {row['num_seeds']:>3} x {row['num_envs']:<6} "
         f"{row['env_steps_per_s']:>11,.0f} {row['physics_steps_per_s']:>12,.0f} "
         f"{row['simulated_s_per_s']:>10,.0f} {row['compile_s']:>8.1f} "
         f"{row['memory_bytes'] / 2**30:>7.2f}"
@@ -200,6 +212,13 @@ def command() -> int:
         metavar="K",
         help="how many vases and gremlins are simulated at once",
     )
+    parser.add_argument(
+        "--vision",
+        type=number(Iterations),
+        nargs=2,
+        metavar=("WIDTH", "HEIGHT"),
+        help="steps with a picture of this size each, and --algo with its encoder for them",
+    )
     parser.add_argument("--algo", help="measure updates of this algorithm instead of random actions")
     parser.add_argument("--horizon", type=number(Amount), help="steps of each environment in a run")
     parser.add_argument(
@@ -221,12 +240,12 @@ def command() -> int:
     if args.algo:
         find_algo(args.algo)
     for name in args.envs:
-        envs.check_options(name, engine=args.engine)
+        envs.check_options(name, **options_of(args))
     use_compilation_cache()
     about = versions()
     print(f"{' '.join(f'{k} {v}' for k, v in about.items())}")
     print(
-        f"{'env':<16} {'engine':<5} {'what':<8} {'seeds x envs':<12} {'env steps/s':>11} "
+        f"{'env':<16} {'engine':<5} {'what':<13} {'seeds x envs':<12} {'env steps/s':>11} "
         f"{'physics/s':>12} {'sim s/s':>10} {'compile':>8} {'GiB':>7}"
     )
 

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxsafe.config import ConfigError, nearest
+from jaxsafe.learn.observations import observation_like
 from jaxsafe.types import Env, Metrics, PyTree, State
 
 Costs = Sequence[str] | Mapping[str, Callable[[Any], jax.Array]]
@@ -32,7 +33,7 @@ class PlaygroundState:
     """The fields of Playground's `mjx_env.State`."""
 
     data: PyTree
-    obs: jax.Array
+    obs: PyTree
     reward: jax.Array
     done: jax.Array
     metrics: Metrics
@@ -83,8 +84,9 @@ class BraxEnv(brax.envs.Env):
         self.env, self._kind, self._held = env, kind, held
 
     @property
-    def observation_size(self) -> int:
-        return self.env.obs_size
+    def observation_size(self) -> Any:
+        like = observation_like(self.env)
+        return {name: x.shape for name, x in like.items()} if isinstance(like, dict) else like.shape[0]
 
     @property
     def action_size(self) -> int:

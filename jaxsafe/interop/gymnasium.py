@@ -25,8 +25,9 @@ from jaxsafe import envs
 from jaxsafe.config import ConfigError
 from jaxsafe.envs.registry import IMPLIED
 from jaxsafe.envs.view.render import FPS, Renderer
+from jaxsafe.learn.observations import observation_like
 from jaxsafe.learn.rollout import RolloutState, init_rollout, restart
-from jaxsafe.types import Env, State
+from jaxsafe.types import Env, PyTree, State
 
 try:
     import gymnasium
@@ -58,8 +59,8 @@ class Specified:
 class GymEnv(Specified, gymnasium.Env):
     """One environment.
 
-    Observation: float32 [obs_size], unbounded. Action: float32 [action_size] in [-1, 1]. The time limit
-    `env.episode_length` truncates.
+    Observation: float32 [obs_size], unbounded, or a dict with a picture, uint8. Action: float32
+    [action_size] in [-1, 1]. The time limit `env.episode_length` truncates.
 
     Args:
         env: an `Env`, or the name of one that is registered.
@@ -82,7 +83,7 @@ class GymEnv(Specified, gymnasium.Env):
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Array, Info]:
         super().reset(seed=seed)
         self._state, self._steps = self._reset(draw_key(self.np_random)), 0
-        return np.array(self._state.obs), described(self.env, self._state)
+        return arrays(self._state.obs), described(self.env, self._state)
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, Info]:
         self._state = state = self._step(self._state, np.float32(action))
@@ -91,7 +92,7 @@ class GymEnv(Specified, gymnasium.Env):
         out_of_time = self._steps >= self.env.episode_length or bool(state.truncated)
         truncated = out_of_time and not terminated
         info = {name: x.item() for name, x in described(self.env, state).items()}
-        return np.array(state.obs), float(state.reward), terminated, truncated, info
+        return arrays(state.obs), float(state.reward), terminated, truncated, info
 
     def render(self) -> Array | None:
         return self._draw.frame(jax.device_get(self._state)) if self._draw else None
@@ -127,7 +128,7 @@ class GymVectorEnv(Specified, gymnasium.vector.VectorEnv):
         self._rollout = self._begin(draw_key(self.np_random))
         self._key = draw_key(self.np_random)
         state = self._rollout.state
-        return np.array(state.obs), masked(described(self.env, state), np.ones(self.num_envs, bool))
+        return arrays(state.obs), masked(described(self.env, state), np.ones(self.num_envs, bool))
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, Info]:
         self._key, key = jax.random.split(self._key)
@@ -139,11 +140,11 @@ class GymVectorEnv(Specified, gymnasium.vector.VectorEnv):
         if done.any():
             final = np.full(self.num_envs, None, object)
             for i in np.flatnonzero(done):
-                final[i] = state.obs[i].copy()
+                final[i] = jax.tree.map(lambda x, i=i: x[i].copy(), state.obs)
             kept = {name: np.where(done, x, np.zeros_like(x)) for name, x in info.items()}
             infos |= masked({"final_obs": final, "final_info": masked(kept, done)}, done)
         rewards = state.reward.astype(np.float64)
-        return np.array(self._rollout.state.obs), rewards, terminated.copy(), truncated.copy(), infos
+        return arrays(self._rollout.state.obs), rewards, terminated.copy(), truncated.copy(), infos
 
     def render(self) -> tuple[Array, ...] | None:
         if self._draw is None:
@@ -203,10 +204,24 @@ def built(env: Env | str, options: dict[str, Any]) -> Env:
     return env
 
 
-def spaces(env: Env) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
+def spaces(env: Env) -> tuple[gymnasium.Space, gymnasium.Space]:
     """Of observations and of actions."""
     box = gymnasium.spaces.Box
-    return box(-np.inf, np.inf, (env.obs_size,)), box(-1.0, 1.0, (env.action_size,))
+
+    def part(like: jax.ShapeDtypeStruct) -> gymnasium.Space:
+        picture = like.dtype == np.uint8
+        return box(0, 255, like.shape, np.uint8) if picture else box(-np.inf, np.inf, like.shape)
+
+    like = observation_like(env)
+    action = box(-1.0, 1.0, (env.action_size,))
+    if isinstance(like, dict):
+        return gymnasium.spaces.Dict({name: part(x) for name, x in like.items()}), action
+    return part(like), action
+
+
+def arrays(obs: PyTree) -> Any:
+    """Copies that may be written to."""
+    return jax.tree.map(np.array, obs)
 
 
 def drawer(env: Env, render_mode: str | None) -> Renderer | None:

@@ -29,6 +29,7 @@ from jaxsafe.envs.safety_gym import suite
 from jaxsafe.envs.safety_gym.config import config_from_plain as read_config
 from jaxsafe.envs.safety_gym.config import defaults
 from jaxsafe.envs.velocity.config import VelocityConfig
+from jaxsafe.learn.barrier import BarrierConfig
 from jaxsafe.learn.bill import PriceClockConfig
 from jaxsafe.learn.model_based import ModelBasedConfig
 from jaxsafe.learn.off_policy import OffPolicyConfig
@@ -36,7 +37,6 @@ from jaxsafe.learn.offline import OfflineConfig
 from jaxsafe.learn.row import Row
 from jaxsafe.run.settings import OFFLINE_UPDATES, TrainConfig, algo_options, as_text
 
-MISSING = {"CRABS": "off-policy"}  # OmniSafe's others, by family
 EPISODE = 1000  # steps
 
 
@@ -360,6 +360,28 @@ def temperature(on: Any, facts: Facts) -> dict[str, Any]:
     return {"algo.alpha_init": 1.0, "algo.alpha_lr": rate} if on else {"algo.alpha_lr": 0.0}
 
 
+def noise(value: Any, facts: Facts) -> dict[str, Any] | None:
+    """CRABS has it in a third of its environments, as a factor."""
+    if "algo.chains" in facts.options:
+        return {} if value == 2 else None
+    return {"algo.noise_min": value, "algo.noise_max": value}
+
+
+def epochs(value: Any, facts: Facts) -> dict[str, Any]:
+    steps = facts.whole("algo_cfgs.steps_per_epoch", 6000)
+    return {"total_steps": steps * convert(value, Amount, "train_cfgs.num_epochs")}
+
+
+def hottest(option: str) -> Translate:
+    """For a range whose two ends are one number here."""
+
+    def turn(value: Any, facts: Facts) -> dict[str, Any] | None:
+        ends = {facts.values.get(f"opt_s.temperature.{end}", value) for end in ("min", "max")}
+        return {option: value} if len(ends) == 1 else None
+
+    return turn
+
+
 HORIZON = 50  # steps of an update of the preset
 DUAL_EVERY = PriceClockConfig.dual_every
 SIZES = "num_envs algo.batch_size algo.replay_size algo.replay_ratio"
@@ -382,7 +404,9 @@ OFF_POLICY: dict[str, Rule] = OMNISAFE | {  # of its off-policy algorithms; what
     "algo_cfgs.policy_delay": Rule("algo.policy_delay"),
     "algo_cfgs.polyak": Rule("algo.tau"),
     "algo_cfgs.use_exploration_noise": Rule("", "OmniSafe does not read it", same=None),
-    "algo_cfgs.exploration_noise": Rule("algo.noise_min algo.noise_max", "one for all environments"),
+    "algo_cfgs.exploration_noise": Rule(
+        "algo.noise_min algo.noise_max", "one for all environments; of CRABS always 2", noise
+    ),
     "algo_cfgs.policy_noise": Rule("algo.smoothing"),
     "algo_cfgs.policy_noise_clip": Rule("algo.smoothing_clip"),
     "algo_cfgs.alpha": Rule("algo.alpha_init"),
@@ -402,6 +426,46 @@ OFF_POLICY: dict[str, Rule] = OMNISAFE | {  # of its off-policy algorithms; what
         "algo.dual_lr", "at each gradient step there", per_move("algo.dual_lr")
     ),
     "lagrange_cfgs.pid_ki": Rule("algo.pid_ki", "at each gradient step there", per_move("algo.pid_ki")),
+    # CRABS alone
+    "train_cfgs.num_epochs": Rule("total_steps", "times steps_per_epoch", epochs),
+    "train_cfgs.raw_policy_episodes": Rule("", "eval_every evaluates during training", same=None),
+    "algo_cfgs.critic_norm_coeff": Rule("", "only read with use_critic_norm", same=None),
+    "transition_model_cfgs.type": Rule("", "the models have no gates", same=None),
+    "transition_model_cfgs.n_ensemble": Rule("algo.models"),
+    "transition_model_cfgs.n_elites": Rule("", "all models count", same=(5,)),
+    "transition_model_cfgs.frozen": Rule("", "models are always refitted", same=(False,)),
+    "transition_model_cfgs.train.batch_size": Rule("algo.model_batch"),
+    "transition_model_cfgs.train.weight_decay": Rule("", "OmniSafe does not read it", same=None),
+    "transition_model_cfgs.train.lr": Rule("", "OmniSafe does not read it", same=None),
+    "transition_model_cfgs.train.mul_std": Rule("", "errors are not scaled", same=(0,)),
+    "lyapunov.ell_coef": Rule("", "always 1", same=(1,)),
+    "lyapunov.barrier_coef": Rule("", "always 1", same=(1,)),
+    "opt_s.temperature.max": Rule(
+        "algo.temperature", "max and min are one", hottest("algo.temperature")
+    ),
+    "opt_s.temperature.min": Rule(
+        "algo.temperature", "max and min are one", hottest("algo.temperature")
+    ),
+    "opt_s.filter.top_k": Rule("", "OmniSafe does not read it", same=None),
+    "opt_s.filter.pool": Rule("", "OmniSafe does not read it", same=None),
+    "opt_s.n_steps": Rule("", "always 1", same=(1,)),
+    "opt_s.method": Rule("", "always MALA", same=("MALA",)),
+    "opt_s.lr": Rule("", "how fast step sizes adapt: always 0.01", same=(0.01,)),
+    "opt_s.batch_size": Rule("algo.chains"),
+    "opt_s.extend_region": Rule("", "OmniSafe does not read it", same=None),
+    "opt_s.barrier_coef": Rule("", "OmniSafe does not read it", same=None),
+    "opt_s.L_neg_coef": Rule("", "OmniSafe does not read it", same=None),
+    "opt_s.resample": Rule("", "states outside of the set jump into it", same=(False,)),
+    "opt_s.n_proj_iters": Rule("", "states outside of the set jump into it", same=None),
+    "opt_s.precond": Rule("", "OmniSafe does not read it", same=None),
+    "opt_h.weight_decay": Rule("algo.barrier_decay"),
+    "opt_h.lr": Rule("algo.barrier_lr"),
+    "opt_h.lambda_2": Rule("", "always the ratio of the slopes", same=("norm",)),
+    "opt_h.n_iters": Rule("", "OmniSafe does not read it", same=None),
+    "crabs.obj.eps": Rule("algo.margin"),
+    "crabs.obj.neg_coef": Rule("", "OmniSafe does not read it", same=None),
+    "n_pretrain_s_iters": Rule("", "the search goes on from the run before", same=None),
+    "task": Rule("", "init_from=RUN begins with a run", same=("train_policy",)),
 }
 
 
@@ -630,9 +694,8 @@ KNOWN = OFFLINE | OFF_POLICY | MODEL_BASED
 # Options that Engine does not have.
 OURS_ALONE = (
     "rules", "observation", "awake", "contact_room", "bounds_num", "bounds", "bounds_cost",
+    "vision_camera",
 )  # fmt: skip
-# Engine's options that ours takes, and does not use yet.
-VISION = ("observe_vision", "vision_size", "vision_render", "vision_render_size")
 
 
 class Line(NamedTuple):
@@ -729,9 +792,11 @@ def set_up(row: Row, target: list[str]) -> tuple[str, list[str], int]:
     Raises:
         ConfigError: OmniSafe's planners do not take the environment.
     """
+    task = target[0].removeprefix("env=")
+    if issubclass(row.config, BarrierConfig) and not task.startswith("pendulum_"):
+        raise ConfigError(f"{target[0]}: CRABS is for SafeInvertedPendulumSwing-v2 alone there")
     if not issubclass(row.config, ModelBasedConfig):
         return "published", target, 1
-    task = target[0].removeprefix("env=")
     if isinstance(envs.ENVS[task], VelocityConfig):
         return "omnisafe_velocity", target, 1
     if "_goal" not in task:
@@ -748,8 +813,6 @@ def find_algorithm(theirs: Any) -> str:
     known = algorithms()
     if not theirs:
         raise ConfigError(f"no algorithm in the file: add --algo, one of {', '.join(known)}")
-    if theirs in MISSING:
-        raise ConfigError(f"{theirs} is not here yet, so it cannot be migrated")
     if theirs not in known:
         raise ConfigError(f"unknown algorithm {theirs} of OmniSafe{nearest(str(theirs), known)}")
     return known[theirs]
@@ -786,11 +849,7 @@ def safety_gym(config: dict[str, Any]) -> Migrated:
         if key not in known:
             raise ConfigError(f"unknown option {key} of Engine{nearest(key, known)}")
     lines = []
-    for key in [k for k in VISION if k in config]:
-        asked = key == "observe_vision" and bool(config[key])
-        lines.append(Line(key, config.pop(key), "vision is not available yet", asked))
     options = dataclasses.asdict(read_config(defaults(**config)))
-    options = {k: v for k, v in options.items() if k not in VISION}
 
     def differences(name: str) -> dict[str, Any]:
         other = envs.env_defaults(name)

@@ -7,6 +7,9 @@
                                                           Q_c = reduce_j Q_cj(s, a),   a from pi(s)
     Q' <- Q' + tau (Q - Q')
 
+With `encoder=cnn` s is what a network makes of the picture. The critics' loss trains it, and the
+policy's does not.
+
 The methods differ in a', in what is picked and in the bonus, which is an entropy or 0: see `Actor`. How
 Q_r and Q_c are mixed is the treatment's: (Q_r / unit - lam Q_c) / (1 + lam) is a Lagrangian's. The unit
 is the standard deviation of Q_r over the batch, or 1: see `price_unit`. Where the method weighs cost, a
@@ -22,6 +25,7 @@ import jax.numpy as jnp
 import optax
 
 from jaxsafe.config import Iterations, Rate, Share, Weight, config
+from jaxsafe.learn.acting import Learned
 from jaxsafe.learn.batch import pmean
 from jaxsafe.learn.bill import PriceClockConfig
 from jaxsafe.learn.constraints import metrics_by_constraint, signal
@@ -36,16 +40,18 @@ from jaxsafe.learn.critics import (
 )
 from jaxsafe.learn.learner import GradientStep, Learner
 from jaxsafe.learn.normalise import CLIP, MIN_STD, averaged, no_moments, standard
+from jaxsafe.learn.observations import EncoderConfig, blank, observation_like
 from jaxsafe.learn.off_policy import OffPolicyConfig
 from jaxsafe.learn.replay import Transitions
 from jaxsafe.learn.steps import Trainable, adam, descend_each, follow
 from jaxsafe.learn.treatments import DampedConfig, PIDConfig, Treatment, no_treatment
+from jaxsafe.nn.cnn import FEATURES, encoded, init_encoder
 from jaxsafe.nn.critics import q_values
 from jaxsafe.types import Env, Metrics, PyTree
 
 
 @config
-class ActorCriticConfig(OffPolicyConfig):
+class ActorCriticConfig(EncoderConfig, OffPolicyConfig):
     """What the actor-critic methods share."""
 
     # Gradient steps of the critics for each one of the policy and the targets.
@@ -107,14 +113,14 @@ class MultiplierConfig(DampedConfig, CostCriticConfig):
 
     CONVENTIONS: ClassVar = (
         Convention(
-            {"dual_damping": 0.0},
-            "the price is the multiplier",
-            "it also rises and falls with the violation at once",
+            {"dual_damping": 0.0, "dual_eps": 1e-8},
+            "the price is the multiplier, which moves by about `dual_lr` at any violation",
+            "the price also follows the violation at once, and a small one moves the multiplier little",
         ),
     )
 
-    # Adam's step of the multiplier, whatever the size of the violation. A policy answers a price only
-    # after some hundred thousand steps.
+    # Adam's step of the multiplier where the violation is far above `dual_eps`. A policy answers a
+    # price only after some hundred thousand steps.
     dual_lr: Rate = 0.01
 
 
@@ -178,11 +184,17 @@ def actor_critic(env: Env, actor: Actor, treatment: Treatment) -> Learner:
 
     def init(key: jax.Array, obs_size: int, action_size: int, cfg: Any) -> Trainable:
         actor_key, critic_key = jax.random.split(key)
+        encoder = {}
+        if cfg.encoder == "cnn":
+            obs_size += FEATURES
+            encoder_key = jax.random.fold_in(key, 1)
+            encoder = {"encoder": init_encoder(encoder_key, blank(observation_like(env)))}
         parts = actor.init(actor_key, obs_size, action_size, cfg)
         sizes = obs_size, action_size
         critics = init_all_critics(critic_key, sizes, actor.critics, treatment, cfg)
-        optimisers = actor.optimisers(cfg, 1.0) | dict.fromkeys(critics, adam(cfg.critic_lr, cfg))
-        trained = parts | critics
+        valued = critics | encoder
+        optimisers = actor.optimisers(cfg, 1.0) | dict.fromkeys(valued, adam(cfg.critic_lr, cfg))
+        trained = parts | valued
         opt_state = {name: optimisers[name].init(params) for name, params in trained.items()}
         if treatment is not no_treatment and cfg.cost_normalize:
             opt_state["cost_scale"] = no_moments(max(len(names(cfg)), 1))
@@ -196,10 +208,12 @@ def actor_critic(env: Env, actor: Actor, treatment: Treatment) -> Learner:
         share = at.remaining if cfg.lr_decay else 1.0
         charged, nets = charged_in(nets, batch, cfg, axis_name)
         y = targets_at(nets.params, batch, charged, critic_key, cfg)
-        adams = dict.fromkeys(critics_among(nets.params), adam(cfg.critic_lr * share, cfg))
+        valued = [*critics_among(nets.params), *(["encoder"] if "encoder" in nets.params else [])]
+        adams = dict.fromkeys(valued, adam(cfg.critic_lr * share, cfg))
 
-        def errors(critics: dict[str, PyTree]) -> tuple[jax.Array, Metrics]:
-            return critic_loss(critics, batch, y, names(cfg), cfg)
+        def errors(valued: dict[str, PyTree]) -> tuple[jax.Array, Metrics]:
+            seen = batch._replace(obs=features(valued, batch.obs))
+            return critic_loss(valued, seen, y, names(cfg), cfg)
 
         nets, metrics = descend_each(errors, nets, adams, axis_name)
 
@@ -229,7 +243,7 @@ def actor_critic(env: Env, actor: Actor, treatment: Treatment) -> Learner:
         params: dict[str, PyTree], batch: Transitions, charged: jax.Array, key: jax.Array, cfg: Any
     ) -> Values:
         """What the critics aim at: y_r and y_c."""
-        targets, obs = params["targets"], batch.next_obs
+        targets, obs = params["targets"], features(params, batch.next_obs)
         action, bonus = actor.next_action(params, targets, obs, key, cfg)
         q_r = q_values(targets["critic_r"], obs, action, cfg).min(0)
         if treatment is not no_treatment and cfg.cost_action == "mean":
@@ -251,13 +265,14 @@ def actor_critic(env: Env, actor: Actor, treatment: Treatment) -> Learner:
         axis_name: str | None,
     ) -> Callable[[dict[str, PyTree]], tuple[jax.Array, Metrics]]:
         """The loss of the actor's parameters, with the critics among `params`."""
+        obs = features(params, batch.obs)
 
         def loss(parts: dict[str, PyTree]) -> tuple[jax.Array, Metrics]:
-            proposal = actor.propose(parts, batch.obs, at.key, cfg)
-            q_r = actor.pick(q_values(params["critic_r"], batch.obs, proposal.action, cfg))
+            proposal = actor.propose(parts, obs, at.key, cfg)
+            q_r = actor.pick(q_values(params["critic_r"], obs, proposal.action, cfg))
             worth = q_r + proposal.bonus
             if treatment is not no_treatment:
-                q_c = known_cost(params, batch.obs, proposal.action, cfg)
+                q_c = known_cost(params, obs, proposal.action, cfg)
                 unit = price_unit(batch, worth, cfg, axis_name)
                 worth = treatment.advantage(at.dual, worth / unit, q_c)
             climbed = batch.mean(worth)
@@ -266,12 +281,18 @@ def actor_critic(env: Env, actor: Actor, treatment: Treatment) -> Learner:
 
         return loss
 
-    return Learner(
-        init=init,
-        act=lambda learned, obs, key: actor.act(learned.params, obs, key, learned.config),
-        step=step,
-        explore=lambda learned, obs, key: explore(learned.params, obs, key, learned.config),
-    )
+    def acting(by: Callable[..., jax.Array]) -> Callable[[Learned, PyTree, Any], jax.Array]:
+        def act(learned: Learned, obs: PyTree, key: jax.Array | None) -> jax.Array:
+            return by(learned.params, features(learned.params, obs), key, learned.config)
+
+        return act
+
+    return Learner(init=init, act=acting(actor.act), step=step, explore=acting(explore))
+
+
+def features(params: dict[str, PyTree], obs: PyTree) -> jax.Array:
+    """`obs` as one vector: what the encoder makes of it, if there is one."""
+    return encoded(params["encoder"], obs) if "encoder" in params else obs
 
 
 def price_unit(batch: Transitions, worth: jax.Array, cfg: Any, axis_name: str | None) -> jax.Array:

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 
 from jaxsafe.config import Bounds, Iterations, Real, Share, Weight, config
 from jaxsafe.learn.conventions import Convention
+from jaxsafe.learn.observations import vector_of, with_vector
 from jaxsafe.learn.rollout import Episode, Trajectory, never
 from jaxsafe.learn.treatments import Treatment
 from jaxsafe.types import Count, Env, PyTree, State
@@ -29,14 +30,14 @@ class Augmentation(NamedTuple):
     renew(resets, cfg, dual) -> State [N], resets drawn in an earlier iteration as they are now.
     stop(episode, cfg) -> bool [N], where an episode of training ends for good.
     reward(traj, cfg) -> float [T, N], what the learner is paid.
-    last_obs(traj, cfg) -> float [T, N, O], the observations whose value each step leads to.
+    last_obs(traj, cfg) -> [T, N, ...], the observations whose value each step leads to.
     """
 
     wrap: Callable[[Env, Any, PyTree], Env]
     renew: Callable[[State, Any, PyTree], State]
     stop: Callable[[Episode, Any], jax.Array]
     reward: Callable[[Trajectory, Any], jax.Array]
-    last_obs: Callable[[Trajectory, Any], jax.Array]
+    last_obs: Callable[[Trajectory, Any], PyTree]
 
 
 no_augmentation = Augmentation(
@@ -86,15 +87,15 @@ class Budget:
 
     def step(self, state: State, action: jax.Array) -> State:
         info = {name: x for name, x in state.info.items() if name != "unsafe"}
-        z = state.obs[-1]
-        state = self.env.step(dataclasses.replace(state, obs=state.obs[:-1], info=info), action)
+        vector = vector_of(state.obs)
+        z, obs = vector[-1], with_vector(state.obs, vector[:-1])
+        state = self.env.step(dataclasses.replace(state, obs=obs, info=info), action)
         return self._show(state, (z - state.cost / self.budget) / self.discount)
 
     def _show(self, state: State, z: jax.Array | float) -> State:
         unsafe = jnp.float32(jnp.asarray(z) <= 0)
-        return dataclasses.replace(
-            state, obs=jnp.append(state.obs, z), info=state.info | {"unsafe": unsafe}
-        )
+        obs = with_vector(state.obs, jnp.append(vector_of(state.obs), z))
+        return dataclasses.replace(state, obs=obs, info=state.info | {"unsafe": unsafe})
 
 
 @config
@@ -124,12 +125,13 @@ def full_budget(env: Env, cfg: Any) -> jax.Array:
 
 
 def safe_reward(traj: Trajectory, cfg: Any) -> jax.Array:
-    return jnp.where(traj.next_obs[..., -1] > 0, traj.reward, cfg.unsafe_reward)
+    return jnp.where(vector_of(traj.next_obs)[..., -1] > 0, traj.reward, cfg.unsafe_reward)
 
 
-def last_budget(traj: Trajectory, cfg: Any) -> jax.Array:
-    full = traj.next_obs.at[..., -1].set(1.0)
-    return jnp.where((traj.truncated & cfg.full_at_end)[..., None], full, traj.next_obs)
+def last_budget(traj: Trajectory, cfg: Any) -> PyTree:
+    vector = vector_of(traj.next_obs)
+    ended = (traj.truncated & cfg.full_at_end)[..., None]
+    return with_vector(traj.next_obs, jnp.where(ended, vector.at[..., -1].set(1.0), vector))
 
 
 # Sootla et al. (2022), "Saute RL: Almost Surely Safe Reinforcement Learning Using State
@@ -242,11 +244,14 @@ def scheduled(env: Env, cfg: Any, dual: Schedule) -> Budget:
     return Budget(env, start(cfg, dual), whole, cfg.saute_discount)
 
 
+def with_budget(resets: State, cfg: Any, dual: Schedule) -> State:
+    vector = vector_of(resets.obs).at[:, -1].set(start(cfg, dual))
+    return dataclasses.replace(resets, obs=with_vector(resets.obs, vector))
+
+
 simmer = saute._replace(
     wrap=scheduled,
-    renew=lambda resets, cfg, dual: dataclasses.replace(
-        resets, obs=resets.obs.at[:, -1].set(start(cfg, dual))
-    ),
+    renew=with_budget,
 )
 
 

@@ -23,7 +23,7 @@ class Batch:
     """B = T * N transitions, as the policy sees them: observations are normalised. With a memory N
     sequences of T, and [N, T] stands for [B].
 
-    obs: float [B, O], or `Sequences`.
+    obs: float [B, O], a dict of that and pictures, or `Sequences`.
     action: float [B, A].
     log_prob: float [B], of the policy that acted.
     old: Gaussian [B, A], of the policy that acted.
@@ -150,7 +150,7 @@ def estimate_batch(
     # a minibatch has single steps or, for a policy with a memory, whole sequences of an environment
     lay_out = by_env if cfg.trunk == "gru" else by_step
     batch = Batch(
-        obs=found.inputs if cfg.trunk == "gru" else by_step(found.inputs),
+        obs=found.inputs if cfg.trunk == "gru" else jax.tree.map(by_step, found.inputs),
         action=lay_out(traj.action),
         log_prob=lay_out(traj.log_prob),
         old=jax.tree.map(lay_out, found.dist),

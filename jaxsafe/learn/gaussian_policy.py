@@ -21,9 +21,10 @@ from jaxsafe.nn.networks import (
 from jaxsafe.types import Policy, PyTree
 
 
-def init_nets(key: jax.Array, obs_size: int, action_size: int, names: Names, cfg: Any) -> Trainable:
-    """All networks, and the critics' optimiser: () where they share the policy's trunk."""
-    sizes = obs_size, action_size
+def init_nets(key: jax.Array, obs: PyTree, action_size: int, names: Names, cfg: Any) -> Trainable:
+    """All networks, for observations like `obs`, and the critics' optimiser: () where they share the
+    policy's trunk."""
+    sizes = obs, action_size
     if cfg.trunk == "gru":
         return Trainable(init_recurrent(key, *sizes, 1 + (len(names) or 1), cfg), ())
     params = init_params(key, *sizes, cfg)
@@ -35,7 +36,7 @@ def init_nets(key: jax.Array, obs_size: int, action_size: int, names: Names, cfg
     return Trainable(params, jax.vmap(adam(cfg.critic_lr, cfg).init)(stack_critics(params)))
 
 
-def decide(learned: Learned, carry: PyTree, obs: jax.Array) -> tuple[Gaussian, PyTree]:
+def decide(learned: Learned, carry: PyTree, obs: PyTree) -> tuple[Gaussian, PyTree]:
     """The action distribution for `obs` [..., O] as the environment gives it, and the next carry."""
     actor, cfg = learned.params["actor"], learned.config
     inputs = network_inputs(learned.normaliser, obs)
@@ -51,7 +52,7 @@ def initial_carry(learned: Learned) -> PyTree:
 
 
 def act(
-    learned: Learned, carry: PyTree, obs: jax.Array, key: jax.Array | None
+    learned: Learned, carry: PyTree, obs: PyTree, key: jax.Array | None
 ) -> tuple[jax.Array, PyTree, dict[str, Any]]:
     dist, carry = decide(learned, carry, obs)
     return (dist.mean if key is None else sample(dist, key)), carry, {}

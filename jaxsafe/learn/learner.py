@@ -46,6 +46,7 @@ class Learner(NamedTuple):
     act(learned, obs [..., O], key) -> action [..., A], the mean one where key is None. `learned` holds
         networks, `params`, the treatment's state, `dual`, and `config`.
     explore(learned, obs [N, O], key) -> action [N, A], how training acts; None: as `act`.
+    random_start(learned) -> bool [], whether actions are random during the warm-up; None: they are.
     policy: for methods that remember something, or that look into the simulator. They act and explore
         by this policy. `act` and `explore` are then not used.
     refit(nets, replay, shared, key, cfg, axis_name) -> (Trainable, metrics), after the rounds of an
@@ -59,6 +60,7 @@ class Learner(NamedTuple):
     step: Callable[[Trainable, Any, GradientStep, Any, str | None], tuple[Trainable, Metrics]]
     act: Callable[[Learned, jax.Array, jax.Array | None], jax.Array] = by_policy
     explore: Callable[[Learned, jax.Array, jax.Array], jax.Array] | None = None
+    random_start: Callable[[Learned], jax.Array] | None = None
     policy: Policy | None = None
     refit: (
         Callable[[Trainable, Any, Shared, jax.Array, Any, str | None], tuple[Trainable, Metrics]] | None

@@ -35,15 +35,9 @@ LEAST_STD = 1e-12  # of an input; a smaller one counts as 1, as in the code of C
 
 
 @config
-class ModelConfig:
-    """For algorithms with a model of the environment."""
+class EnsembleConfig:
+    """For algorithms with an ensemble that predicts where an action leads."""
 
-    # Whether the model is the simulator itself, which foresees its random numbers, too. The policy
-    # then needs the simulator wherever it acts.
-    true_model: bool = False
-    # Whether the model learns the cost. If not, the environment computes it from the observation, as
-    # those of Goal do with env.observation=coordinates. OmniSafe learns it in velocity tasks.
-    learn_cost: bool = True
     # A number that the environment reports, such as goal_met. Steps on which it is not 0 are kept from
     # the model, as a new goal does not follow from the action. As in OmniSafe.
     jump: str = "goal_met"
@@ -66,6 +60,27 @@ class ModelConfig:
     max_epochs: Iterations = 1000  # Epochs that end a refit anyway. OmniSafe has no bound.
     # Steps of an epoch. 0 is as many as one pass over the data has.
     epoch_steps: Annotated[int, Bounds(0, 2**24)] = 0
+
+    @property
+    def told(self) -> tuple[str, ...]:
+        """What the ensemble predicts beside the next observation."""
+        return ()
+
+
+@config
+class ModelConfig(EnsembleConfig):
+    """For algorithms with a model of the environment."""
+
+    # Whether the model is the simulator itself, which foresees its random numbers, too. The policy
+    # then needs the simulator wherever it acts.
+    true_model: bool = False
+    # Whether the model learns the cost. If not, the environment computes it from the observation, as
+    # those of Goal do with env.observation=coordinates. OmniSafe learns it in velocity tasks.
+    learn_cost: bool = True
+
+    @property
+    def told(self) -> tuple[str, ...]:
+        return ("reward", "cost") if self.learn_cost else ("reward",)
 
 
 class Prediction(NamedTuple):
@@ -163,7 +178,12 @@ def init_model(key: jax.Array, env: Env, cfg: Any) -> Trainable:
         return Trainable((), ())
     if not cfg.learn_cost:
         observed_cost(env)
-    inputs, outputs = env.obs_size + env.action_size, 1 + cfg.learn_cost + env.obs_size
+    return init_fitted(key, env, cfg)
+
+
+def init_fitted(key: jax.Array, env: Env, cfg: Any) -> Trainable:
+    """An ensemble, `Fitted`, and its optimiser's state."""
+    inputs, outputs = env.obs_size + env.action_size, len(cfg.told) + env.obs_size
     ensemble: PyTree = init_ensemble(key, cfg.models, inputs, cfg.model_hidden, outputs)
     return Trainable(Fitted(ensemble, unscaled(inputs)), optax.adam(cfg.model_lr).init(ensemble))
 
@@ -214,11 +234,10 @@ def transitions_at(ring: ModelRecord, flat: jax.Array, cfg: Any) -> tuple[jax.Ar
     rows, num_envs = ring.reward.shape
     row, env = flat // num_envs, flat % num_envs
     now = jax.tree.map(lambda x: x[row, env], (ring.obs, ring.action))
-    kept = (ring.obs, ring.reward, ring.cost)
-    obs, reward, cost = jax.tree.map(lambda x: x[(row + 1) % rows, env], kept)
-    told = [reward[..., None], cost[..., None]] if cfg.learn_cost else [reward[..., None]]
+    kept = (ring.obs, *(getattr(ring, name) for name in cfg.told))
+    obs, *told = jax.tree.map(lambda x: x[(row + 1) % rows, env], kept)
     inputs = jnp.concatenate([now[0], jnp.clip(now[1], -1.0, 1.0)], -1)
-    return inputs, jnp.concatenate([*told, obs - now[0]], -1)
+    return inputs, jnp.concatenate([*(x[..., None] for x in told), obs - now[0]], -1)
 
 
 def scale_of(ring: ModelRecord, mask: jax.Array, axis_name: str | None) -> Scale:
@@ -351,13 +370,31 @@ def refit(
     cfg: Any,
     axis_name: str | None = None,
 ) -> tuple[Trainable, Metrics]:
-    """`nets` with the model refitted, if that is due at the end of this update.
+    """`nets` with the model refitted, if that is due at the end of this update: see `when_due`."""
+    if cfg.true_model:
+        return nets, {"train/nonfinite": jnp.zeros(())}
+
+    def learn(span: Span) -> tuple[Trainable, Metrics]:
+        model, metrics = fit(model_of(nets), replay, span, key, cfg, axis_name)
+        return with_model(nets, model), metrics
+
+    return when_due(learn, nets, replay, shared, cfg, axis_name)
+
+
+def when_due(
+    learn: Callable[[Span], tuple[Trainable, Metrics]],
+    nets: Trainable,
+    replay: ModelRecord,
+    shared: Shared,
+    cfg: Any,
+    axis_name: str | None,
+) -> tuple[Trainable, Metrics]:
+    """What `learn` makes of the rows that the replay holds, if a refit is due at the end of this
+    update; else `nets`, with metrics of NaN.
 
     It is due at the update that ends the warm-up, and then whenever `refit_every` environment steps
     have passed. A resumed run without its replay fills that first.
     """
-    if cfg.true_model:
-        return nets, {"train/nonfinite": jnp.zeros(())}
     devices = device_count(axis_name)
     if cfg.model_batch % devices:
         raise ConfigError(f"model_batch={cfg.model_batch} does not split over {devices} devices")
@@ -367,16 +404,10 @@ def refit(
     due = (filled >= warm_up) & ((filled - warm_up) % period == 0)
     rows = replay.reward.shape[0]
     span = held(rows, cfg.horizon, cfg.horizon, jnp.asarray(shared.iteration), shared.since)
+    like = jax.eval_shape(learn, span)[1]
 
-    def learn(model: Trainable) -> tuple[Trainable, Metrics]:
-        return fit(model, replay, span, key, cfg, axis_name)
-
-    old = model_of(nets)
-    like = jax.eval_shape(learn, old)[1]
-
-    def leave(model: Trainable) -> tuple[Trainable, Metrics]:
+    def leave(span: Span) -> tuple[Trainable, Metrics]:
         none = {k: jnp.full(x.shape, jnp.nan) for k, x in like.items()}
-        return model, none | {"train/nonfinite": jnp.zeros(())}
+        return nets, none | {"train/nonfinite": jnp.zeros(())}
 
-    new, metrics = jax.lax.cond(due, learn, leave, old)
-    return with_model(nets, new), metrics
+    return jax.lax.cond(due, learn, leave, span)

@@ -127,10 +127,10 @@ def collect_records(
     return jax.lax.scan(step, stepping, keys)
 
 
-def marked(state: State, bad: Bad, before: jax.Array) -> State:
+def marked(state: State, bad: Bad, before: PyTree) -> State:
     """`state` with a reward of NaN in bad worlds, so that no transition that leads there counts.
 
-    In these worlds obs is the last one, `before` [N, O].
+    In these worlds obs is the last one, `before` [N, ...].
     """
     state = dataclasses.replace(mended(state, bad), obs=select_rows(bad.any, before, state.obs))
     return dataclasses.replace(state, reward=jnp.where(bad.any, jnp.nan, state.reward))

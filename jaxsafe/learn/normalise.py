@@ -14,6 +14,7 @@ the unbiased variance, which differs by 1 / count.
 batches, in which recent batches may count more.
 """
 
+import math
 from typing import NamedTuple
 
 import flax.struct
@@ -21,6 +22,8 @@ import jax
 import jax.numpy as jnp
 
 from jaxsafe.learn.batch import batch_mean, pmean, psum
+from jaxsafe.learn.observations import vector_of, with_vector
+from jaxsafe.types import PyTree
 
 MIN_STD = 0.01  # in units of what is normalised
 CLIP = 5.0  # standard deviations
@@ -49,7 +52,7 @@ def merge(
     weight: float [], the reciprocal of the share of samples that count. The other samples must be 0;
         they do not change mean and variance.
     """
-    x = x.reshape(-1, x.shape[-1])
+    x = x.reshape(math.prod(x.shape[:-1]), x.shape[-1])
     mean = batch_mean(x, axis_name, axis=0) * weight
     var = batch_mean((x - mean) ** 2, axis_name, axis=0)
     var = (var - (1 - 1 / weight) * mean**2) * weight
@@ -65,17 +68,19 @@ def normalise(stats: Normaliser, x: jax.Array) -> jax.Array:
     return jnp.clip((x - stats.mean) / std, -CLIP, CLIP)
 
 
-def network_inputs(normaliser: Normaliser | tuple[()], obs: jax.Array) -> jax.Array:
-    """`obs` [..., O] as the networks take it: normalised, if there is a normaliser.
+def network_inputs(normaliser: Normaliser | tuple[()], obs: PyTree) -> PyTree:
+    """`obs` as the networks take it: its vector [..., O] normalised, if there is a normaliser.
 
-    What an augmentation appended to the environment's observation is left as it is.
+    What an augmentation appended to the environment's observation is left as it is, and so is a
+    picture, which networks scale themselves.
     """
     if isinstance(normaliser, tuple):
         return obs
-    size = normaliser.mean.shape[-1]
-    if obs.shape[-1] == size:
-        return normalise(normaliser, obs)
-    return jnp.concatenate([normalise(normaliser, obs[..., :size]), obs[..., size:]], -1)
+    size, vector = normaliser.mean.shape[-1], vector_of(obs)
+    seen = normalise(normaliser, vector[..., :size])
+    if vector.shape[-1] > size:
+        seen = jnp.concatenate([seen, vector[..., size:]], -1)
+    return with_vector(obs, seen)
 
 
 class Moments(NamedTuple):

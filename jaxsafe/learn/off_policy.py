@@ -43,6 +43,7 @@ from jaxsafe.learn.learner import GradientStep, Learner, policy_by
 from jaxsafe.learn.metrics import step_metrics
 from jaxsafe.learn.next_step_rollout import Stepping, StepRecord, collect_records, started
 from jaxsafe.learn.normalise import init_normaliser, merge, network_inputs
+from jaxsafe.learn.observations import check_observation, vector_of
 from jaxsafe.learn.replay import (
     Record,
     Source,
@@ -216,8 +217,9 @@ def off_policy(
         check_cost_names(names, env)
         cfg = jax.tree.map(jnp.float32, cfg)
         params_key, stepping_key, key = jax.random.split(key, 3)
-        nets = learner.init(params_key, env.obs_size, env.action_size, cfg)
         rollout = init_rollout(env, device_key(stepping_key, axis_name), cfg.num_envs, cfg.stagger)
+        check_observation(rollout.state.obs, cfg)
+        nets = learner.init(params_key, env.obs_size, env.action_size, cfg)
         dual = treatment.init(cfg)
         normaliser = init_normaliser(env.obs_size) if sizes.normalises else ()
         carry = policy.init(Learned(cfg, nets.params, dual, normaliser))
@@ -294,6 +296,9 @@ def off_policy(
         """The environment steps of a round, and whether the normaliser had to skip them."""
         cfg, sizes = ts.config, sizes_of(ts.config, axis_name)
         learned = Learned(cfg, now.nets.params, ts.dual, now.normaliser)
+        random = at.warming_up
+        if learner.random_start is not None:
+            random &= learner.random_start(learned)
 
         def behave(
             carry: PyTree, state: State, first: jax.Array, key: jax.Array
@@ -313,13 +318,13 @@ def off_policy(
                 silent = {k: jnp.zeros(x.shape) for k, x in jax.eval_shape(chosen, carry)[2].items()}
                 return action, carry, silent
 
-            return jax.lax.cond(at.warming_up, at_random, chosen, carry)
+            return jax.lax.cond(random, at_random, chosen, carry)
 
         keys = jax.random.split(device_key(key, axis_name), sizes.every)
         stepping, (rows, steps) = collect_records(env, behave, now.stepping, keys, learner.record(cfg))
         normaliser, skipped = now.normaliser, jnp.bool_(False)
         if sizes.normalises:
-            merged = merge(normaliser, rows.obs, axis_name)
+            merged = merge(normaliser, vector_of(rows.obs), axis_name)
             finite = all_finite(merged)
             normaliser, skipped = select(finite, merged, normaliser), ~finite
         replay = write(now.replay, rows, at.before)

@@ -39,6 +39,12 @@ from jaxsafe.learn.constraints import Names, metrics_by_constraint
 from jaxsafe.learn.conventions import Convention
 from jaxsafe.learn.learner import GradientStep, Learner, policy_by
 from jaxsafe.learn.normalise import init_normaliser, merge, network_inputs
+from jaxsafe.learn.observations import (
+    check_observation,
+    observation_like,
+    vector_of,
+    with_vector,
+)
 from jaxsafe.learn.replay import Transitions
 from jaxsafe.learn.steps import Trainable, adam, remaining
 from jaxsafe.learn.treatments import LagrangianConfig, Treatment, no_treatment
@@ -52,13 +58,13 @@ Draw = Callable[["DataSet", Any], Callable[[jax.Array], jax.Array]]
 class Episodes(NamedTuple):
     """The m episodes of a data set.
 
-    number: int32 [n], which of them each transition belongs to. first_obs: float [m, O], where they
-    begin. ret, cost: float [m], undiscounted sums. whole: bool [m], False for an episode that is cut
-    off: it neither terminates nor runs out of time.
+    number: int32 [n], which of them each transition belongs to. first_obs: [m, ...], where they begin.
+    ret, cost: float [m], undiscounted sums. whole: bool [m], False for an episode that is cut off: it
+    neither terminates nor runs out of time.
     """
 
     number: Array
-    first_obs: Array
+    first_obs: PyTree
     ret: Array
     cost: Array
     whole: Array
@@ -67,17 +73,18 @@ class Episodes(NamedTuple):
 class DataSet(NamedTuple):
     """n transitions, in any order.
 
-    obs, next_obs: float [n, O]. action: float [n, A]. reward, cost: float [n]. terminated: bool [n],
-    True where next_obs has no value. truncated: bool [n], True where the episode runs out of time,
-    which is not termination. costs: float [n] each, by name, of the costs that have names.
+    obs, next_obs: float [n, O], or dicts of that, 'vector', and 'vision', uint8 [n, H, W, C].
+    action: float [n, A]. reward, cost: float [n]. terminated: bool [n], True where next_obs has no
+    value. truncated: bool [n], True where the episode runs out of time, which is not termination.
+    costs: float [n] each, by name, of the costs that have names.
     episodes: Episodes, or () where it is not known which transitions make one.
     """
 
-    obs: Array
+    obs: PyTree
     action: Array
     reward: Array
     cost: Array
-    next_obs: Array
+    next_obs: PyTree
     terminated: Array
     truncated: Array
     costs: Mapping[str, Array]
@@ -85,11 +92,11 @@ class DataSet(NamedTuple):
 
 
 def data_set(
-    obs: np.ndarray,
+    obs: Any,
     action: np.ndarray,
     reward: np.ndarray,
     cost: np.ndarray,
-    next_obs: np.ndarray,
+    next_obs: Any,
     terminated: np.ndarray,
     truncated: np.ndarray | None = None,
     costs: dict[str, np.ndarray] | None = None,
@@ -101,8 +108,11 @@ def data_set(
         truncated: None if it is not known. The episodes are then not known either.
         cut: bool [n], where an episode stops without an end, besides the last transition.
     """
-    floats = (np.asarray(x, np.float32) for x in (obs, action, reward, cost, next_obs))
-    obs, action, reward, cost, next_obs = floats
+    action, reward, cost = (np.asarray(x, np.float32) for x in (action, reward, cost))
+    obs, next_obs = (
+        with_vector(jax.tree.map(np.asarray, x), np.asarray(vector_of(x), np.float32))
+        for x in (obs, next_obs)
+    )
     terminated, episodes = np.asarray(terminated, bool), ()
     if truncated is not None:
         truncated = np.asarray(truncated, bool) & ~terminated
@@ -115,7 +125,7 @@ def data_set(
 
 
 def episodes_of(
-    obs: np.ndarray, reward: np.ndarray, cost: np.ndarray, ends: np.ndarray, last: np.ndarray
+    obs: Any, reward: np.ndarray, cost: np.ndarray, ends: np.ndarray, last: np.ndarray
 ) -> Episodes:
     """The episodes of transitions in order. `last` marks the last transition of each, `ends` those that
     are whole; the very last one is the last of an episode anyway."""
@@ -123,12 +133,15 @@ def episodes_of(
     number = np.cumsum(first, dtype=np.int32) - 1
     count = int(number[-1]) + 1
     ret, paid = (np.bincount(number, x, count).astype(np.float32) for x in (reward, cost))
-    return Episodes(number, obs[first], ret, paid, np.bincount(number, ends, count) > 0)
+    first_obs = jax.tree.map(lambda x: x[first], obs)
+    return Episodes(number, first_obs, ret, paid, np.bincount(number, ends, count) > 0)
 
 
 def data_set_like(env: Env) -> DataSet:
     """A data set of one transition, all zeros: its shapes are those of data of `env`."""
-    obs, number = np.zeros((1, env.obs_size), np.float32), np.zeros(1, np.float32)
+    like = observation_like(env)
+    obs = jax.tree.map(lambda x: np.zeros((1, *x.shape), x.dtype), like)
+    number = np.zeros(1, np.float32)
     action, yes = np.zeros((1, env.action_size), np.float32), np.ones(1, bool)
     return data_set(obs, action, number, number, obs, yes, ~yes, dict.fromkeys(env.cost_names, number))
 
@@ -237,7 +250,7 @@ class TrainState:
 
 def anywhere(data: DataSet, cfg: Any) -> Callable[[jax.Array], jax.Array]:
     """Draws rows of the whole data set, uniformly and with replacement."""
-    return lambda key: jax.random.randint(key, (cfg.batch_size,), 0, len(data.obs))
+    return lambda key: jax.random.randint(key, (cfg.batch_size,), 0, len(data.reward))
 
 
 def offline(
@@ -253,7 +266,9 @@ def offline(
 
     def init(key: jax.Array, cfg: Any, shared: Shared) -> TrainState:
         check_values(cfg)
-        data = data_of(shared, env)
+        data, like = data_of(shared, env), observation_like(env)
+        check_observation(like, cfg)
+        check_pictures(data, like)
         check_costs(names(cfg), data)
         draw(data, cfg)  # refuses data that it cannot serve
         cfg = jax.tree.map(jnp.float32, cfg)
@@ -261,7 +276,7 @@ def offline(
         nets = learner.init(params_key, env.obs_size, env.action_size, cfg)
         normaliser: PyTree = ()
         if cfg.obs_normalize:
-            normaliser = merge(init_normaliser(env.obs_size), jnp.asarray(data.obs))
+            normaliser = merge(init_normaliser(env.obs_size), jnp.asarray(vector_of(data.obs)))
         return TrainState(cfg, nets.params, nets.opt_state, treatment.init(cfg), normaliser, key)
 
     def update(ts: TrainState, shared: Shared) -> tuple[TrainState, Metrics]:
@@ -327,14 +342,14 @@ def batch_at(
     if isinstance(cfg, OfflineValueConfig) and cfg.time_limit_ends:
         terminated |= at(data.truncated)
     return Transitions(
-        obs=network_inputs(normaliser, at(data.obs)),
+        obs=network_inputs(normaliser, jax.tree.map(at, data.obs)),
         action=jnp.clip(at(data.action), -1.0, 1.0),
         reward=at(data.reward),
         cost=cost,
         costs=jnp.stack([at(data.costs[name]) for name in names], -1)
         if names
         else jnp.zeros((len(rows), 0)),
-        next_obs=network_inputs(normaliser, at(data.next_obs)),
+        next_obs=network_inputs(normaliser, jax.tree.map(at, data.next_obs)),
         steps=jnp.ones(len(rows), jnp.int32),
         terminated=terminated,
         weight=jnp.full(len(rows), 1 / len(rows)),
@@ -345,9 +360,9 @@ def first_obs_at(data: DataSet, key: jax.Array, cfg: Any, normaliser: PyTree) ->
     """Observations [B, O] at which episodes begin, drawn with replacement; () where none is known."""
     if not data.episodes:
         return ()
-    first_obs = jnp.asarray(data.episodes.first_obs)
-    rows = jax.random.randint(key, (cfg.batch_size,), 0, len(first_obs))
-    return network_inputs(normaliser, first_obs[rows])
+    first_obs = data.episodes.first_obs
+    rows = jax.random.randint(key, (cfg.batch_size,), 0, len(vector_of(first_obs)))
+    return network_inputs(normaliser, jax.tree.map(lambda x: jnp.asarray(x)[rows], first_obs))
 
 
 def constrained(batch: Transitions, names: Names) -> jax.Array:
@@ -400,8 +415,8 @@ def data_of(shared: Shared, env: Env) -> DataSet:
     if not isinstance(data, DataSet):
         raise ConfigError("an offline algorithm learns from a data set: give dataset=PATH")
     for name, x, size in (
-        ("observations", data.obs, env.obs_size),
-        ("next_observations", data.next_obs, env.obs_size),
+        ("observations", vector_of(data.obs), env.obs_size),
+        ("next_observations", vector_of(data.next_obs), env.obs_size),
         ("actions", data.action, env.action_size),
     ):
         if x.shape[1] != size:
@@ -409,3 +424,19 @@ def data_of(shared: Shared, env: Env) -> DataSet:
                 f"dataset: {name} have {x.shape[1]} numbers, those of the environment {size}"
             )
     return data
+
+
+def check_pictures(data: DataSet, like: PyTree) -> None:
+    """Raise ConfigError unless the pictures of a data set are those of an environment that observes
+    what `like` has the shapes of."""
+
+    def size(obs: PyTree, skip: int) -> str:
+        if not isinstance(obs, dict):
+            return "no pictures"
+        height, width, channels = obs["vision"].shape[skip:]
+        return f"pictures of {width} x {height} x {channels}"
+
+    shown = size(like, 0)
+    for obs in (data.obs, data.next_obs):
+        if (found := size(obs, 1)) != shown:
+            raise ConfigError(f"dataset: it has {found}, the environment {shown}")

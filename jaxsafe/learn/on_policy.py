@@ -54,6 +54,7 @@ from jaxsafe.learn.estimates import (
 from jaxsafe.learn.gaussian_policy import decide, gaussian_policy, init_nets
 from jaxsafe.learn.metrics import step_metrics
 from jaxsafe.learn.normalise import init_normaliser, merge
+from jaxsafe.learn.observations import EncoderConfig, blank, check_observation, vector_of
 from jaxsafe.learn.returns import (
     Estimator,
     LostTime,
@@ -73,7 +74,7 @@ from jaxsafe.types import Algorithm, Clocks, Env, Metrics, PyTree, Shared
 
 
 @config
-class OnPolicyConfig:
+class OnPolicyConfig(EncoderConfig):
     """What the on-policy algorithms share."""
 
     POLICY_STEPS: ClassVar = 1  # steps of the policy in an iteration
@@ -299,11 +300,12 @@ def on_policy_loop(env: Env, method: Method, axis_name: str | None) -> Algorithm
         params_key, rollout_key, key = jax.random.split(key, 3)
         dual = method.init_dual(cfg)
         wrapped = augmentation.wrap(env, cfg, dual)
-        sizes = wrapped.obs_size, wrapped.action_size
         names = constrained_costs(cfg)
         check_cost_names(names, env)
-        nets = init_nets(params_key, *sizes, names, cfg)
         rollout = init_rollout(wrapped, device_key(rollout_key, axis_name), cfg.num_envs, cfg.stagger)
+        obs = jax.tree.map(operator.itemgetter(0), rollout.state.obs)
+        check_observation(obs, cfg)
+        nets = init_nets(params_key, blank(obs), wrapped.action_size, names, cfg)
         carry = jnp.zeros((cfg.num_envs, cfg.hidden[-1])) if cfg.trunk == "gru" else ()
         return TrainState(
             config=cfg,
@@ -329,7 +331,7 @@ def on_policy_loop(env: Env, method: Method, axis_name: str | None) -> Algorithm
         learned = learned_of(ts)
 
         def behave(
-            carry: PyTree, obs: jax.Array, first: jax.Array, key: jax.Array
+            carry: PyTree, obs: PyTree, first: jax.Array, key: jax.Array
         ) -> tuple[jax.Array, jax.Array, PyTree]:
             carry = reset_carry(gaussian_policy, learned, carry, first)
             dist, carry = decide(learned, carry, obs)
@@ -368,7 +370,7 @@ def on_policy_loop(env: Env, method: Method, axis_name: str | None) -> Algorithm
         if cfg.trunk == "separate":
             passes = improved.metrics["train/passes"] if stops_critics(cfg) else cfg.critic_epochs
             fitted = fit_critics(ts, batch, passes, critic_key, axis_name)
-        raw_obs = traj.obs[..., : env.obs_size]
+        raw_obs = vector_of(traj.obs)[..., : env.obs_size]
         normaliser = merge(ts.normaliser, raw_obs, axis_name) if cfg.obs_normalize else ()
         after = TrainState(
             config=cfg,
@@ -455,6 +457,8 @@ def check_sizes(cfg: Any) -> None:
     """Refuse sizes out of their bounds, and those that do not fit each other."""
     check_values(cfg)
     check_steps(cfg.num_envs, cfg.horizon)
+    if cfg.trunk == "gru" and cfg.encoder == "cnn":
+        raise ConfigError("trunk=gru: expected separate or shared with encoder=cnn")
     # a network with a memory learns from whole sequences, one of each environment
     rows = "num_envs" if cfg.trunk == "gru" else "num_envs * horizon"
     size = cfg.num_envs * (1 if cfg.trunk == "gru" else cfg.horizon)

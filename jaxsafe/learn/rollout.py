@@ -21,8 +21,8 @@ from jaxsafe.learn.batch import select_rows
 from jaxsafe.types import Env, PyTree, State
 
 MOST_STEPS = 2**31 - 1  # environment steps of an update, which int32 counts
-# (carry [N, ...], obs [N, O], first [N], key) -> action [N, A], log_prob [N], carry
-Behaviour = Callable[[PyTree, jax.Array, jax.Array, jax.Array], tuple[jax.Array, jax.Array, PyTree]]
+# (carry [N, ...], obs [N, ...], first [N], key) -> action [N, A], log_prob [N], carry
+Behaviour = Callable[[PyTree, PyTree, jax.Array, jax.Array], tuple[jax.Array, jax.Array, PyTree]]
 
 
 def check_steps(num_envs: int, horizon: int) -> None:
@@ -92,7 +92,7 @@ class Trajectory:
     truncated.
     """
 
-    obs: jax.Array
+    obs: PyTree
     first: jax.Array
     action: jax.Array
     log_prob: jax.Array
@@ -102,7 +102,7 @@ class Trajectory:
     terminated: jax.Array
     truncated: jax.Array
     done: jax.Array
-    next_obs: jax.Array
+    next_obs: PyTree
     ended: jax.Array
     episode: Episode
     length: jax.Array
@@ -137,8 +137,8 @@ def never(episode: Episode) -> jax.Array:
     return jnp.bool_(False)
 
 
-def memoryless(act: Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]) -> Behaviour:
-    """The behaviour of a policy that remembers nothing: (obs [N, O], key) -> action, log_prob."""
+def memoryless(act: Callable[[PyTree, jax.Array], tuple[jax.Array, jax.Array]]) -> Behaviour:
+    """The behaviour of a policy that remembers nothing: (obs [N, ...], key) -> action, log_prob."""
     return lambda carry, obs, first, key: (*act(obs, key), carry)
 
 
@@ -153,7 +153,7 @@ def collect(
     """Step all environments `horizon` times.
 
     Args:
-        behave: (carry [N, ...], obs [N, O], first [N], key) -> action [N, A], log_prob [N], carry. It
+        behave: (carry [N, ...], obs [N, ...], first [N], key) -> action [N, A], log_prob [N], carry. It
             begins its carry anew where `first` holds; see `memoryless`.
         stop: sums so far -> bool [N], where a step terminates its episode besides the environment.
     """
@@ -232,9 +232,10 @@ def restart(env: Env, rollout: RolloutState, done: jax.Array, key: jax.Array) ->
     )
 
 
-def finite(x: jax.Array) -> jax.Array:
-    """Whether all of each environment is, bool [N], of float [N, ...]."""
-    return jnp.isfinite(x).reshape(x.shape[0], -1).all(1)
+def finite(tree: PyTree) -> jax.Array:
+    """Whether all of each environment is, bool [N], of leaves [N, ...]."""
+    rows = [jnp.isfinite(x).reshape(x.shape[0], -1).all(1) for x in jax.tree.leaves(tree)]
+    return jnp.stack(rows).all(0)
 
 
 def bad_of(state: State) -> Bad:

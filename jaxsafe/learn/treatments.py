@@ -4,13 +4,13 @@ What is mixed are advantages in on-policy algorithms, and values of actions in t
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 
-from jaxsafe.config import Cap, Iterations, Rate, Share, Weight, config
+from jaxsafe.config import Bounds, Cap, Iterations, Rate, Share, Weight, config
 from jaxsafe.learn.constraints import LimitsConfig, Names, constrained_costs, limit, total_cost_alone
 from jaxsafe.types import Count, Metrics, PyTree
 
@@ -68,8 +68,12 @@ def init_multiplier(cfg: Any) -> Multiplier:
 
 def adam_ascent(dual: Multiplier, episode_cost: jax.Array, cfg: Any, iteration: Count) -> Multiplier:
     """One Adam step on the loss -lam (J_c - cost_limit), then lam in [0, lam_max]."""
+    return ascended(dual, episode_cost, cfg, eps=1e-8)
+
+
+def ascended(dual: Multiplier, episode_cost: jax.Array, cfg: Any, eps: float | jax.Array) -> Multiplier:
     grad = -(episode_cost - limit(cfg, constrained_costs(cfg)))
-    change, opt_state = optax.adam(cfg.dual_lr).update(grad, dual.opt_state)
+    change, opt_state = optax.adam(cfg.dual_lr, eps=eps).update(grad, dual.opt_state)
     lam: Any = optax.apply_updates(dual.lam, change)
     return Multiplier(jnp.clip(lam, 0.0, cfg.lam_max), opt_state)
 
@@ -97,6 +101,10 @@ class DampedConfig(LagrangianConfig):
     # Price for each unit by which J_c exceeds its limit, beside the multiplier; below the limit it is
     # taken off. A multiplier alone overshoots, because it goes on to rise until J_c has fallen.
     dual_damping: Weight = 0.02
+    # What Adam adds to the size of recent violations, by which it divides. Where these are smaller, a
+    # unit of them moves the multiplier by dual_lr / dual_eps. With Adam's usual 1e-8, as in OmniSafe,
+    # it moves by dual_lr even there, so that a price that came to rest swings again.
+    dual_eps: Annotated[float, Bounds(1e-12, 1e6)] = 10.0
 
 
 class Damped(NamedTuple):
@@ -111,7 +119,7 @@ def init_damped(cfg: Any) -> Damped:
 
 def damped_ascent(dual: Damped, episode_cost: jax.Array, cfg: Any, iteration: Count) -> Damped:
     """lam = l + dual_damping (J_c - cost_limit), clipped to [0, lam_max], with the multiplier l."""
-    multiplier = adam_ascent(dual.multiplier, episode_cost, cfg, iteration)
+    multiplier = ascended(dual.multiplier, episode_cost, cfg, cfg.dual_eps)
     over = episode_cost - limit(cfg, constrained_costs(cfg))
     lam = jnp.clip(multiplier.lam + cfg.dual_damping * over, 0.0, cfg.lam_max)
     return Damped(lam, multiplier)

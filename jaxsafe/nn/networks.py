@@ -12,6 +12,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from jaxsafe.nn.cnn import CNN
 from jaxsafe.nn.gaussian import Gaussian
 from jaxsafe.nn.recurrent import Recurrent, Sequences, unroll
 from jaxsafe.types import PyTree
@@ -22,6 +23,8 @@ LOG_STD = (-20.0, 2.0)
 
 class MLP(nn.Module):
     """Layers of `activation` and a linear one, float [..., I] -> [..., out].
+
+    Of an observation with a picture, a dict, a `CNN` first makes a vector.
 
     weights 'orthogonal': gain sqrt(2), `gain` for the last layer, zero biases (Andrychowicz et al.,
     2021, "What Matters in On-Policy Reinforcement Learning?"). 'torch': weights and biases uniform
@@ -43,7 +46,9 @@ class MLP(nn.Module):
     precision: jax.lax.Precision = jax.lax.Precision.HIGHEST
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: PyTree) -> jax.Array:
+        if isinstance(x, dict):
+            x = CNN(self.precision, name="encoder")(x)
         for size in self.hidden:
             x = self._dense(size, math.sqrt(2.0), x.shape[-1])(x)
             x = nn.LayerNorm()(x) if self.layer_norm else x
@@ -86,13 +91,13 @@ def policy_outputs(action_size: int, cfg: Any) -> int:
     return 2 * action_size if cfg.std == "state" else action_size
 
 
-def init_params(key: jax.Array, obs_size: int, action_size: int, cfg: Any) -> dict[str, PyTree]:
-    """{'actor': {'mean', 'log_std' [A]}, 'critic_r', 'critic_c'}.
+def init_params(key: jax.Array, obs: PyTree, action_size: int, cfg: Any) -> dict[str, PyTree]:
+    """{'actor': {'mean', 'log_std' [A]}, 'critic_r', 'critic_c'}, for observations like `obs`.
 
     'mean' is the policy's network. With `std` 'state' the second half of its outputs is added to
     log_std; on a common trunk the last outputs are values.
     """
-    keys, obs = jax.random.split(key, 3), jnp.zeros(obs_size)
+    keys = jax.random.split(key, 3)
     actor = {
         "mean": mlp(cfg, policy_outputs(action_size, cfg), gain=0.01).init(keys[0], obs),
         "log_std": jnp.full(action_size, cfg.init_log_std, jnp.float32),
@@ -134,13 +139,13 @@ def recurrent(cfg: Any, action_size: int, critics: int) -> Recurrent:
 
 
 def init_recurrent(
-    key: jax.Array, obs_size: int, action_size: int, critics: int, cfg: Any
+    key: jax.Array, obs: jax.Array, action_size: int, critics: int, cfg: Any
 ) -> dict[str, PyTree]:
     """{'actor': {'mean', 'log_std' [A]}} alone; the critics are in 'mean', too."""
     net = recurrent(cfg, action_size, critics)
     return {
         "actor": {
-            "mean": net.init(key, jnp.zeros(cfg.hidden[-1]), jnp.zeros(obs_size)),
+            "mean": net.init(key, jnp.zeros(cfg.hidden[-1]), obs),
             "log_std": jnp.full(action_size, cfg.init_log_std, jnp.float32),
         }
     }
@@ -195,13 +200,13 @@ def distribution(actor: PyTree, out: jax.Array, cfg: Any) -> Gaussian:
     return Gaussian(out, jnp.broadcast_to(actor["log_std"], out.shape))
 
 
-def value(critic: PyTree, obs: jax.Array, cfg: Any) -> jax.Array:
+def value(critic: PyTree, obs: PyTree, cfg: Any) -> jax.Array:
     """A critic's estimate for `obs` [..., O], float [...], in units of reward or of cost."""
     out: Any = mlp(cfg, 1).apply(critic, obs)
     return out[..., 0]
 
 
-def values(params: dict[str, PyTree], obs: jax.Array, cfg: Any) -> jax.Array:
+def values(params: dict[str, PyTree], obs: PyTree, cfg: Any) -> jax.Array:
     """The values of reward and of each cost, float [..., 1 + K], of a network without memory."""
     if cfg.trunk == "shared":
         return outputs(params["actor"], obs, cfg)[1]
@@ -224,8 +229,8 @@ class RolloutOutputs(NamedTuple):
 
 def apply_to_rollout(
     params: dict[str, PyTree],
-    obs: jax.Array,
-    next_obs: jax.Array,
+    obs: PyTree,
+    next_obs: PyTree,
     first: jax.Array,
     carry: PyTree,
     cfg: Any,
@@ -233,14 +238,19 @@ def apply_to_rollout(
     """The networks' outputs for a rollout.
 
     Args:
-        obs, next_obs: float [T, N, O], before and after each step, before any reset.
+        obs, next_obs: [T, N, ...], before and after each step, before any reset.
         first: bool [T, N], where an episode begins.
         carry: what the policy remembered before the rollout: [N, H], or () without a memory.
     """
     actor = params["actor"]
     if cfg.trunk != "gru":
-        v, next_v = values(params, obs, cfg), values(params, next_obs, cfg)
-        return RolloutOutputs(obs, action_dist(actor, obs, cfg), v, next_v)
+
+        def of_step(seen: PyTree, after: PyTree) -> tuple[Gaussian, jax.Array, jax.Array]:
+            return action_dist(actor, seen, cfg), values(params, seen, cfg), values(params, after, cfg)
+
+        if isinstance(obs, dict):  # pictures of one step at a time, to save memory
+            return RolloutOutputs(obs, *jax.lax.map(lambda x: of_step(*x), (obs, next_obs)))
+        return RolloutOutputs(obs, *of_step(obs, next_obs))
     inputs = Sequences(jnp.swapaxes(obs, 0, 1), jnp.swapaxes(first, 0, 1), carry)
     h, out = unroll(net_of(actor, cfg), actor["mean"], inputs)
     h, out = jnp.swapaxes(h, 0, 1), jnp.swapaxes(out, 0, 1)

@@ -13,12 +13,14 @@ import numpy as np
 import jaxsafe
 from jaxsafe.config import Bounds, ConfigError, flat
 from jaxsafe.learn.acting import Player, Playing
+from jaxsafe.learn.observations import observation_like, vector_of, with_vector
 from jaxsafe.learn.offline import DataSet, data_set
 from jaxsafe.run import dataset, run_folder
 from jaxsafe.run.policies import RunPolicies
-from jaxsafe.types import PyTree
+from jaxsafe.types import PyTree, State
 
 AT_ONCE = 1000  # episodes that one call of the compiled program plays, at most
+AT_ONCE_BYTES = 10**9  # of what is observed in them
 Size = Annotated[int, Bounds(1, 10**9)]  # transitions
 
 
@@ -30,9 +32,9 @@ class Ingredient(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """T steps of an episode, as they are recorded; `obs` is [T + 1, O]."""
+    """T steps of an episode, as they are recorded; `obs` is [T + 1, ...]."""
 
-    obs: jax.Array
+    obs: PyTree
     action: jax.Array
     reward: jax.Array
     cost: jax.Array
@@ -107,13 +109,16 @@ def episode(player: Player, key: jax.Array, obs_size: int, sampled: bool) -> Ste
     reset_key, act_key = jax.random.split(key)
     env = player.task
 
+    def seen(state: State) -> PyTree:
+        return with_vector(state.obs, vector_of(state.obs)[:obs_size])
+
     def step(now: Playing, t: jax.Array) -> tuple[Playing, Steps]:
         sample_key = jax.random.fold_in(act_key, t) if sampled else None
         action, carry = player.act(now.carry, now.state, sample_key)
         action = jnp.clip(action, -1.0, 1.0)
         after = env.step(now.state, action)
         made = Steps(
-            obs=after.obs[:obs_size],
+            obs=seen(after),
             action=action,
             reward=after.reward,
             cost=after.cost,
@@ -125,7 +130,9 @@ def episode(player: Player, key: jax.Array, obs_size: int, sampled: bool) -> Ste
 
     start = player.start(reset_key)
     _, steps = jax.lax.scan(step, start, jnp.arange(env.episode_length))
-    return steps._replace(obs=jnp.concatenate([start.state.obs[None, :obs_size], steps.obs]))
+    first = seen(start.state)
+    obs = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, steps.obs)
+    return steps._replace(obs=obs)
 
 
 def episodes(run: RunPolicies, steps: int, seed: int, sampled: bool) -> Iterator[tuple[int, Steps]]:
@@ -137,7 +144,9 @@ def episodes(run: RunPolicies, steps: int, seed: int, sampled: bool) -> Iterator
     policies = len(jax.tree.leaves(run.learned)[0])
     task = run.algo.task(jax.tree.map(lambda x: x[0], run.learned))
     wanted = math.ceil(steps / run.env.episode_length)
-    each = math.ceil(min(AT_ONCE, wanted) / policies)
+    seen = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(observation_like(run.env)))
+    fit = max(1, AT_ONCE_BYTES // (seen * run.env.episode_length))
+    each = math.ceil(min(AT_ONCE, fit, wanted) / policies)
 
     def of_one(learned: PyTree, keys: jax.Array) -> Steps:
         player = Player(run.algo.policy, learned, task)
@@ -175,7 +184,7 @@ def collect(
         ConfigError: runs of different tasks, or a run whose every episode has such numbers.
     """
     check_same_task([x.run for x in ingredients])
-    parts: list[dict[str, np.ndarray]] = []
+    parts: list[dict[str, Any]] = []
     recipe = []
     for number, (run, share) in enumerate(ingredients):
         wanted, have, kept, lost = math.ceil(share * size - 1e-6), 0, 0, 0
@@ -183,7 +192,7 @@ def collect(
         while have < wanted:
             policy, steps = next(source)
             made = arrays(steps)
-            if not all(np.isfinite(x).all() for x in made.values()):
+            if not all(np.isfinite(x).all() for x in jax.tree.leaves(made)):
                 lost += 1
                 if lost > max(10, 10 * kept):
                     raise ConfigError(f"{run.folder} plays episodes with numbers that are not finite")
@@ -195,7 +204,7 @@ def collect(
                 | {"run": np.full(count, number, np.int32), "policy": np.full(count, policy, np.int32)}
             )
         recipe.append(about(run) | {"share": share, "episodes": kept, "transitions": have})
-    whole: dict[str, Any] = {name: np.concatenate([x[name] for x in parts]) for name in parts[0]}
+    whole: dict[str, Any] = jax.tree.map(lambda *x: np.concatenate(x), *parts)
     run, policy, costs = (whole.pop(name) for name in ("run", "policy", "costs"))
     names = ingredients[0].run.env.cost_names
     data = data_set(**whole, costs={name: costs[:, k] for k, name in enumerate(names)})
@@ -221,8 +230,8 @@ def arrays(steps: Steps) -> dict[str, Any]:
     terminated = np.asarray(steps.terminated)[:count]
     last = np.arange(count) == count - 1
     return {
-        "obs": steps.obs[:count],
-        "next_obs": steps.obs[1 : count + 1],
+        "obs": jax.tree.map(lambda x: x[:count], steps.obs),
+        "next_obs": jax.tree.map(lambda x: x[1 : count + 1], steps.obs),
         "action": steps.action[:count],
         "reward": steps.reward[:count],
         "cost": steps.cost[:count],

@@ -14,6 +14,7 @@ What is written, as .npz or .hdf5:
     terminals                         bool [n]; the end of an episode by its time limit is none
     timeouts                          bool [n]; that end
     cost_NAME                         float [n], for each cost with a name
+    vision, next_vision               uint8 [n, height, width, channels], where there are pictures
 
 Transitions are in the order of their episodes. Without `timeouts` any order will do, and the episodes
 are not known. Other arrays in a file are left alone.
@@ -34,6 +35,7 @@ import h5py
 import numpy as np
 
 from jaxsafe.config import ConfigError, nearest, one_line
+from jaxsafe.learn.observations import vector_of
 from jaxsafe.learn.offline import DataSet, data_set
 from jaxsafe.run import checkpoint, files
 
@@ -46,6 +48,7 @@ ARRAYS = {
     "next_observations": ("next_obs", 2),
     "terminals": ("terminated", 1),
 }
+PICTURES = {"obs": "vision", "next_obs": "next_vision"}  # field -> name in the file
 NAMED = "cost_"  # begins the names of costs that have names
 OMNISAFE = {  # OmniSafe's name -> ours
     "obs": "observations",
@@ -103,7 +106,23 @@ def from_flat(path: str, source: Source) -> DataSet:
     raw = {name: checked(path, name, x, axes[name], raw["rewards"]) for name, x in raw.items()}
     costs = {name.removeprefix(NAMED): x for name, x in raw.items() if name.startswith(NAMED)}
     fields: Any = {field: raw[name] for name, (field, _) in ARRAYS.items()}
+    for field, name in PICTURES.items():
+        if "vision" in source.names:
+            picture = pictures(path, name, source, raw["rewards"])
+            fields[field] = {"vector": fields[field], "vision": picture}
     return data_set(**fields, truncated=raw.get("timeouts"), costs=costs)
+
+
+def pictures(path: str, name: str, source: Source, like: np.ndarray) -> np.ndarray:
+    if name not in source.names:
+        raise ConfigError(f"dataset={path} has vision, and no {name}")
+    x = source.read(name)
+    if x.dtype != np.uint8 or x.ndim != 4 or len(x) != len(like) or not x.size:
+        raise ConfigError(
+            f"dataset={path}: {name} is {x.dtype}{list(x.shape)}, expected uint8 [n, height, width, "
+            "channels], with the same n as rewards"
+        )
+    return x
 
 
 def from_omnisafe(path: str, source: Source, episode_length: int | None) -> DataSet:
@@ -168,7 +187,7 @@ def from_minari(path: str, source: Source) -> DataSet:
 
 def checked(path: str, name: str, x: np.ndarray, axes: int, like: np.ndarray) -> np.ndarray:
     """`x` as float32, if it is numbers of so many axes and as many as `like`."""
-    if x.dtype.kind not in "biuf" or x.ndim != axes or x.shape[:1] != like.shape[:1] or not x.size:
+    if x.dtype.kind not in "biuf" or x.ndim != axes or x.shape[:1] != like.shape[:1] or not len(x):
         shape = "[n, size]" if axes == 2 else "[n]"
         raise ConfigError(
             f"dataset={path}: {name} is {x.dtype}{list(x.shape)}, expected numbers {shape}, with "
@@ -257,7 +276,10 @@ def write_dataset(
         ConfigError: the name ends otherwise.
     """
     path = Path(path)
-    arrays = {name: np.asarray(getattr(data, field)) for name, (field, _) in ARRAYS.items()}
+    arrays = {name: np.asarray(vector_of(getattr(data, field))) for name, (field, _) in ARRAYS.items()}
+    if isinstance(data.obs, dict):
+        for field, name in PICTURES.items():
+            arrays[name] = np.asarray(getattr(data, field)["vision"])
     if data.episodes:
         arrays["timeouts"] = np.asarray(data.truncated)
     arrays |= {f"{NAMED}{name}": np.asarray(x) for name, x in data.costs.items()} | dict(more or {})

@@ -10,11 +10,11 @@ import io
 import textwrap
 import tokenize
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from jaxsafe import algos, envs
 from jaxsafe.config import flat
-from jaxsafe.envs.racing import task as racing
 from jaxsafe.envs.wrap import WrapConfig
 from jaxsafe.run.arguments import compose
 from jaxsafe.run.settings import Settings, TrainConfig, as_text
@@ -69,8 +69,9 @@ def about_env(settings: Settings) -> dict[str, str]:
     found["engine"] = "what computes the physics: auto, c, warp or jax"
     if isinstance(entry, dict):
         return comments(envs.SafetyGymConfig) | found
-    if entry in racing.ROWS.values():
-        return comments(envs.CarRacing) | found
+    kind = entry.func if isinstance(entry, partial) else entry
+    if kind in (envs.CarRacing, envs.Pendulum, envs.CartPendulum):
+        return comments(kind) | found
     return (comments(type(entry)) if isinstance(entry, envs.VelocityConfig) else {}) | found
 
 

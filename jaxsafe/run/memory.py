@@ -8,6 +8,7 @@ import jax
 
 from jaxsafe.config import ConfigError
 from jaxsafe.learn.model_based import ModelBasedConfig
+from jaxsafe.learn.observations import observation_like
 from jaxsafe.learn.planning import planning_bytes
 from jaxsafe.run import checkpoint, programs
 from jaxsafe.run.programs import Program
@@ -27,7 +28,8 @@ def check_memory(env: Env, settings: Settings) -> None:
     Lower bounds. Of a trajectory: observations before and after each step, actions and a few scalars.
     """
     limit, what = device_memory()
-    step = 4 * (2 * env.obs_size + env.action_size + 8 + len(env.cost_names))  # bytes
+    seen = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(observation_like(env)))
+    step = 2 * seen + 4 * (env.action_size + 8 + len(env.cost_names))  # bytes
     steps = settings.row.make(env, None).clocks(settings.algo).steps
     members = len(settings.configs) * settings.train.num_seeds
     need = step * steps * members // settings.train.devices

@@ -18,7 +18,7 @@ def test_a_row_tells_what_was_measured(tmp_path, monkeypatch, capsys):
         sys, "argv", ["benchmark", "hopper_velocity", *sizes.split(), "--json", str(rows)]
     )
     assert benchmark.main() == 0
-    assert "hopper_velocity  c     steps      1 x 3" in capsys.readouterr().out
+    assert "hopper_velocity  c     steps           1 x 3" in capsys.readouterr().out
     row = json.loads(rows.read_text())
     rate = row["env_steps_per_s"]
     assert row["physics_steps_per_s"] == pytest.approx(4 * rate)

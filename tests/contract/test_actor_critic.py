@@ -439,7 +439,7 @@ def test_a_bill_is_the_cost_of_real_steps_since_the_last_move_for_each_constrain
         "num_envs": 4, "horizon": 12, "learn_every": 6, "batch_size": 8, "replay_ratio": 1,
         "replay_size": 96, "learning_starts": 10_000, "hidden": (4,), "stagger": False,
         "dual_every": 48, "lam_init": 1.0, "dual_lr": 0.5, "cost_limits": {"a": 2.0, "b": 8.0},
-        "dual_damping": 0.2,
+        "dual_damping": 0.2, "dual_eps": 1e-8,
     }  # fmt: skip
     cfg, algo = ALGOS["td3_lag"].config(**settings), ALGOS["td3_lag"].make(env)
 

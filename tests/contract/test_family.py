@@ -112,7 +112,7 @@ def test_omnisafes_pcpo_steps_along_the_plain_gradient():
 
 def problem(cfg):
     keys = jax.random.split(jax.random.key(0), 3)
-    actor = init_params(keys[0], 3, 2, cfg)["actor"]
+    actor = init_params(keys[0], jnp.zeros(3), 2, cfg)["actor"]
     obs = jax.random.normal(keys[1], (64, 3))
     old = action_dist(actor, obs, cfg)
     action = sample(old, keys[2])

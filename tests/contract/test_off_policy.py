@@ -19,7 +19,7 @@ from toys import START, Arriving, Corridor, Lever, Ticker
 from jaxsafe.algos import ALGOS
 from jaxsafe.config import ConfigError
 from jaxsafe.learn.acting import Player
-from jaxsafe.learn.model_based import ModelBasedConfig
+from jaxsafe.learn.models import EnsembleConfig
 from jaxsafe.learn.next_step_rollout import collect_records
 from jaxsafe.learn.off_policy import OffPolicyConfig
 from jaxsafe.types import Env, Shared, State
@@ -27,8 +27,8 @@ from jaxsafe.types import Env, Shared, State
 NAMES = [
     name
     for name, entry in ALGOS.items()
-    if issubclass(entry.config, OffPolicyConfig) and not issubclass(entry.config, ModelBasedConfig)
-]  # those that plan have tests of their own
+    if issubclass(entry.config, OffPolicyConfig) and not issubclass(entry.config, EnsembleConfig)
+]  # those with a model have tests of their own
 # one of each kind of actor; one with critics of cost, a price and a delayed policy
 QUICK = ["sac", "td3_lag"]
 OTHERS = [pytest.param(name, marks=pytest.mark.slow) for name in NAMES if name not in QUICK]

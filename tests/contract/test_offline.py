@@ -148,7 +148,7 @@ def test_observations_are_normalised_by_the_data(name):
 def test_a_gradient_step_of_bc_by_hand():
     """One linear layer, Adam's first step: lr in the direction of the sign of the gradient."""
     cfg = bc.BCConfig(hidden=(), lr=0.01, obs_normalize=False, max_grad_norm=1e9)
-    learner = bc.learner(2)
+    learner = bc.learner(Corridor())
     fit: Any = learner.init(jax.random.key(0), 4, 2, cfg)
     data = linear_data()._replace(action=np.float32(3.0) * linear_data().action)  # clipped to [-1, 1]
     rows = np.array([0, 3, 5])

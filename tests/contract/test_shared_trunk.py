@@ -28,11 +28,11 @@ def networks() -> Any:
     the same as one network."""
 
     def build():
-        params = init_params(jax.random.key(0), 3, 2, CFG)
+        params = init_params(jax.random.key(0), jnp.zeros(3), 2, CFG)
         hidden = params["actor"]["mean"]["params"]["Dense_0"]
 
         def critic(key):
-            own = init_params(key, 3, 2, CFG)["critic_r"]["params"]
+            own = init_params(key, jnp.zeros(3), 2, CFG)["critic_r"]["params"]
             return {"params": own | {"Dense_0": hidden}}
 
         of_costs = jax.vmap(critic)(jax.random.split(jax.random.key(1)))

@@ -11,6 +11,7 @@ import jax
 import pytest
 
 from jaxsafe import envs
+from jaxsafe.learn.observations import observation_like, vector_of
 from jaxsafe.run.arguments import compose
 from jaxsafe.run.settings import make_env
 
@@ -71,7 +72,7 @@ def test_the_runs_of_a_page_could_start(page):
     for line in commands(page):
         if line[1] == "scripts/train.py" and not any(word.startswith("resume=") for word in line):
             env = make_env(compose(line[2:]))
-            assert jax.eval_shape(env.reset, jax.random.key(0)).obs.shape == (env.obs_size,)
+            assert vector_of(observation_like(env)).shape == (env.obs_size,)
 
 
 def commands(page: Path) -> list[list[str]]:

@@ -172,6 +172,7 @@ RENDERING = {
     "vision_size": (32, 24),
     "vision_render": False,
     "vision_render_size": (64, 48),
+    "vision_camera": "track",
 }
 TESTED_ALONE = {
     "reward_exception",
@@ -292,7 +293,6 @@ def test_all_of_amid_costs():
         ({"robot_base": "xmls/cat.xml"}, "did you mean 'car'"),
         ({"sensors_obs": ("gyros",)}, "no sensor 'gyros'; did you mean 'gyro'"),
         ({"observe_freejoint": True}, "no free joint"),
-        ({"observe_vision": True}, "vision is not available"),
         ({"reward_orientation": True, "reward_orientation_body": "robt"}, "did you mean 'robot'"),
         ({"frameskip_binom_p": 1.5}, "expected a number between 0 and 1"),
         ({"frameskip_binom_n": 0}, "expected a whole number between 1 and"),

@@ -143,7 +143,7 @@ def test_options_are_those_of_the_table(name, option, value):
 def test_27_tasks_and_the_others_are_registered_for_each_robot():
     suite = {f"{r}_{t}{i}" for r in SENSORS for t in ("goal", "button", "push") for i in "012"}
     assert len(suite) == 27 and suite < set(envs.ENVS)
-    extra = 3 * 2 + 3 * 5 + 6 + 2  # run and circle, grids, velocity tasks, racing
+    extra = 3 * 2 + 3 * 5 + 6 + 2 + 4  # run and circle, grids, velocity tasks, racing, pendulums
     assert len(envs.ENVS) == 27 + extra + 2 * 4 + 12  # Safety-Gymnasium's circles and run, SEditor's
 
 

@@ -12,7 +12,7 @@ from brax.envs.fast import ObservationMode
 from brax.envs.wrappers import training
 from brax.training.agents.ppo import train as ppo
 from compiling import FAST
-from toys import START, Corridor, Ticker
+from toys import START, Corridor, Patch, Ticker
 
 from jaxsafe import algos, envs
 from jaxsafe.config import ConfigError
@@ -69,6 +69,7 @@ def test_in_brax_s_wrappers_a_time_limit_truncates_and_an_end_does_not():
 def test_either_state_steps_alike_and_keeps_what_wrappers_add(adapt):
     env, key = adapt(Ticker()), jax.random.key(3)
     assert (env.observation_size, env.action_size) == (3, 1)
+    assert adapt(Patch()).observation_size == {"vector": (1,), "vision": (8, 8, 3)}
     first = env.reset(key)
     old = env.reset(jax.random.key_data(key))  # Brax's style of keys
     np.testing.assert_array_equal(first.obs, old.obs)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
-from toys import Corridor, Ticker
+from toys import Corridor, Patch, Ticker
 
 from jaxsafe import envs
 from jaxsafe.config import ConfigError
@@ -272,3 +272,18 @@ def test_without_gymnasium_there_is_one_line(monkeypatch):
     monkeypatch.delitem(sys.modules, "jaxsafe.interop.gymnasium")
     with pytest.raises(ConfigError, match=r"pip install 'jaxsafe\[gymnasium\]'"):
         importlib.import_module("jaxsafe.interop.gymnasium")
+
+
+def test_pictures_have_a_space_and_stay_whole():
+    env: Any = GymEnv(Patch())
+    assert env.observation_space["vision"] == gymnasium.spaces.Box(0, 255, (8, 8, 3), np.uint8)
+    obs, _ = env.reset(seed=0)
+    assert env.observation_space.contains(obs)
+    assert env.observation_space.contains(env.step(env.action_space.sample())[0])
+    several = GymVectorEnv(Patch(), num_envs=2)
+    seen, _ = several.reset(seed=0)
+    assert several.observation_space.contains(seen)
+    for _ in range(Patch.episode_length):
+        seen, *_, info = several.step(several.action_space.sample())
+    last = info["final_obs"][1]
+    assert last["vision"].shape == (8, 8, 3) and last["vector"] == 0 and seen["vector"][1] == 1

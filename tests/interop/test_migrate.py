@@ -136,8 +136,8 @@ SAC_LAG: dict[str, Any] = {
 PLAIN = ["env=point_goal1", "env.rules=safety_gymnasium"]
 
 
-def migrated(config: dict[str, Any], algo: str) -> migrate.Migrated:
-    found = migrate.omnisafe(config, algo, "SafetyPointGoal1-v0")
+def migrated(config: dict[str, Any], algo: str, env: str = "SafetyPointGoal1-v0") -> migrate.Migrated:
+    found = migrate.omnisafe(config, algo, env)
     arguments.check_arguments(found.argv)  # train.py takes it
     return found
 
@@ -423,11 +423,41 @@ def test_every_option_that_a_key_becomes_exists_in_its_family():
         assert {o for rule in own.values() for o in rule.ours.split()} <= fields
 
 
-def test_all_of_omnisafe_but_crabs_is_here_and_no_row_has_a_name_that_is_not_there():
+def test_all_of_omnisafe_is_here_and_no_row_has_a_name_that_is_not_there():
     ours = {theirs: migrate.family_of(algos.ALGOS[n]) for theirs, n in migrate.algorithms().items()}
-    assert list(migrate.MISSING) == ["CRABS"]
-    assert ours | migrate.MISSING == {n: kind for kind, names in THEIRS.items() for n in names.split()}
-    assert len(ours) == sum(bool(row.omnisafe) for row in algos.ALGOS.values()) == 44
+    assert ours == {n: kind for kind, names in THEIRS.items() for n in names.split()}
+    assert len(ours) == sum(bool(row.omnisafe) for row in algos.ALGOS.values()) == 45
+
+
+CRABS = {  # of OmniSafe's CRABS.yaml
+    "train_cfgs": {"num_epochs": 101, "raw_policy_episodes": 10},
+    "algo_cfgs": {
+        "steps_per_epoch": 6000, "batch_size": 256, "max_grad_norm": 40, "polyak": 0.005,
+        "exploration_noise": 2.0, "alpha": 0.2, "auto_alpha": False, "start_learning_steps": 10_000,
+    },
+    "transition_model_cfgs": {"n_ensemble": 5, "n_elites": 5, "train": {"batch_size": 256}},
+    "lyapunov": {"ell_coef": 1.0, "barrier_coef": 1},
+    "opt_s": {"temperature": {"max": 0.03, "min": 0.03}, "batch_size": 10_000, "method": "MALA"},
+    "opt_h": {"weight_decay": 0.0001, "lr": 0.0003, "lambda_2": "norm", "locals": {}},
+    "crabs": {"obj": {"eps": 0.01, "neg_coef": 1.0}},
+    "task": "train_policy",
+}  # fmt: skip
+
+
+def test_a_config_of_crabs_is_its_preset_with_omnisafes_temperature():
+    found = migrated(CRABS, "CRABS", "SafeInvertedPendulumSwing-v2")
+    assert not lost(found)
+    assert found.argv == [
+        "env=pendulum_swing", "algo=crabs", "preset=published", "compat=omnisafe", "total_steps=606000",
+        "algo.max_grad_norm=40.0", "algo.alpha_init=0.2", "algo.alpha_lr=0.0",
+    ]  # fmt: skip
+    other = {
+        "algo_cfgs": {"exploration_noise": 1.0},
+        "opt_s": {"temperature": {"max": 0.1, "min": 0.01}},
+    }
+    assert lost(migrated(other, "CRABS", "MyPendulumTilt-v0")) == [
+        "algo_cfgs.exploration_noise", "opt_s.temperature.max", "opt_s.temperature.min",
+    ]  # fmt: skip
 
 
 BCQ_LAG = {  # of OmniSafe's BCQLag.yaml
@@ -470,7 +500,7 @@ def test_offline_configs_count_gradient_steps_and_keep_a_path():
             "batch_size=0: expected a whole number between 1 and",
         ),
         ({}, "PPOlag", "point_goal1", "did you mean 'PPOLag'"),
-        ({}, "CRABS", "point_goal1", "CRABS is not here yet"),
+        ({}, "CRABS", "SafetyPointGoal1-v0", "CRABS is for SafeInvertedPendulumSwing-v2 alone"),
         ({}, "", "point_goal1", "add --algo"),
         ({}, "CPO", "", "add --env"),
         ({}, "CPO", "SafetyRacecarGoal1-v0", "no counterpart"),
@@ -530,7 +560,8 @@ def test_an_engine_dict_is_the_nearest_environment_and_the_rest():
     for name, message in (("hazard_num", "did you mean 'hazards_num'"), ("awake", "of Engine")):
         with pytest.raises(ConfigError, match=message):
             migrate.safety_gym({name: 3})
-    assert lost(migrate.safety_gym({"observe_vision": True})) == ["observe_vision"]
+    seen = migrate.safety_gym({**envs.ENVS["point_goal1"], "observe_vision": True})
+    assert seen.argv == ["env=point_goal1", "env.observe_vision=true"]
 
 
 def test_the_script_prints_a_command_and_refuses_in_a_line(tmp_path, capsys):

@@ -179,7 +179,7 @@ KEYS = jax.random.split(jax.random.key(0), 3)
 def problem():
     """A policy, and a batch of its actions, of which both together earn and the first costs."""
     cfg = CPOConfig(hidden=(8,))
-    actor = init_params(KEYS[0], 3, 2, cfg)["actor"]
+    actor = init_params(KEYS[0], jnp.zeros(3), 2, cfg)["actor"]
     obs = jax.random.normal(KEYS[1], (256, 3))
     old = action_dist(actor, obs, cfg)
     action = sample(old, KEYS[2])

@@ -9,7 +9,7 @@ from jaxsafe.nn.networks import LOG_STD, action_dist, init_params, value
 
 
 def params(**settings):
-    return init_params(jax.random.key(0), 5, 3, PPOConfig(**settings))
+    return init_params(jax.random.key(0), jnp.zeros(5), 3, PPOConfig(**settings))
 
 
 def test_torch_weights_and_biases_fill_their_interval():

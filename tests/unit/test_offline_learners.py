@@ -107,7 +107,7 @@ def elbo(vae, obs, action, eps, weight):
 
 def test_a_gradient_of_vae_bc():
     cfg = bc.VAEBCConfig(**LINEAR, vae_hidden=(), kl_weight=0.3)
-    learner = bc.autoencoder(2)
+    learner = bc.autoencoder(Corridor())
     nets, batch, at, b = prepared(learner, cfg)
     after, metrics = stepped(learner, nets, batch, at, cfg)
     eps = noise(at.key, (5, 4))

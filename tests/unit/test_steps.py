@@ -24,7 +24,7 @@ def problem(size=64):
     """A policy, and a batch of its actions."""
     cfg = PPOConfig(**SMALL)
     keys = jax.random.split(jax.random.key(0), 3)
-    params = init_params(keys[0], 3, 2, cfg)
+    params = init_params(keys[0], jnp.zeros(3), 2, cfg)
     obs = jax.random.normal(keys[1], (size, 3))
     old = action_dist(params["actor"], obs, cfg)
     action = sample(old, keys[2])

@@ -59,7 +59,7 @@ def test_no_gradient_gives_no_direction():
 
 def test_the_fisher_product_is_that_of_the_kls_hessian():
     cfg = CPOConfig(hidden=(3,), init="torch")
-    actor = init_params(jax.random.key(0), 2, 2, cfg)["actor"]
+    actor = init_params(jax.random.key(0), jnp.zeros(2), 2, cfg)["actor"]
     obs = jax.random.normal(jax.random.key(1), (16, 2))
     params, unravel = ravel_pytree(actor)
 
@@ -80,7 +80,7 @@ def test_a_kl_per_action_is_half_the_kl_of_two_actions():
     def step(**options):
         cfg = TRPOConfig(hidden=(8,), init="torch", **options)
         keys = jax.random.split(jax.random.key(0), 3)
-        actor = init_params(keys[0], 3, 2, cfg)["actor"]
+        actor = init_params(keys[0], jnp.zeros(3), 2, cfg)["actor"]
         obs = jax.random.normal(keys[1], (64, 3))
         old = action_dist(actor, obs, cfg)
         action = sample(old, keys[2])
@@ -128,7 +128,7 @@ def natural(step, **options):
 @partial(jax.jit, static_argnums=0, compiler_options=FAST)
 def taken(step, cfg):
     keys = jax.random.split(jax.random.key(0), 3)
-    actor = init_params(keys[0], 3, 2, cfg)["actor"]
+    actor = init_params(keys[0], jnp.zeros(3), 2, cfg)["actor"]
     obs = jax.random.normal(keys[1], (256, 3))
     old = action_dist(actor, obs, cfg)
     action = sample(old, keys[2])

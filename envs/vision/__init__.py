@@ -1,0 +1,1 @@
+"""Pictures for policies: what a camera in a MuJoCo model sees, cast in JAX on any device."""

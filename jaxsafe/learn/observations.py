@@ -1,0 +1,64 @@
+"""Observations: a vector, or a dict with the `vector` and `vision`, a picture beside it.
+
+A picture is uint8 [..., height, width, channels]. It stays so in rollouts and in the replay.
+"""
+
+from typing import Any, ClassVar, Literal
+
+import jax
+import jax.numpy as jnp
+
+from jaxsafe.config import ConfigError, config
+from jaxsafe.types import Env, PyTree
+
+
+@config
+class EncoderConfig:
+    """For algorithms that take pictures."""
+
+    TAKES_PICTURES: ClassVar = True  # False where an algorithm adds a part that takes vectors
+
+    # What becomes of pictures. cnn: convolutions make 128 numbers of them, which go with the vector.
+    # none: there are no pictures.
+    encoder: Literal["none", "cnn"] = "none"
+
+
+def vector_of(obs: PyTree) -> Any:
+    """Of an observation, what is not a picture."""
+    return obs["vector"] if isinstance(obs, dict) else obs
+
+
+def with_vector(obs: PyTree, vector: Any) -> PyTree:
+    """`obs` with another vector."""
+    return obs | {"vector": vector} if isinstance(obs, dict) else vector
+
+
+def observation_like(env: Env) -> Any:
+    """The shapes and types of what `env` observes. It is traced, not simulated."""
+    return jax.eval_shape(env.reset, jax.random.key(0)).obs
+
+
+def blank(like: PyTree) -> PyTree:
+    """Zeros of these shapes and types, to initialise networks with."""
+    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
+
+
+def check_observation(like: PyTree, cfg: Any) -> None:
+    """Refuse settings that do not fit what is observed.
+
+    Raises:
+        ConfigError: pictures without an encoder for them, an encoder without pictures, or parts that
+            no network takes.
+    """
+    takes = isinstance(cfg, EncoderConfig) and cfg.TAKES_PICTURES
+    shows = isinstance(like, dict)
+    if shows and like.keys() != {"vector", "vision"}:
+        raise ConfigError("env.observation_flatten=false: expected true, learners take a vector")
+    if shows and not takes:
+        raise ConfigError(
+            "env.observe_vision=true: this algorithm takes vectors; those that take pictures, as "
+            "ppo_lag, sac_lag and bc, have algo.encoder=cnn"
+        )
+    if takes and (cfg.encoder == "cnn") != shows:
+        seen = "env.observe_vision=true shows pictures" if shows else "the environment shows none"
+        raise ConfigError(f"encoder={cfg.encoder}: expected {'cnn' if shows else 'none'}, as {seen}")
