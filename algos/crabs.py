@@ -55,7 +55,7 @@ from jaxsafe.learn.replay import Span, Transitions
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.steps import Trainable, adam, descend_each, follow
 from jaxsafe.learn.treatments import no_treatment
-from jaxsafe.nn.critics import q_values
+from jaxsafe.nn.critics import q_values, smallest
 from jaxsafe.nn.ensemble import outputs_of
 from jaxsafe.nn.squashed import squashed_mean, squashed_policy
 from jaxsafe.types import Algorithm, Env, Metrics, PyTree, Shared
@@ -259,7 +259,7 @@ def crabs(env: Env) -> Learner:
 
         def loss(parts: dict[str, PyTree]) -> tuple[jax.Array, Metrics]:
             made = actor.propose(parts, batch.obs, policy_key, cfg)
-            q = q_values(nets.params["critic_r"], batch.obs, made.action, cfg).min(0)
+            q = smallest(q_values(nets.params["critic_r"], batch.obs, made.action, cfg))
             u = here.u(core_of(params), batch.obs, made.action, cfg)
             refused = (u > 0) & ~free
             climbed = batch.mean(jnp.where(refused, -REFUSED - u, q) + made.bonus)

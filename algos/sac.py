@@ -20,6 +20,7 @@ from jaxsafe.learn.off_policy import off_policy
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.steps import adam
 from jaxsafe.learn.treatments import Treatment, damped_lagrangian, no_treatment, pid
+from jaxsafe.nn.critics import smallest
 from jaxsafe.nn.squashed import init_squashed, squashed_mean, squashed_policy, squashed_sample
 from jaxsafe.types import Algorithm, Env, PyTree
 
@@ -135,7 +136,7 @@ def soft_actor(action_size: int) -> Actor:
         act=act,
         next_action=next_action,
         propose=propose,
-        pick=lambda q: q.min(0),
+        pick=smallest,
     )
 
 

@@ -33,7 +33,7 @@ from jaxsafe.learn.sequences import SequenceBatch, drawn_sequences, lambda_retur
 from jaxsafe.learn.steps import Trainable, adam, descend_each, follow
 from jaxsafe.learn.treatments import LagrangianConfig, Treatment, initial_price, lagrangian
 from jaxsafe.nn.beta import Beta, beta_mode, beta_policy, beta_sample, init_beta
-from jaxsafe.nn.critics import init_critics, q_values
+from jaxsafe.nn.critics import init_critics, q_values, smallest
 from jaxsafe.types import Algorithm, Count, Env, Metrics, PyTree
 
 Positive = Annotated[float, Bounds(1e-6, 1e6)]
@@ -224,7 +224,7 @@ def optimisers(cfg: Any, share: jax.Array | float) -> dict[str, optax.GradientTr
 
 def reward_value(params: dict[str, PyTree], obs: jax.Array, action: jax.Array, cfg: Any) -> jax.Array:
     """Q_r, the smaller value, float [...]."""
-    return q_values(params["critic_r"], obs, action, cfg).min(0)
+    return smallest(q_values(params["critic_r"], obs, action, cfg))
 
 
 def proposer_gain(

@@ -60,8 +60,8 @@ FAMILIES = {  # the pages of docs/theory
     ),
     "recorded_data": ("bcq", "bcq_lag", "crr", "ccrr", "coptidice"),
     "planning": ("pets", "cce_pets", "rce_pets", "cap_pets", "loop", "safe_loop"),
-    "world_models": ("dreamer", "dreamer_lag", "ambs"),
     "certificates": ("crabs",),
+    "world_models": ("dreamer", "dreamer_lag", "ambs"),
 }
 PLANNING = " env.observation=coordinates env.wrap.action_repeat=5 algo.learn_cost=false"
 LOOPS = {  # the first that an algorithm's config is one of
@@ -81,8 +81,7 @@ How families work, step by step: [prices](../theory/prices.md),
 [trust regions](../theory/trust_region.md), [penalties](../theory/penalties.md),
 [budgets in the state](../theory/budgets.md), [values of actions](../theory/actor_critics.md),
 [recorded data](../theory/recorded_data.md), [planning](../theory/planning.md),
-[world models](../theory/world_models.md),
-[certificates](../theory/certificates.md).
+[certificates](../theory/certificates.md), [world models](../theory/world_models.md).
 
 The on-policy algorithms share these options:
 

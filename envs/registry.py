@@ -39,6 +39,9 @@ ALIASES |= racing.ALIASES | pendulum.ALIASES
 # options that an alias stands for, beside a name
 IMPLIED: dict[str, dict[str, Any]] = {a: options for a, (_, options) in velocities.aliases().items()}
 IMPLIED |= {suite.their_id(name): {"rules": "safety_gymnasium"} for name in suite.ruled()}
+for their, name in suite.seeing(ALIASES).items():
+    IMPLIED[their] = IMPLIED.get(suite.blind(their), {}) | suite.picture(their)
+    ALIASES[their] = name
 
 
 def register(name: str, env: Any) -> None:

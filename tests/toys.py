@@ -194,6 +194,31 @@ class Lever:
 
 
 @dataclass(frozen=True)
+class Ledge:
+    """A point on a line that is paid for standing far to the right, where a step beyond 1/2 is unsafe.
+
+    Observation [1]: x in [-1, 1], 0 at first. An action moves it by up to 0.3. Reward: x. Cost: 1 where
+    x > 1/2. In an episode of 10 steps there are 8.9 to earn, with 9 violations, or 4.8 without any.
+    """
+
+    obs_size: int = 1
+    action_size: int = 1
+    episode_length: int = 10
+    cost_names: tuple[str, ...] = ("beyond",)
+
+    def reset(self, key: jax.Array) -> State:
+        return dataclasses.replace(self._state(jnp.zeros(())), reward=jnp.zeros(()))
+
+    def step(self, state: State, action: jax.Array) -> State:
+        x = state.physics + 0.3 * jnp.clip(action[0], -1.0, 1.0)
+        return self._state(jnp.clip(x, -1.0, 1.0))
+
+    def _state(self, x: jax.Array) -> State:
+        cost = (x > 0.5).astype(jnp.float32)
+        return State(x, x[None], x, cost, cost[None], jnp.bool_(False), {})
+
+
+@dataclass(frozen=True)
 class Patch:
     """A picture with a green patch, at whose column to point, and a red one to keep away from.
 
@@ -228,28 +253,3 @@ class Patch:
         left = jnp.reshape(1 - passed / self.episode_length, (1,))
         obs = {"vision": picture, "vector": left}
         return State(key, obs, reward, cost, cost[None], jnp.bool_(False), {})
-
-
-@dataclass(frozen=True)
-class Ledge:
-    """A point on a line that is paid for standing far to the right, where a step beyond 1/2 is unsafe.
-
-    Observation [1]: x in [-1, 1], 0 at first. An action moves it by up to 0.3. Reward: x. Cost: 1 where
-    x > 1/2. In an episode of 10 steps there are 8.9 to earn, with 9 violations, or 4.8 without any.
-    """
-
-    obs_size: int = 1
-    action_size: int = 1
-    episode_length: int = 10
-    cost_names: tuple[str, ...] = ("beyond",)
-
-    def reset(self, key: jax.Array) -> State:
-        return dataclasses.replace(self._state(jnp.zeros(())), reward=jnp.zeros(()))
-
-    def step(self, state: State, action: jax.Array) -> State:
-        x = state.physics + 0.3 * jnp.clip(action[0], -1.0, 1.0)
-        return self._state(jnp.clip(x, -1.0, 1.0))
-
-    def _state(self, x: jax.Array) -> State:
-        cost = (x > 0.5).astype(jnp.float32)
-        return State(x, x[None], x, cost, cost[None], jnp.bool_(False), {})

@@ -12,6 +12,7 @@ from jaxsafe.envs.engines import Physics, Readings
 from jaxsafe.envs.safety_gym import layout as layouts
 from jaxsafe.envs.safety_gym import scene as scenes
 from jaxsafe.envs.safety_gym.config import SafetyGymConfig
+from jaxsafe.envs.vision.poses import rotation_of
 
 
 @flax.struct.dataclass
@@ -177,21 +178,3 @@ def pose(xy: jax.Array, height: float, heading: jax.Array) -> jax.Array:
     zero = jnp.zeros_like(heading)
     quat = jnp.stack([jnp.cos(heading / 2), zero, zero, jnp.sin(heading / 2)], -1)
     return jnp.concatenate([xy, z[..., None], quat], -1)
-
-
-def rotation_of(quat: jax.Array) -> jax.Array:
-    """Rotation matrix [3, 3] of a quaternion [4], w first."""
-    w, x, y, z = quat / norm(quat)
-    return jnp.stack(
-        [
-            w * w + x * x - y * y - z * z,
-            2 * (x * y - w * z),
-            2 * (x * z + w * y),
-            2 * (x * y + w * z),
-            w * w - x * x + y * y - z * z,
-            2 * (y * z - w * x),
-            2 * (x * z - w * y),
-            2 * (y * z + w * x),
-            w * w - x * x - y * y + z * z,
-        ]
-    ).reshape(3, 3)

@@ -12,7 +12,8 @@ from jaxsafe.envs.engines import Readings
 from jaxsafe.envs.safety_gym import layout as layouts
 from jaxsafe.envs.safety_gym import scene as scenes
 from jaxsafe.envs.safety_gym import sensing
-from jaxsafe.envs.safety_gym.arena import Arena, World, norm, rotation_of
+from jaxsafe.envs.safety_gym.arena import Arena, World, norm
+from jaxsafe.envs.vision.poses import rotation_of
 
 COORDINATE_SENSORS = ("velocimeter", "accelerometer", "gyro", "magnetometer")
 HAZARDS_AT = 9  # numbers before the hazards', where coordinates are observed

@@ -241,3 +241,25 @@ def alias(name: str) -> str:
     head = "Testing" if task.startswith("grid") else "Safexp"
     task = task.replace("gridwall", "GridWall").capitalize() if task != "gridwall" else "GridWall"
     return f"{head}-{robot.capitalize()}{task}-v0"
+
+
+def seeing(aliases: dict[str, str]) -> dict[str, str]:
+    """The ids of tasks with a picture, of those without: Safexp-CarPush1Vision-v0 is car_push1, and so
+    is SafetyCarPush1Vision-v0."""
+    tasks = {**suite(), **circles_and_runs()}
+    return {
+        f"{their.removesuffix('-v0')}Vision-v0": name
+        for their, name in aliases.items()
+        if name in tasks
+    }
+
+
+def blind(their: str) -> str:
+    """The id of a task without a picture."""
+    return their.replace("Vision-v0", "-v0")
+
+
+def picture(their: str) -> dict[str, Any]:
+    """Options of an id with a picture. Safety-Gymnasium's are of 256 x 256 pixels."""
+    large = {} if their.startswith("Safexp") else {"vision_size": (256, 256)}
+    return {"observe_vision": True, **large}

@@ -104,7 +104,7 @@ def make_eye(model: mujoco.MjModel, camera: str, size: tuple[int, int]) -> Eye:
         def draw(v: jax.Array) -> jax.Array:
             return packed(colours(drawing, view, jnp.asarray(u)[None, :], v[:, None]))
 
-        # A loop, because XLA would else make its outputs, of three channels, of all of this anew each.
+        # in a loop: fused with the unpacking, XLA would draw every pixel once for each channel
         pixels = jax.lax.map(draw, jnp.asarray(bands)).reshape(-1, width)[:height]
         return jax.lax.bitcast_convert_type(pixels, jnp.uint8)[..., :3]
 

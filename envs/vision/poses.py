@@ -29,9 +29,9 @@ def rotation_of(quat: jax.Array) -> jax.Array:
     quat = quat / jnp.sqrt(jnp.square(quat).sum(-1, keepdims=True))
     w, x, y, z = jnp.moveaxis(quat, -1, 0)
     rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
     ]
     return jnp.stack([jnp.stack(row, -1) for row in rows], -2)
 

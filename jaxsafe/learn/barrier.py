@@ -35,6 +35,7 @@ import optax
 from jaxsafe.config import Amount, Bounds, ConfigError, Rate, Units, Weight, config
 from jaxsafe.learn.batch import select
 from jaxsafe.learn.models import FARTHEST
+from jaxsafe.nn.critics import largest
 from jaxsafe.nn.networks import MLP
 from jaxsafe.types import Env, PyTree
 
@@ -129,8 +130,7 @@ class System(NamedTuple):
     def u(self, core: Core, obs: jax.Array, action: jax.Array, cfg: Any) -> jax.Array:
         """u, float [...], for `obs` [..., O] and `action` [..., A]."""
         h = self.h(core.barrier, self.foresee(core.model, obs, action, cfg), cfg)
-        worst = jnp.argmax(h, axis=0)  # the gradient of max is NaN where h is rounded in two ways
-        return jnp.take_along_axis(h, worst[None], axis=0)[0]
+        return largest(h)
 
     def judge(self, core: Core, obs: jax.Array, cfg: Any) -> tuple[jax.Array, jax.Array]:
         """h and u + eps of the policy at `obs` [..., O], float [...] each."""

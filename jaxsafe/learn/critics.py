@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxsafe.learn.constraints import Names, each
 from jaxsafe.learn.replay import Transitions
 from jaxsafe.learn.treatments import Treatment, no_treatment
-from jaxsafe.nn.critics import init_critics, q_values
+from jaxsafe.nn.critics import init_critics, largest, q_values
 from jaxsafe.types import Metrics, PyTree
 
 
@@ -74,7 +74,7 @@ def reduced_costs(
 ) -> jax.Array:
     """Q_c, float [B] or [B, K]."""
     q_c = cost_values(critics, obs, action, names, cfg)
-    return q_c.max(0) if cfg.cost_reduce == "max" else q_c.mean(0)
+    return largest(q_c) if cfg.cost_reduce == "max" else q_c.mean(0)
 
 
 def expected_cost(

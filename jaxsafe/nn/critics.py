@@ -22,3 +22,17 @@ def q_values(critics: PyTree, obs: jax.Array, action: jax.Array, cfg: Any) -> ja
     pair = jnp.concatenate([obs, action], -1)
     out: Any = jax.vmap(lambda critic: coarse_mlp(cfg, 1, cfg.layer_norm).apply(critic, pair))(critics)
     return out[..., 0]
+
+
+def smallest(values: jax.Array) -> jax.Array:
+    """Over the first axis, of values [count, ...]. Its gradient is that of one of them.
+
+    The gradient of `values.min(0)` looks for those that equal the result. It is NaN where a compiled
+    program rounds the values in two ways, so that none does.
+    """
+    return jnp.take_along_axis(values, values.argmin(0)[None], 0)[0]
+
+
+def largest(values: jax.Array) -> jax.Array:
+    """As `smallest`."""
+    return jnp.take_along_axis(values, values.argmax(0)[None], 0)[0]

@@ -67,6 +67,9 @@ def test_every_environment_of_the_suite_has_an_id():
     assert ruled == {"env": "car_push2", "rules": "safety_gymnasium"}
     older = gymnasium.spec("jaxsafe/SafetyAntVelocity-v0").kwargs
     assert older == {"env": "ant_velocity", "thresholds": "v0"}
+    seeing = gymnasium.spec("jaxsafe/SafetyCarPush2Vision-v0").kwargs
+    assert seeing == ruled | {"observe_vision": True, "vision_size": (256, 256)}
+    assert gymnasium.spec("jaxsafe/PointGoal1Vision-v0").kwargs == kwargs[0] | {"observe_vision": True}
 
 
 @pytest.mark.filterwarnings("error")

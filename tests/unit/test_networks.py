@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from jaxsafe.algos.ppo import PPOConfig
+from jaxsafe.nn.critics import largest, smallest
 from jaxsafe.nn.gaussian import log_prob
 from jaxsafe.nn.networks import LOG_STD, action_dist, init_params, value
 
@@ -73,3 +74,12 @@ def test_gradients_reach_every_parameter_and_are_finite(settings):
 
     for x in jax.tree.leaves(jax.grad(total)(tree)):
         assert jnp.isfinite(x).all() and (x != 0).any()
+
+
+def test_the_gradient_of_the_smallest_value_is_that_of_one():
+    values = jnp.array([[1.0, 5.0, 2.0], [3.0, 4.0, 2.0]])
+    np.testing.assert_array_equal(smallest(values), [1, 4, 2])
+    np.testing.assert_array_equal(largest(values), [3, 5, 2])
+    slope = jax.grad(lambda values: smallest(values).sum())(values)
+    np.testing.assert_array_equal(slope, [[1, 0, 1], [0, 1, 0]])
+    assert jnp.isnan(smallest(values.at[1, 0].set(jnp.nan))[0])
