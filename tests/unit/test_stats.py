@@ -134,5 +134,5 @@ def test_a_drawn_band_ends_where_its_measure_ends():
     axes = Figure().subplots()
     for measure in ("train/return", "train/cost"):
         plots.band(axes, measure, np.arange(2), values, "")
-    low = [band.get_paths()[0].vertices[:, 1].min() for band in axes.collections]
+    low = [np.asarray(band.get_paths()[0].vertices)[:, 1].min() for band in axes.collections]
     assert low[0] < -1 and low[1] == 0
