@@ -30,9 +30,15 @@ def smallest(values: jax.Array) -> jax.Array:
     The gradient of `values.min(0)` looks for those that equal the result. It is NaN where a compiled
     program rounds the values in two ways, so that none does.
     """
-    return jnp.take_along_axis(values, values.argmin(0)[None], 0)[0]
+    return _row(values, values.argmin(0))
 
 
 def largest(values: jax.Array) -> jax.Array:
     """As `smallest`."""
-    return jnp.take_along_axis(values, values.argmax(0)[None], 0)[0]
+    return _row(values, values.argmax(0))
+
+
+def _row(values: jax.Array, index: jax.Array) -> jax.Array:
+    """`values[index]`, elementwise; without a gather, whose gradient would be a scatter."""
+    rows = jnp.arange(len(values)).reshape(-1, *(1,) * index.ndim)
+    return jnp.where(rows == index, values, 0.0).sum(0)

@@ -167,17 +167,27 @@ def read_yaml(path: Path) -> Any:
     """
     text = read_text(path)
     with reading(path):
-        depth = 0
-        for event in yaml.parse(text, LOADER):  # the loader calls itself for each level
+        check_events(text, path)
+        found = yaml.load(text, LOADER)
+        check_plain(found, path)
+    return found
+
+
+def check_events(text: str, path: Path) -> None:
+    """Refuse what is costly to load: aliases, and levels, for each of which the loader calls itself."""
+    depth = 0
+    try:
+        for event in yaml.parse(text, LOADER):
             depth += isinstance(event, yaml.CollectionStartEvent)
             depth -= isinstance(event, yaml.CollectionEndEvent)
             if depth > DEEPEST:
                 raise ConfigError(TOO_DEEP.format(path))
             if isinstance(event, yaml.AliasEvent):  # a few lines of them stand for billions of values
                 raise ConfigError(f"{path} holds an alias, *{event.anchor}; expected plain values")
-        found = yaml.load(text, LOADER)
-        check_plain(found, path)
-    return found
+    except yaml.MarkedYAMLError as error:
+        if error.context == "while increasing flow level":  # a bound of newer builds of libyaml
+            raise ConfigError(TOO_DEEP.format(path)) from None
+        raise
 
 
 def read_json(path: Path) -> Any:
