@@ -358,7 +358,7 @@ def test_each_critic_learns_its_own_cost():
     np.testing.assert_allclose(values, [0.5, 1.5], atol=0.1)
 
 
-@pytest.mark.parametrize("name", ["cpo", "ppo_lag"])
+@pytest.mark.parametrize("name", [pytest.param("cpo", marks=pytest.mark.slow), "ppo_lag"])
 def test_limits_are_leaves_and_train_side_by_side(name):
     algo = ALGOS[name].make(Levers())
     cfg = ALGOS[name].config(**TINY, cost_limits={"paint": 8.0, "noise": 4.0})
