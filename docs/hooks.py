@@ -4,13 +4,18 @@
   the part of a title before its colon.
 - Links to files that are no part of the site lead to copies of them in source/, as text; links to
   folders without README.md to a list of what is in them.
+- Equations of algorithms are typeset: `equations.drawn`.
 - Docstrings of the reference get lists of fields, and blank lines before sections: `laid_out`.
 """
 
 import posixpath
 import re
+import sys
 from pathlib import Path
 from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parent))
+from equations import drawn
 
 ROOT = Path(__file__).parent.parent
 SOURCES = "docs/source/"  # if it were a folder: where the copies are on the site
@@ -107,4 +112,5 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
-    return relinked(markdown, f"docs/{page.file.src_uri}")
+    text = relinked(markdown, f"docs/{page.file.src_uri}")
+    return drawn(text) if page.file.src_uri.startswith("algorithms/") else text

@@ -14,6 +14,7 @@ ROOT = Path(__file__).parent.parent.parent
 DOCS = ROOT / "docs"
 sys.path.insert(0, str(DOCS))
 hooks = importlib.import_module("hooks")
+equations = importlib.import_module("equations")
 PAGES = sorted(DOCS.rglob("*.md"))
 
 
@@ -116,3 +117,22 @@ def test_every_task_of_the_suite_has_a_small_picture():
     drawn = {f"{robot}_{task}" for robot in ("point", "car", "doggo") for task in tasks}
     assert set(found) == drawn | set(velocities.suite())
     assert max(found.values()) <= 25_000
+
+
+def test_equations_of_algorithms_are_typeset():
+    line = equations.line
+    assert line("Q' <- Q' + tau_x (Q - 1e-6)", {"tau_x"}) == (
+        "<i>Q</i>′ ← <i>Q</i>′ + tau_x (<i>Q</i> − 1e-6)"
+    )
+    assert line("sum_j (y_c - lam)^2 <= cost_limit") == (
+        "Σ<sub><i>j</i></sub> (<i>y</i><sub><i>c</i></sub> − <i>λ</i>)<sup>2</sup> ≤ cost_limit"
+    )
+    assert line("x'b of a < b, Dreamer's, a policy") == (
+        "<i>x</i>′<i>b</i> of <i>a</i> &lt; <i>b</i>, Dreamer's, a policy"
+    )
+    page = "Before\n```text\nR  = c,   by `kappa_lr`\n     H\n```\nafter, `algo.kappa_lr`\n"
+    assert equations.drawn(page) == (
+        'Before\n<div class="equations"><table class="equations">'
+        "<tr><td><i>R</i></td><td>= <i>c</i>,&emsp;by <code>kappa_lr</code></td></tr>"
+        "<tr><td></td><td><i>H</i></td></tr></table></div>\nafter, `algo.kappa_lr`\n"
+    )
