@@ -13,6 +13,25 @@ LAYERS = ((32, 8, 4), (64, 4, 2), (64, 3, 1))  # channels, side of the kernel, s
 FEATURES = 128  # numbers that the picture becomes
 
 
+def patches(x: jax.Array, side: int, stride: int) -> jax.Array:
+    """The squares of `side` that a convolution sees, [..., H / stride, W / stride, side side C].
+
+    Borders are padded with zeros. A product of these and a matrix is a convolution. On a CPU XLA
+    computes it in a loop, as of gradient steps, 25 times as fast as its own convolution.
+    """
+    height, width = (-(-n // stride) for n in x.shape[-3:-1])
+    missing = [
+        max((out - 1) * stride + side - n, 0)
+        for n, out in zip(x.shape[-3:-1], (height, width), strict=True)
+    ]
+    x = jnp.pad(x, [(0, 0)] * (x.ndim - 3) + [(m // 2, m - m // 2) for m in missing] + [(0, 0)])
+    last = ((height - 1) * stride + 1, (width - 1) * stride + 1)
+    shifts = [(i, j) for i in range(side) for j in range(side)]
+    return jnp.concatenate(
+        [x[..., i : i + last[0] : stride, j : j + last[1] : stride, :] for i, j in shifts], -1
+    )
+
+
 class CNN(nn.Module):
     """{'vision' uint8 [..., H, W, C], 'vector' float [..., O]} -> float [..., FEATURES + O].
 
@@ -32,10 +51,8 @@ class CNN(nn.Module):
         weights = nn.initializers.orthogonal(math.sqrt(2.0))
         x = obs["vision"].astype(jnp.float32) / 255
         for channels, side, stride in LAYERS:
-            layer = nn.Conv(
-                channels, (side, side), stride, precision=self.precision, kernel_init=weights
-            )
-            x = nn.relu(layer(x))
+            layer = nn.Dense(channels, precision=self.precision, kernel_init=weights)
+            x = nn.relu(layer(patches(x, side, stride)))
         x = x.reshape(*x.shape[:-3], math.prod(x.shape[-3:]))
         x = nn.Dense(FEATURES, precision=self.precision, kernel_init=weights)(x)
         return jnp.concatenate([nn.tanh(nn.LayerNorm()(x)), obs["vector"]], -1)

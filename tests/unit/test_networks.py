@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from jaxsafe.algos.ppo import PPOConfig
+from jaxsafe.nn.cnn import patches
 from jaxsafe.nn.critics import largest, smallest
 from jaxsafe.nn.gaussian import log_prob
 from jaxsafe.nn.networks import LOG_STD, action_dist, init_params, value
@@ -83,3 +84,17 @@ def test_the_gradient_of_the_smallest_value_is_that_of_one():
     slope = jax.grad(lambda values: smallest(values).sum())(values)
     np.testing.assert_array_equal(slope, [[1, 0, 1], [0, 1, 0]])
     assert jnp.isnan(smallest(values.at[1, 0].set(jnp.nan))[0])
+
+
+@pytest.mark.parametrize("side, stride", [(8, 4), (4, 2), (3, 1)])
+def test_patches_times_a_matrix_are_a_convolution(side, stride):
+    keys = jax.random.split(jax.random.key(0))
+    x, kernel = (
+        jax.random.normal(keys[0], (2, 10, 13, 3)),
+        jax.random.normal(keys[1], (side, side, 3, 5)),
+    )
+    names = ("NHWC", "HWIO", "NHWC")
+    exact = {"dimension_numbers": names, "precision": jax.lax.Precision.HIGHEST}
+    expected = jax.lax.conv_general_dilated(x, kernel, (stride, stride), "SAME", **exact)
+    found = jnp.matmul(patches(x, side, stride), kernel.reshape(-1, 5), precision="highest")
+    np.testing.assert_allclose(found, expected, atol=1e-4)
