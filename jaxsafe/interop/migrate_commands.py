@@ -4,9 +4,8 @@
     jaxsafe migrate alf "python -m alf.bin.train --conf seditor_safety_gym_conf.py --conf_param=..."
 
 Of SEditor's configs the first has `algo=seditor` and the one without an editor `algo=sac_lag`, each on
-SEditor's own tasks. AMBS's algorithms are not here yet: the command has their task, seed, steps and
-environments, and the default algorithm. Source: the READMEs and configs of sacktock/AMBS @5184901 and
-hnyu/seditor @f78b720.
+SEditor's own tasks. A command of AMBS has `algo=ambs` with the preset of its penalty, on vectors.
+Source: the READMEs and configs of sacktock/AMBS @5184901 and hnyu/seditor @f78b720.
 """
 
 import ast
@@ -25,12 +24,17 @@ EDITED = STEPS | {"algo": "seditor", "preset": "published"}
 ALONE = STEPS | {"algo": "sac_lag", "num_envs": 32, "algo.cost_limit": 0.5}  # 5e-4 in 1,000 steps
 
 
+def never(value: Any) -> bool:
+    return False
+
+
 class Flag(NamedTuple):
-    """What becomes of a flag: `turn(value)` gives options, `note` says why there is none."""
+    """What becomes of a flag: `turn(value)` gives options, `note` says why there is none, and
+    `lost(value)` whether it asked for more."""
 
     turn: Callable[[Any], dict[str, Any]] = lambda value: {}
     note: str = ""
-    lost: bool = True
+    lost: Callable[[Any], Any] = lambda value: True
 
 
 def ambs_task(value: str) -> dict[str, Any]:
@@ -56,26 +60,25 @@ def seditor_task(value: Any) -> dict[str, Any]:
     return {"env": f"seditor_{name}"}
 
 
-SHIELD = "the shield and its penalties are not available yet"
 AMBS: dict[str, Flag] = {
     "task": Flag(ambs_task),
     "seed": Flag(lambda value: {"seed": convert(value, Seed, "--seed")}),
     "run.steps": Flag(ambs_steps),
     "envs.amount": Flag(lambda value: {"num_envs": value}),
-    "logdir": Flag(note="run_dir names a run's folder", lost=False),
-    "configs": Flag(note="sizes of a world model, and pixels, which are not available yet"),
-    "penalty_coeff": Flag(note=SHIELD),
-    "plpg": Flag(note=SHIELD),
-    "copt": Flag(note=SHIELD),
-    "penl_critic_type": Flag(note=SHIELD),
-    "normalise_ret": Flag(note=SHIELD),
+    "logdir": Flag(note="run_dir names a run's folder", lost=never),
+    "configs": Flag(note="ambs takes vectors here, and its presets have size=12m"),
+    "penalty_coeff": Flag(lambda value: {"algo.penalty_coef": value}),
+    "plpg": Flag(lambda value: {"preset": "plpg"} if value else {}, "off", lost=never),
+    "copt": Flag(lambda value: {"preset": "copt"} if value else {}, "off", lost=never),
+    "penl_critic_type": Flag(note="both of its types are the same critic", lost=never),
+    "normalise_ret": Flag(note="no option: rewards keep their weight, as with False", lost=bool),
 }
 ALF: dict[str, Flag] = {
     "create_environment.env_name": Flag(seditor_task),
     "create_environment.num_parallel_environments": Flag(lambda value: {"num_envs": value}),
     "TrainerConfig.num_env_steps": Flag(lambda value: {"total_steps": value}),
     "TrainerConfig.random_seed": Flag(lambda value: {"seed": value}),
-    "root_dir": Flag(note="run_dir names a run's folder", lost=False),
+    "root_dir": Flag(note="run_dir names a run's folder", lost=never),
 }
 
 
@@ -85,10 +88,9 @@ def ambs(command: str) -> Migrated:
     Raises:
         ConfigError: a task without counterpart, no task, or a value that cannot be.
     """
-    flags = dict(flags_of(command))
-    found, lines = turned(flags, AMBS)
-    lines.append(Line("algo", "AMBS", "approximate model-based shielding is not available yet", True))
-    return migrated({"env.wrap.action_repeat": AMBS_REPEAT} | found, lines, "--task")
+    found, lines = turned(dict(flags_of(command)), AMBS)
+    begin = {"algo": "ambs", "preset": "penl", "env.wrap.action_repeat": AMBS_REPEAT}
+    return migrated(begin | found, lines, "--task")
 
 
 def alf(command: str) -> Migrated:
@@ -153,7 +155,7 @@ def turned(flags: dict[str, Any], rules: dict[str, Flag]) -> tuple[dict[str, Any
         options = rule.turn(value)
         found |= options
         text = " ".join(as_option(k, v) for k, v in options.items()) or rule.note
-        lines.append(Line(name, value, text, lost=not options and rule.lost))
+        lines.append(Line(name, value, text, lost=not options and bool(rule.lost(value))))
     return found, lines
 
 

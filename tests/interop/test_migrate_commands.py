@@ -21,14 +21,23 @@ ALF = (
 )
 
 
-def test_a_command_of_ambs_keeps_task_seed_and_frames():
+def test_a_command_of_ambs_keeps_task_seed_frames_and_penalty():
     found = ambs(AMBS)
     settings = compose(found.argv)
     assert (settings.env_name, settings.train.seed) == ("point_goal1", 3)
     assert settings.train.total_steps == 1_000_000  # frames: its steps have two raw ones
     assert settings.env_options["wrap"]["action_repeat"] == 2
     lost = {line.key for line in found.lines if line.lost}
-    assert lost == {"configs", "penalty_coeff", "plpg", "normalise_ret", "penl_critic_type", "algo"}
+    assert lost == {"configs"}
+    assert settings.algo_name == "ambs" and settings.algo.imagine_steps == 15
+    assert (settings.algo.penalty, settings.algo.penalty_coef, settings.algo.size) == (
+        "plpg",
+        0.8,
+        "12m",
+    )
+    penl = ambs(AMBS.replace("--plpg True --normalise_ret False", "--normalise_ret True"))
+    assert compose(penl.argv).algo.penalty == "penl"
+    assert {line.key for line in penl.lines if line.lost} == {"configs", "normalise_ret"}
 
 
 def test_a_command_of_alf_keeps_task_seed_and_seditor_s_settings():
@@ -75,7 +84,7 @@ def test_an_unknown_flag_is_named_with_the_nearest():
     assert line.lost and "did you mean 'penalty_coeff'" in line.text
 
 
-@pytest.mark.parametrize("source, command, lost", [("ambs", AMBS, 6), ("alf", ALF, 0)])
+@pytest.mark.parametrize("source, command, lost", [("ambs", AMBS, 1), ("alf", ALF, 0)])
 def test_the_command_prints_what_to_type_and_what_is_lost(source, command, lost, capsys):
     assert typed("migrate", source, command) == 0
     out, err = capsys.readouterr()
