@@ -62,10 +62,10 @@ class AMBSConfig(dreamer.DreamerConfig):
     copies of it. They foresee its random numbers, too, and only the actions differ. It shows what a
     learned model costs. The policy then needs the simulator wherever it acts.
 
-    What the shield guarantees: if the model is exact, m dreams are at least ln(1 / confidence) / (2
-    eps^2), and C and V_i are known, then where it lets pi act, pi keeps the probability of a violation
-    within T steps below delta, wrong with a probability of `confidence` at most. What it does not: the
-    model and the critics are learned, and the bound says nothing of the safe policy.
+    What the shield guarantees: where it lets pi act, pi has a violation within T steps with a
+    probability below delta. This is wrong with a probability of `confidence` at most. It needs an exact
+    model, known C and V_i, and m of at least ln(1 / confidence) / (2 eps^2). But model and critics are
+    learned, and the bound says nothing of the safe policy.
 
     Source: Goodall and Belardinelli (2023), "Approximate Model-Based Shielding for Safe Reinforcement
     Learning", arXiv:2308.00707, and (2024), "Leveraging Approximate Model-based Shielding for

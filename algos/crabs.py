@@ -1,5 +1,6 @@
 """CRABS: soft actor-critic within a set of states that a learned certificate finds safe."""
 
+import dataclasses
 import math
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -289,7 +290,7 @@ def crabs(env: Env) -> Learner:
             core = core_of(nets.params | {"actor": policy})
 
             def loss(policy: PyTree) -> tuple[jax.Array, jax.Array]:
-                h, u = here.judge(core.replace(actor=policy), search.obs, cfg)  # type: ignore
+                h, u = here.judge(dataclasses.replace(core, actor=policy), search.obs, cfg)
                 counts = violating(h, u)
                 return jnp.where(counts, u, 0.0).sum() / jnp.maximum(counts.sum(), 1), counts.mean()
 
@@ -325,7 +326,7 @@ def crabs(env: Env) -> Learner:
             core, safe, certified = core_of(params), params["safe"], params["certified"]
             keep = cfg.barrier_keep * certified
             found = certify(here, core, safe.barrier, keep, state["barrier"], state["search"], cfg)
-            new = core.replace(barrier=found.barrier)  # type: ignore[attr-defined]
+            new = dataclasses.replace(core, barrier=found.barrier)
             # back to the last certificate, if there is one
             rejected = select(certified > 0, safe.barrier, found.barrier)
             factor = jnp.where(found.at_once, 1 / 2, 1 / 1.2)

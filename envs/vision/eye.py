@@ -120,9 +120,9 @@ def thing_of(model: mujoco.MjModel, geom: int) -> Thing:
         raise ValueError(f"geom {name}: expected a plane, sphere, capsule, cylinder or box")
     material = model.geom_matid[geom]
     rgba = model.geom_rgba[geom] if material < 0 else model.mat_rgba[material]
-    *rgb, alpha = rgba.tolist()
-    size, checker = tuple(model.geom_size[geom].tolist()), surface.checker_of(model, geom)
-    return Thing(kind, size, tuple(rgb), alpha, checker)  # type: ignore[arg-type]
+    red, green, blue, alpha = rgba.tolist()
+    x, y, z = model.geom_size[geom].tolist()
+    return Thing(kind, (x, y, z), (red, green, blue), alpha, surface.checker_of(model, geom))
 
 
 def camera_of(model: mujoco.MjModel, name: str) -> Callable[[Pose], Pose]:

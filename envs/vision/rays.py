@@ -83,10 +83,9 @@ def capsule(size: Size, origin: Vector, direction: Vector) -> Hit:
     cap = sphere(size, (origin[0], origin[1], origin[2] - end), direction)
     side = jnp.abs(z) <= half
     x, y = ((origin[i] + round_.enter * direction[i]) / radius for i in (0, 1))
-    normal = tuple(
-        jnp.where(side, a, b) for a, b in zip((x, y, jnp.zeros_like(x)), cap.normal, strict=True)
-    )
-    return hit(round_.there, jnp.where(side, round_.enter, cap.distance), normal)  # type: ignore
+    nx, ny, nz = cap.normal
+    normal = (jnp.where(side, x, nx), jnp.where(side, y, ny), jnp.where(side, 0.0, nz))
+    return hit(round_.there, jnp.where(side, round_.enter, cap.distance), normal)
 
 
 def cylinder(size: Size, origin: Vector, direction: Vector) -> Hit:
@@ -115,13 +114,14 @@ def box(size: Size, origin: Vector, direction: Vector) -> Hit:
     x, y, z = enters
     t = jnp.maximum(jnp.maximum(x, y), z)
     by_x, by_y = x >= t, y >= t
-    sides = (by_x, by_y & ~by_x, ~(by_x | by_y))
-    normal = tuple(
-        jnp.where(side, jnp.where(d > 0, -1.0, 1.0), 0.0)
-        for side, d in zip(sides, direction, strict=True)
+    dx, dy, dz = (jnp.where(d > 0, -1.0, 1.0) for d in direction)
+    normal = (
+        jnp.where(by_x, dx, 0.0),
+        jnp.where(by_y & ~by_x, dy, 0.0),
+        jnp.where(by_x | by_y, 0.0, dz),
     )
     leave = jnp.minimum(jnp.minimum(leaves[0], leaves[1]), leaves[2])
-    return hit(t < leave, t, normal)  # type: ignore[arg-type]
+    return hit(t < leave, t, normal)
 
 
 SHAPES: dict[int, Callable[[Size, Vector, Vector], Hit]] = {

@@ -83,9 +83,9 @@ def checker_of(model: mujoco.MjModel, geom: int) -> Checker | None:
     if not (plane and crossed and (whole == pixels[..., 0]).all()):
         raise ValueError(f"geom {geom}: expected a checker on a plane for a texture")
     half, repeat = model.geom_size[geom], model.mat_texrepeat[material]
-    side = tuple(float(half[i] / repeat[i]) for i in (0, 1))
+    side = float(half[0] / repeat[0]), float(half[1] / repeat[1])
     even, odd = (tuple((c / 255).tolist()) for c in (squares[1, 0, :3], squares[0, 0, :3]))
-    return Checker(even, odd, side)  # type: ignore[arg-type]
+    return Checker(even, odd, side)
 
 
 def checkered(checker: Checker, x: jax.Array, y: jax.Array, width: jax.Array) -> Colour:

@@ -23,6 +23,7 @@ Source: Luo and Ma (2021), "Learning Barrier Certificates: Towards Safe Reinforc
 Training-time Violations", arXiv:2108.01846, and the authors' code, roosephu/crabs @823da6c.
 """
 
+import dataclasses
 import math
 from collections.abc import Callable
 from typing import Annotated, Any, NamedTuple
@@ -271,7 +272,8 @@ def walk(system: System, core: Core, search: Search, cfg: Any) -> Search:
     ratio = jnp.where(inside, jnp.where(new_inside, ratio, 0.0), 1.0)
     taken = (jax.random.uniform(take_key, ratio.shape) < ratio) & new_inside
     adapted = tau * (1 + TAU_RATE * (ratio - ACCEPTED))
-    return search.replace(  # type: ignore[attr-defined]
+    return dataclasses.replace(
+        search,
         z=jnp.where(taken[:, None], new, z),
         tau=jnp.where(inside, adapted, tau),
         key=jax.random.key_data(key),
@@ -339,7 +341,7 @@ def barrier_loss(
     h_ref = system.h(reference, obs, cfg)
 
     def loss(barrier: PyTree) -> jax.Array:
-        h, u = system.judge(core.replace(barrier=barrier), obs, cfg)  # type: ignore[attr-defined]
+        h, u = system.judge(dataclasses.replace(core, barrier=barrier), obs, cfg)
         worst = jnp.where(counts, u - lam * h, 0.0).sum() / jnp.maximum(counts.sum(), 1)
         return worst + keep * jax.nn.relu(h - h_ref).mean()
 
@@ -363,7 +365,7 @@ def certify(
     optimiser = decayed_adam(cfg.barrier_lr, cfg.barrier_decay)
 
     def step(now: Hunt) -> Hunt:
-        at = core.replace(barrier=now.barrier)  # type: ignore[attr-defined]
+        at = dataclasses.replace(core, barrier=now.barrier)
         search = walk(system, at, now.search, cfg)
         loss, counts = barrier_loss(system, at, search.obs, reference, keep, cfg)
         change, opt_state = optimiser.update(jax.grad(loss)(now.barrier), now.opt_state, now.barrier)
