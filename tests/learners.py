@@ -1,4 +1,4 @@
-"""On-policy algorithms with their compiled updates, shared by the contract tests.
+"""Algorithms with their compiled updates, shared by the contract tests; most are on-policy.
 
 Most of a contract test's time is compiling. So structure is held for every row without compiling, and
 what needs numbers is compiled for `covering()` rows alone, once, as one program of three members that
@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from compiling import FAST
 from toys import START, Corridor, updated
@@ -21,7 +22,7 @@ from jaxsafe.algos import ALGOS
 from jaxsafe.config import ConfigError
 from jaxsafe.learn.on_policy import OnPolicyConfig
 from jaxsafe.run import compat
-from jaxsafe.types import Algorithm, Metrics, PyTree
+from jaxsafe.types import Algorithm, Metrics, PyTree, Shared
 
 TINY: dict[str, Any] = {"num_envs": 8, "horizon": 25, "minibatches": 2, "hidden": (8,)}
 OPTIONS: dict[str, Any] = {
@@ -128,6 +129,22 @@ def initial(name: str, env: Any, cfg: Any) -> Callable[[jax.Array, dict[str, jax
         return algo.init(key, dataclasses.replace(cfg, **swept), START)
 
     return jax.jit(jax.vmap(init), compiler_options=FAST)
+
+
+def two_members(algo: Algorithm, cfg: Any) -> tuple[PyTree, Callable]:
+    """Their states at first, and the compiled update, which uses up its argument."""
+    init = jax.vmap(lambda key: algo.init(key, cfg, START))
+    ts = jax.jit(init, compiler_options=FAST)(jax.random.split(jax.random.key(3), 2))
+    update = jax.jit(jax.vmap(algo.update, in_axes=(0, None)), donate_argnums=0)
+    return ts, update.lower(ts, START).compile(FAST)
+
+
+def at(iteration: int, since: int = 0) -> Shared:
+    return Shared(np.int32(iteration), np.int32(since))
+
+
+def copy(tree: PyTree) -> PyTree:
+    return jax.tree.map(jnp.copy, tree)
 
 
 def member(tree: PyTree, i: int) -> PyTree:

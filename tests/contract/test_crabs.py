@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compiling import FAST
+from learners import at
 from toys import START, Corridor, Ticker
 
 from jaxsafe.algos import ALGOS
 from jaxsafe.config import ConfigError
 from jaxsafe.learn.acting import Player
 from jaxsafe.learn.certificate import interval_barrier
-from jaxsafe.types import Shared
 
 ROW = ALGOS["crabs"]
 TINY: dict[str, Any] = {
@@ -43,10 +43,6 @@ def compiled():
     algo, start = begun()
     like = jax.eval_shape(start, jnp.zeros(()))
     return jax.jit(algo.update, donate_argnums=0).lower(like, START).compile(FAST)
-
-
-def at(iteration: int, since: int = 0) -> Shared:
-    return Shared(np.int32(iteration), np.int32(since))
 
 
 def differ(a, b):

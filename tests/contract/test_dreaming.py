@@ -1,7 +1,6 @@
 """What every algorithm with a world model must do, on toys."""
 
 import dataclasses
-import operator
 import os
 import subprocess
 import sys
@@ -13,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compiling import FAST
+from learners import at, copy, member, two_members
 from toys import START, Corridor, Ledge, Lever
 
 from jaxsafe.algos import ALGOS, ambs
@@ -36,27 +36,9 @@ def settings_of(name: str, **settings: Any) -> Any:
     return ALGOS[name].config(**tiny | settings)
 
 
-def at(iteration: int, since: int = 0) -> Shared:
-    return Shared(np.int32(iteration), np.int32(since))
-
-
 @cache
 def together(name: str):
-    """Two members: their states at first, and the compiled update, which uses up its argument."""
-    algo, cfg = ALGOS[name].make(Corridor()), settings_of(name)
-    keys = jax.random.split(jax.random.key(3), 2)
-    init = jax.vmap(lambda key: algo.init(key, cfg, START))
-    ts = jax.jit(init, compiler_options=FAST)(keys)
-    update = jax.jit(jax.vmap(algo.update, in_axes=(0, None)), donate_argnums=0)
-    return ts, update.lower(ts, START).compile(FAST)
-
-
-def copy(tree):
-    return jax.tree.map(jnp.copy, tree)
-
-
-def member(tree, i):
-    return jax.tree.map(operator.itemgetter(i), tree)
+    return two_members(ALGOS[name].make(Corridor()), settings_of(name))
 
 
 def same(a, b):

@@ -1,7 +1,6 @@
 """What every planning algorithm must do, on toys."""
 
 import dataclasses
-import operator
 import os
 import subprocess
 import sys
@@ -13,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compiling import FAST
+from learners import at, copy, member, two_members
 from toys import START, Corridor, Lever
 
 from jaxsafe.algos import ALGOS
@@ -47,27 +47,9 @@ def settings_of(name: str, **settings: Any) -> Any:
     return config(**tiny | settings)
 
 
-def at(iteration: int, since: int = 0) -> Shared:
-    return Shared(np.int32(iteration), np.int32(since))
-
-
 @cache
 def together(name: str):
-    """Two members: their states at first, and the compiled update, which uses up its argument."""
-    algo, cfg = ALGOS[name].make(Corridor()), settings_of(name)
-    keys = jax.random.split(jax.random.key(3), 2)
-    init = jax.vmap(lambda key: algo.init(key, cfg, START))
-    ts = jax.jit(init, compiler_options=FAST)(keys)
-    update = jax.jit(jax.vmap(algo.update, in_axes=(0, None)), donate_argnums=0)
-    return ts, update.lower(ts, START).compile(FAST)
-
-
-def copy(tree):
-    return jax.tree.map(jnp.copy, tree)
-
-
-def row(tree, i):
-    return jax.tree.map(operator.itemgetter(i), tree)
+    return two_members(ALGOS[name].make(Corridor()), settings_of(name))
 
 
 def differ(a, b):
@@ -185,19 +167,19 @@ def test_seeds_side_by_side_are_the_lone_ones():
     ts, vmapped = together("cap_pets")
     algo = ALGOS["cap_pets"].make(Corridor())
     alone = jax.jit(algo.update, compiler_options=FAST)
-    ts, lone = copy(ts), [row(ts, i) for i in range(2)]
+    ts, lone = copy(ts), [member(ts, i) for i in range(2)]
     for iteration in range(4):
         ts, metrics = vmapped(ts, at(iteration))
         for i in range(2):
             lone[i], own = alone(lone[i], at(iteration))
             for name in ("train/model_epochs", "train/model_error", "train/cost_rate"):
                 np.testing.assert_allclose(metrics[name][i], own[name], rtol=1e-3)
-            for x, y in zip(*map(jax.tree.leaves, (row(ts.params, i), lone[i].params)), strict=True):
+            for x, y in zip(*map(jax.tree.leaves, (member(ts.params, i), lone[i].params)), strict=True):
                 np.testing.assert_allclose(x, y, rtol=1e-3, atol=1e-3)
 
 
 def test_a_plan_is_carried_along_and_needs_no_key():
-    algo, ts = ALGOS["cap_pets"].make(Corridor()), row(together("cap_pets")[0], 0)
+    algo, ts = ALGOS["cap_pets"].make(Corridor()), member(together("cap_pets")[0], 0)
     learned = algo.learned(ts)
     player = Player(algo.policy, learned, algo.task(learned))
     state = Corridor().reset(jax.random.key(0))

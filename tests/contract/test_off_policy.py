@@ -1,7 +1,6 @@
 """What every off-policy algorithm must do, on toys, and SAC's equations by hand."""
 
 import dataclasses
-import operator
 import os
 import subprocess
 import sys
@@ -14,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compiling import FAST
+from learners import at, copy, member
 from toys import START, Arriving, Corridor, Lever, Ticker
 
 from jaxsafe.algos import ALGOS
@@ -67,21 +67,9 @@ def together(name):
     return ts, update.lower(ts, START).compile(FAST)
 
 
-def copy(tree):
-    return jax.tree.map(jnp.copy, tree)
-
-
 def start(name, seed=0, env: Env = Corridor(), **settings):  # noqa: B008
     algo, cfg = ALGOS[name].make(env), ALGOS[name].config(**TINY | settings)
     return jax.jit(lambda key: algo.init(key, cfg, START), compiler_options=FAST)(jax.random.key(seed))
-
-
-def at(iteration, since=0):
-    return Shared(np.int32(iteration), np.int32(since))
-
-
-def row(tree, i):
-    return jax.tree.map(operator.itemgetter(i), tree)
 
 
 def numbers(tree):
@@ -149,14 +137,14 @@ def test_the_first_actions_are_uniform_and_a_resumed_run_acts_by_its_policy_whil
 def test_seeds_and_floats_side_by_side_are_the_lone_ones(name):
     ts, vmapped = together(name)
     ts, update = copy(ts), build(name)[1]
-    lone = [row(ts, i) for i in range(4)]
+    lone = [member(ts, i) for i in range(4)]
     for iteration in range(4):  # the ring is full after three
         ts, metrics = vmapped(ts, at(iteration))
         for i in range(4):
             lone[i], alone = update(lone[i], at(iteration))
-            for x, y in zip(numbers(row(ts, i)), numbers(lone[i]), strict=True):
+            for x, y in zip(numbers(member(ts, i)), numbers(lone[i]), strict=True):
                 np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-4)
-            for x, y in zip(numbers(row(metrics, i)), numbers(alone), strict=True):
+            for x, y in zip(numbers(member(metrics, i)), numbers(alone), strict=True):
                 np.testing.assert_allclose(x, y, rtol=1e-3, atol=1e-4)
 
 
@@ -280,7 +268,10 @@ def test_the_last_observation_of_an_episode_has_a_row_and_the_next_row_is_a_rese
     ts = start("sac", env=env, num_envs=5, horizon=40, learn_every=40, replay_ratio=1, batch_size=200,
                replay_size=400, stagger=False)  # fmt: skip
     keys = jax.random.split(jax.random.key(1), 40)
-    behave = lambda carry, state, first, key: (jnp.zeros((5, 1)), carry, {})  # noqa: E731
+
+    def behave(carry, state, first, key):
+        return jnp.zeros((5, 1)), carry, {}
+
     _, (rows, steps) = jax.jit(lambda x: collect_records(env, behave, x, keys))(ts.stepping)
     name, clock, life = np.moveaxis(np.asarray(rows.obs), -1, 0)
     last = np.asarray(rows.terminated | rows.truncated)

@@ -241,9 +241,10 @@ def test_on_a_known_chain_it_overrules_where_the_bound_says(monkeypatch):
     monkeypatch.setattr(ambs, "world_of", lambda *_: chain)
     monkeypatch.setattr(ambs, "chosen", lambda *_: jnp.zeros(2))
     monkeypatch.setattr(ambs, "safety_value", lambda params, features, cfg: jnp.zeros(len(features)))
-    says = lambda world, params, x: {  # noqa: E731
-        "cost": 10.0 * (x[:, 0] == 5), "cont": jnp.ones(len(x))
-    }  # fmt: skip
+
+    def says(world, params, x):
+        return {"cost": 10.0 * (x[:, 0] == 5), "cont": jnp.ones(len(x))}
+
     monkeypatch.setattr(ambs, "read", says)
     learned = Learned(cfg, {"model": ()}, (), ())
 
@@ -251,8 +252,7 @@ def test_on_a_known_chain_it_overrules_where_the_bound_says(monkeypatch):
     def estimates(state):
         latent = Latent(jnp.array([state], jnp.float32), jnp.zeros(1))
         keys = jax.random.split(jax.random.key(0), 200)
-        one = lambda key: ambs.risk(Corridor(), learned, latent, jnp.zeros(2), key)  # noqa: E731
-        return jax.vmap(one)(keys)
+        return jax.vmap(lambda key: ambs.risk(Corridor(), learned, latent, jnp.zeros(2), key))(keys)
 
     overruled = []
     for state in range(5):

@@ -226,7 +226,10 @@ def test_the_policy_remembers_what_the_model_learns_from():
     ts = jax.jit(lambda key: algo.init(key, cfg, START), compiler_options=FAST)(jax.random.key(0))
     learned = algo.learned(ts)
     player = Player(algo.policy, learned, env)
-    act = lambda learned, carry, obs, key: algo.policy.act(learned, carry, obs, None)  # noqa: E731
+
+    def act(learned, carry, obs, key):
+        return algo.policy.act(learned, carry, obs, None)
+
     likeliest = player._replace(policy=algo.policy._replace(act=act))
 
     @jax.jit
@@ -298,7 +301,10 @@ def test_the_model_foresees_a_deterministic_toy():
         reset_key, act_key = jax.random.split(key)
         action = jnp.repeat(jax.random.uniform(act_key, (4, 16, 2), minval=-1.0), 4, axis=0)
         state = jax.vmap(env.reset)(jax.random.split(reset_key, 16))
-        step = lambda s, a: (jax.vmap(env.step)(s, a), (s.obs, s.reward))  # noqa: E731
+
+        def step(state, action):
+            return jax.vmap(env.step)(state, action), (state.obs, state.reward)
+
         obs, reward = jax.lax.scan(step, state, action)[1]
         no = jnp.zeros((16, 16), bool)
         return Record(obs, action, reward, reward, reward[..., None], no, no, no)
@@ -307,9 +313,10 @@ def test_the_model_foresees_a_deterministic_toy():
         params, opt_state = now
         rows = play(key)
         batch = SequenceBatch(rows, jnp.full(16, 1 / 16))
-        loss = lambda params: world_model.model_loss(  # noqa: E731
-            world, params, batch, {"reward": rows.reward}, key, cfg
-        )
+
+        def loss(params):
+            return world_model.model_loss(world, params, batch, {"reward": rows.reward}, key, cfg)
+
         grads = jax.grad(loss, has_aux=True)(params)[0]
         change, opt_state = rule.update(grads, opt_state, params)
         return (optax.apply_updates(params, change), opt_state), None
