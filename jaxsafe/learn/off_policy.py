@@ -333,22 +333,36 @@ def off_policy(
     def gradient_steps(
         ts: TrainState, now: RoundCarry, at: RoundClock, key: jax.Array
     ) -> tuple[Trainable, Metrics]:
-        """The gradient steps of a round, each on a batch of its own. Metrics are [updates]."""
+        """The gradient steps of a round, each on a batch of its own. Metrics are [updates].
+
+        If they lead to anything that is not finite, none of them takes effect. A GPU spends as long on
+        launching a gradient step as on computing it, so what all of them need is done once: all batches
+        are drawn before the first, and the outcome is checked after the last.
+        """
         cfg, sizes = ts.config, sizes_of(ts.config, axis_name)
         source = Source(now.replay, at.after, now.normaliser, sizes.batch, sizes.n_step)
 
-        def step(nets: Trainable, x: tuple[jax.Array, jax.Array]) -> tuple[Trainable, Metrics]:
-            number, key = x
-            draw_key, step_key = jax.random.split(device_key(key, axis_name))
-            batch, dropped = replayed(draw_key, source, cfg, axis_name)
-            when = GradientStep(number, at.remaining, step_key, ts.dual)
-            new, metrics = learner.step(nets, batch, when, cfg, axis_name)
-            finite = psum(~all_finite(new), axis_name) == 0
-            lost = {"train/nonfinite": dropped + ~finite}
-            return select(finite, new, nets), jax.tree.map(jnp.float32, metrics | lost)
+        def keys_of(key: jax.Array) -> jax.Array:
+            return jax.random.split(device_key(key, axis_name))
 
+        def batch_of(key: jax.Array) -> tuple[PyTree, jax.Array]:
+            return replayed(key, source, cfg, axis_name)
+
+        def step(
+            nets: Trainable, x: tuple[jax.Array, jax.Array, PyTree]
+        ) -> tuple[Trainable, Metrics]:
+            number, key, batch = x
+            when = GradientStep(number, at.remaining, key, ts.dual)
+            new, metrics = learner.step(nets, batch, when, cfg, axis_name)
+            return new, jax.tree.map(jnp.float32, metrics)
+
+        keys = jax.vmap(keys_of)(jax.random.split(key, sizes.updates))
+        batches, dropped = jax.vmap(batch_of)(keys[:, 0])
         numbers = at.gradient_steps + jnp.arange(sizes.updates)
-        return jax.lax.scan(step, now.nets, (numbers, jax.random.split(key, sizes.updates)))
+        nets, metrics = jax.lax.scan(step, now.nets, (numbers, keys[:, 1], batches))
+        finite = psum(~all_finite(nets), axis_name) == 0
+        lost = {"train/nonfinite": jnp.float32(dropped + ~finite)}
+        return select(finite, nets, now.nets), metrics | lost
 
     def refit(
         ts: TrainState, now: RoundCarry, shared: Shared, key: jax.Array
