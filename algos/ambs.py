@@ -515,6 +515,8 @@ AUTHORS: dict[str, Any] = {
     "n_step": 63, "learning_starts": 1024, "model_lr": 1e-4, "lr": 3e-5, "critic_lr": 3e-5,
     "dyn_scale": 0.5, "replay_value": 0.0, "limit_ends": True, "size": "12m",
 }  # fmt: skip
+# its `medium` networks, for pictures of 64 x 64 alone and env.wrap.action_repeat=2; the nearest size
+PIXELS: dict[str, Any] = AUTHORS | PENALTIES["plpg"] | {"encoder": "cnn", "size": "50m"}
 TRUE: dict[str, Any] = {"shield": "true_dynamics", "rule": "binomial", "shield_rollouts": 64}
 # for a problem of a ledge, some steps away
 LEDGE: dict[str, Any] = dreamer.LEVER | {
@@ -526,7 +528,8 @@ ROWS = {
         AMBSConfig,
         make,
         "Dreamer with a shield that dreams ahead, and a safe policy",
-        {name: AUTHORS | options for name, options in PENALTIES.items()} | {"true_dynamics": TRUE},
+        {name: AUTHORS | options for name, options in PENALTIES.items()}
+        | {"pixels": PIXELS, "true_dynamics": TRUE},
         holds="nothing",
         note=note,
         examine=examine,

@@ -4,7 +4,8 @@
     jaxsafe migrate alf "python -m alf.bin.train --conf seditor_safety_gym_conf.py --conf_param=..."
 
 Of SEditor's configs the first has `algo=seditor` and the one without an editor `algo=sac_lag`, each on
-SEditor's own tasks. A command of AMBS has `algo=ambs` with the preset of its penalty, on vectors.
+SEditor's own tasks. A command of AMBS has `algo=ambs` with the preset of its penalty, and pictures or
+vectors, as its configs say.
 Source: the READMEs and configs of sacktock/AMBS @5184901 and hnyu/seditor @f78b720.
 """
 
@@ -19,6 +20,12 @@ from jaxsafe.interop.migrate import Line, Migrated, as_option
 from jaxsafe.run.settings import nested, settings_from_options
 
 AMBS_REPEAT = 2  # raw steps in a step, of its safetygym configs
+# its networks, and ours of about as many parameters
+AMBS_SIZES = {"small": "12m", "medium": "50m", "large": "100m", "xlarge": "200m"}
+PICTURES: dict[str, Any] = {  # its safetygym_vision, which sees nothing else
+    "env.observe_vision": True, "env.vision_size": [64, 64], "algo.encoder": "cnn",
+    "algo.replay_ratio": 512,
+}  # fmt: skip
 STEPS: dict[str, Any] = {"total_steps": 5_000_000}  # of its configs for Safety Gym
 EDITED = STEPS | {"algo": "seditor", "preset": "published"}
 ALONE = STEPS | {"algo": "sac_lag", "num_envs": 32, "algo.cost_limit": 0.5}  # 5e-4 in 1,000 steps
@@ -48,6 +55,19 @@ def ambs_steps(value: Any) -> dict[str, Any]:
     return {"total_steps": AMBS_REPEAT * convert(value, int, "--run.steps")}
 
 
+def ambs_configs(value: Any) -> dict[str, Any]:
+    names = str(value).split()
+    seen = PICTURES if "safetygym_vision" in names else {}
+    size = next((ours for theirs, ours in AMBS_SIZES.items() if theirs in names), None)
+    return seen | ({"algo.size": size} if size else {})
+
+
+def all_but_pictures(env: str) -> dict[str, bool]:
+    """What switches off all that a task shows besides a picture."""
+    defaults = envs.env_defaults(env).items()
+    return {f"env.{k}": False for k, value in defaults if k.startswith("observe_") and value is True}
+
+
 def seditor_tasks() -> list[str]:
     return [name.removeprefix("seditor_") for name in envs.ENVS if name.startswith("seditor_")]
 
@@ -66,7 +86,7 @@ AMBS: dict[str, Flag] = {
     "run.steps": Flag(ambs_steps),
     "envs.amount": Flag(lambda value: {"num_envs": value}),
     "logdir": Flag(note="run_dir names a run's folder", lost=never),
-    "configs": Flag(note="ambs takes vectors here, and its presets have size=12m"),
+    "configs": Flag(ambs_configs, "vectors, and size=12m", lambda value: value != "safetygym"),
     "penalty_coeff": Flag(lambda value: {"algo.penalty_coef": value}),
     "plpg": Flag(lambda value: {"preset": "plpg"} if value else {}, "off", lost=never),
     "copt": Flag(lambda value: {"preset": "copt"} if value else {}, "off", lost=never),
@@ -90,6 +110,8 @@ def ambs(command: str) -> Migrated:
     """
     found, lines = turned(dict(flags_of(command)), AMBS)
     begin = {"algo": "ambs", "preset": "penl", "env.wrap.action_repeat": AMBS_REPEAT}
+    if "env" in found and "algo.encoder" in found:
+        found |= all_but_pictures(found["env"])
     return migrated(begin | found, lines, "--task")
 
 

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jaxsafe.config import ConfigError
 from jaxsafe.learn.acting import Learned
 from jaxsafe.learn.learner import GradientStep, Learner
+from jaxsafe.learn.observations import blank, observation_like
 from jaxsafe.learn.replay import Record
 from jaxsafe.learn.sequences import SequenceBatch, drawn_sequences, lambda_returns
 from jaxsafe.learn.steps import Trainable, descend_each, follow
@@ -277,7 +278,7 @@ def dreaming_learner(env: Env, behaviour: Behaviour, policy: Policy | None = Non
                 "the rows of a sequence"
             )
         size = SIZES[cfg.size]
-        obs, action = jnp.zeros(obs_size), jnp.zeros(action_size)
+        obs, action = blank(observation_like(env)), jnp.zeros(action_size)
         features = jnp.zeros(size.deter + size.latents * size.classes)
         model_key, actor_key, critic_key = jax.random.split(key, 3)
         world = world_of(env, behaviour.all_heads, cfg)

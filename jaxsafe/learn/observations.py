@@ -57,7 +57,7 @@ def check_observation(like: PyTree, cfg: Any) -> None:
     if shows and not takes:
         raise ConfigError(
             "env.observe_vision=true: this algorithm takes vectors; those that take pictures, as "
-            "ppo_lag, sac_lag and bc, have algo.encoder=cnn"
+            "ppo_lag, sac_lag, dreamer and bc, have algo.encoder=cnn"
         )
     if takes and (cfg.encoder == "cnn") != shows:
         seen = "env.observe_vision=true shows pictures" if shows else "the environment shows none"

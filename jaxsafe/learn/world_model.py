@@ -14,20 +14,13 @@ import jax.numpy as jnp
 import optax
 
 from jaxsafe.config import Amount, Iterations, Norm, Rate, Share, Weight, config
+from jaxsafe.learn.observations import EncoderConfig, observation_like
 from jaxsafe.learn.off_policy import RoundConfig
 from jaxsafe.learn.replay import Record
 from jaxsafe.learn.sequences import SequenceBatch
+from jaxsafe.nn.coders import Decoder, Encoder, VectorDecoder, VectorEncoder, check_picture
 from jaxsafe.nn.gaussian import Gaussian, entropy, log_prob, sample
-from jaxsafe.nn.rssm import (
-    SIZES,
-    Beliefs,
-    Head,
-    Latent,
-    VectorDecoder,
-    VectorEncoder,
-    WorldModel,
-    kl,
-)
+from jaxsafe.nn.rssm import SIZES, Beliefs, Head, Latent, WorldModel, kl
 from jaxsafe.nn.two_hot import BINS, two_hot_loss, two_hot_mean
 from jaxsafe.types import Env, Metrics, PyTree
 
@@ -36,9 +29,12 @@ STD = (0.1, 1.0)  # range of the actor's standard deviation, as in the authors' 
 
 
 @config
-class WorldModelConfig(RoundConfig):
+class WorldModelConfig(EncoderConfig, RoundConfig):
     """What algorithms with a world model share."""
 
+    # What becomes of pictures. cnn: the model sees them through convolutions, and learns to paint them.
+    # none: there are no pictures.
+    encoder: Literal["none", "cnn"] = "none"
     # Environments side by side, of all devices together. The authors have 16 and fewer.
     num_envs: Amount = 64
     # Steps of each environment between two rounds of gradient steps, of 1,024 environment steps in all.
@@ -84,13 +80,20 @@ class WorldModelConfig(RoundConfig):
 
 
 def world_of(env: Env, heads: dict[str, int], cfg: Any) -> WorldModel:
-    """The model of an environment whose observations are vectors.
+    """The model of an environment.
 
     heads: name -> BINS for a number, CHANCE for a probability.
+
+    Raises:
+        ConfigError: pictures whose sides do not suit the model's size.
     """
     size = SIZES[cfg.size]
-    decoder = VectorDecoder(size, env.obs_size)
-    return WorldModel(size, VectorEncoder(size), decoder, tuple(heads.items()))
+    coders: Any = VectorEncoder(size), VectorDecoder(size, env.obs_size)
+    if cfg.encoder == "cnn":
+        shape = observation_like(env)["vision"].shape
+        check_picture(shape, size, cfg.size)
+        coders = Encoder(size), Decoder(size, shape, env.obs_size)
+    return WorldModel(size, *coders, tuple(heads.items()))
 
 
 def actor_of(env: Env, cfg: Any) -> Head:
@@ -180,13 +183,13 @@ def model_loss(
     targets: for each head, float [T, B].
     """
     latents, (prior, posterior) = filtered(world, params, batch.rows, key)
-    features, fixed = latents.features, jax.lax.stop_gradient
+    fixed = jax.lax.stop_gradient
 
     def mean(x: jax.Array) -> jax.Array:
         return (batch.weight * x.mean(0)).sum()
 
-    decoded = world.apply(params, features, method="decode")
-    read: Any = world.apply(params, features, method="read")
+    decoded = world.apply(params, latents, method="decode")
+    read: Any = world.apply(params, latents.features, method="read")
     losses = {"obs": mean(world.decoder.loss(decoded, batch.rows.obs))}
     losses |= {name: mean(head_loss(read[name], target)) for name, target in targets.items()}
     dyn = mean(jnp.maximum(cfg.free_nats, kl(fixed(posterior), prior)))

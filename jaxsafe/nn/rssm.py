@@ -19,33 +19,38 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from jaxsafe.nn.two_hot import symlog
-
 UNIFORM = 0.01  # the probability that a draw of a latent is uniform
 
 
 class Size(NamedTuple):
     """deter: of h. hidden: units of the layers about it. latents, classes: of z. units, layers: of
-    encoder, decoder, actor and critic. blocks: of the recurrent unit's weights."""
+    encoder, decoder, actor and critic. channels: of a picture's layers, each of which halves it.
+    blocks: of the recurrent unit's weights."""
 
     deter: int
     hidden: int
     classes: int
     units: int
+    channels: tuple[int, ...]
     latents: int = 32
     layers: int = 3
     blocks: int = 8
 
 
+def layers_of(depth: int) -> tuple[int, ...]:
+    """The channels of a picture's layers."""
+    return 2 * depth, 3 * depth, 4 * depth, 4 * depth
+
+
 # by the millions of parameters that they have with a picture for observation; `tiny` is for tests
 SIZES = {
-    "tiny": Size(deter=32, hidden=16, classes=4, units=16, latents=4, layers=1, blocks=2),
-    "1m": Size(deter=512, hidden=64, classes=4, units=64),
-    "12m": Size(deter=2048, hidden=256, classes=16, units=256),
-    "25m": Size(deter=3072, hidden=384, classes=24, units=384),
-    "50m": Size(deter=4096, hidden=512, classes=32, units=512),
-    "100m": Size(deter=6144, hidden=768, classes=48, units=768),
-    "200m": Size(deter=8192, hidden=1024, classes=64, units=1024),
+    "tiny": Size(32, 16, classes=4, units=16, channels=(8,), latents=4, layers=1, blocks=2),
+    "1m": Size(512, 64, classes=4, units=64, channels=layers_of(4)),
+    "12m": Size(2048, 256, classes=16, units=256, channels=layers_of(16)),
+    "25m": Size(3072, 384, classes=24, units=384, channels=layers_of(24)),
+    "50m": Size(4096, 512, classes=32, units=512, channels=layers_of(32)),
+    "100m": Size(6144, 768, classes=48, units=768, channels=layers_of(48)),
+    "200m": Size(8192, 1024, classes=64, units=1024, channels=layers_of(64)),
 }
 
 
@@ -171,40 +176,11 @@ def kl(p: jax.Array, q: jax.Array) -> jax.Array:
 # ---- the world model ---------------------------------------------------------------------------
 
 
-class VectorEncoder(nn.Module):
-    """Observations [..., O] -> what the posterior sees of them, [..., units]. Large numbers are
-    squeezed by symlog."""
-
-    size: Size
-
-    @nn.compact
-    def __call__(self, obs: jax.Array) -> jax.Array:
-        x = symlog(obs)
-        for _ in range(self.size.layers):
-            x = Hidden(self.size.units)(x)
-        return x
-
-
-class VectorDecoder(nn.Module):
-    """Features [..., F] -> symlog of the observation, [..., O]."""
-
-    size: Size
-    obs_size: int
-
-    @nn.compact
-    def __call__(self, features: jax.Array) -> jax.Array:
-        return Head(self.size.layers, self.size.units, self.obs_size)(features)
-
-    def loss(self, decoded: jax.Array, obs: jax.Array) -> jax.Array:
-        """The squared error of what `__call__` gave, summed over the observation: float [...]."""
-        return ((decoded - symlog(obs)) ** 2).sum(-1)
-
-
 class WorldModel(nn.Module):
     """The model with its heads. Axes in front of those of one step are free.
 
     encoder: observation -> float [..., E].
-    decoder: features -> what it makes of them; `decoder.loss(that, obs)` -> float [...].
+    decoder: latent -> what it makes of it; `decoder.loss(that, obs)` -> float [...].
     heads: name -> how many numbers it gives.
     """
 
@@ -238,8 +214,8 @@ class WorldModel(nn.Module):
         h = self.memory(latent, within(action))
         return Latent(h, draw(self._beliefs(self.before, h), key))
 
-    def decode(self, features: jax.Array) -> Any:
-        return self.decoder(features)
+    def decode(self, latent: Latent) -> Any:
+        return self.decoder(latent)
 
     def read(self, features: jax.Array) -> dict[str, jax.Array]:
         """What each head gives, float [..., out]."""
@@ -248,7 +224,7 @@ class WorldModel(nn.Module):
     def everything(self, obs: Any, action: jax.Array) -> Any:
         """Runs all parts once, which makes their parameters."""
         latent, _ = self.observe(self.start(), action, self.embed(obs), None)
-        return self.decode(latent.features), self.read(latent.features)
+        return self.decode(latent), self.read(latent.features)
 
     def start(self) -> Latent:
         """The latent before the first observation of an episode."""

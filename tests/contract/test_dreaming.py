@@ -4,7 +4,7 @@ import dataclasses
 import os
 import subprocess
 import sys
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import jax
@@ -71,12 +71,21 @@ def test_a_shield_in_the_simulator_keeps_the_structure_and_sees_the_state():
     assert algo.policy.privileged(jax.eval_shape(algo.learned, before))
 
 
+@dataclasses.dataclass(frozen=True)
+class Dark(Corridor):
+    """Corridor with a black picture beside its observation."""
+
+    def _state(self, x):
+        state, picture = super()._state(x), jnp.zeros((64, 64, 3), jnp.uint8)
+        return dataclasses.replace(state, obs={"vision": picture, "vector": state.obs})
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_published_settings_build(name):
-    algo = ALGOS[name].make(Corridor())
     for settings in ALGOS[name].published.values():
         cfg = ALGOS[name].config(**settings)
-        before = jax.eval_shape(lambda key, cfg=cfg: algo.init(key, cfg, START), jax.random.key(0))
+        init = ALGOS[name].make(Corridor() if cfg.encoder == "none" else Dark()).init
+        before = jax.eval_shape(partial(init, cfg=cfg, shared=START), jax.random.key(0))
         assert before.params["model"]["params"]["memory"]["BlockDense_0"]["kernel"].shape[0] == 8
 
 

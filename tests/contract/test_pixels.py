@@ -7,14 +7,19 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
+from compiling import FAST
 from learners import TINY
 from toys import START, Corridor, Patch
 
-from jaxsafe.algos import ALGOS
+from jaxsafe.algos import ALGOS, dreamer
 from jaxsafe.config import ConfigError
-from jaxsafe.learn.observations import EncoderConfig, check_observation, observation_like
+from jaxsafe.learn import world_model
+from jaxsafe.learn.observations import EncoderConfig, blank, check_observation, observation_like
 from jaxsafe.learn.offline import data_set
+from jaxsafe.learn.replay import Record
+from jaxsafe.learn.sequences import SequenceBatch
 from jaxsafe.run.dataset import read_dataset, write_dataset
 from jaxsafe.types import Shared
 
@@ -122,3 +127,73 @@ def test_an_actor_critic_learns_where_the_patch_is_and_only_the_critics_teach_it
     for iteration in range(8):
         ts, metrics = update(ts, Shared(np.int32(iteration)))
     assert metrics["train/return"] > 3 and metrics["train/nonfinite"] == 0
+
+
+# ---- world models --------------------------------------------------------------------------------
+
+DREAMERS = ("dreamer", "dreamer_lag")
+
+
+@pytest.mark.parametrize("name", ["ambs", *(pytest.param(n, marks=pytest.mark.slow) for n in DREAMERS)])
+def test_a_dreamers_update_keeps_the_structure_and_the_replay_keeps_bytes(name):
+    algo, cfg = ALGOS[name].make(Patch()), ALGOS[name].config(**dreamer.LEVER, encoder="cnn")
+    before = jax.eval_shape(lambda: algo.init(jax.random.key(0), cfg, START))
+    after, _ = jax.eval_shape(algo.update, before, START)
+    chex.assert_trees_all_equal_shapes_and_dtypes(before, after)
+    assert before.replay.obs["vision"].dtype == jnp.uint8
+    large = dataclasses.replace(cfg, size="1m")
+    with pytest.raises(ConfigError, match="pictures of 8 x 8: size=1m expects sides that 16 divides"):
+        jax.eval_shape(lambda: algo.init(jax.random.key(0), large, START))
+
+
+def test_a_model_learns_to_paint_what_it_sees():
+    """So the latents know where the green patch is."""
+    env, cfg = Patch(), dreamer.DreamerConfig(size="tiny", encoder="cnn", lr_warmup=10)
+    world = world_model.world_of(env, {}, cfg)
+    rule = world_model.laprop(2e-2, cfg)
+
+    def rows_of(key):  # 32 sequences of 2 rows, each a picture of its own
+        obs = jax.vmap(jax.vmap(env.reset))(jax.random.split(key, (2, 32))).obs
+        zero, no = jnp.zeros((2, 32)), jnp.zeros((2, 32), bool)
+        return Record(obs, zero[..., None], zero, zero, zero[..., None], no, no, no)
+
+    def step(now, key):
+        params, opt_state = now
+        batch = SequenceBatch(rows_of(key), jnp.full(32, 1 / 32))
+
+        def loss(params):
+            total, (_, metrics) = world_model.model_loss(world, params, batch, {}, key, cfg)
+            return total, metrics["train/model_obs_loss"]
+
+        grads, of_obs = jax.grad(loss, has_aux=True)(params)
+        change, opt_state = rule.update(grads, opt_state, params)
+        return (optax.apply_updates(params, change), opt_state), of_obs
+
+    def train(key):
+        rows = rows_of(key)
+        params: Any = world.init(key, blank(observation_like(env)), jnp.zeros(1), method="everything")
+        keys = jax.random.split(key, 200)
+        (params, _), losses = jax.lax.scan(step, (params, rule.init(params)), keys)
+        latents, _ = world_model.filtered(world, params, rows, None)
+        return losses, world.apply(params, latents, method="decode"), rows.obs
+
+    losses, painted, seen = jax.jit(train, compiler_options=FAST)(jax.random.key(0))
+    assert painted["vision"].shape == (2, 32, 8, 8, 3) and painted["vector"].shape == (2, 32, 1)
+    assert losses[-10:].mean() < 0.25 * losses[0]
+    greenest = painted["vision"][..., 3, :, 1].argmax(-1)  # of the columns
+    assert (greenest == seen["vision"][..., 3, :, 1].argmax(-1)).mean() > 0.9
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["dreamer", "dreamer_lag"])
+def test_dreamer_learns_where_the_patch_is(name):
+    """5 at best, and 2 without eyes."""
+    algo, cfg = ALGOS[name].make(Patch()), ALGOS[name].config(**ALGOS[name].lever, encoder="cnn")
+
+    def train(key):
+        ts = algo.init(key, cfg, START)
+        return jax.lax.scan(lambda ts, i: algo.update(ts, Shared(i)), ts, jnp.arange(100))[1]
+
+    metrics = jax.jit(train)(jax.random.key(0))
+    assert metrics["train/return"][-20:].mean() > 4
+    assert (metrics["train/nonfinite"] == 0).all()

@@ -332,7 +332,7 @@ def test_the_model_foresees_a_deterministic_toy():
 
         def blind(latent, x):
             after: Any = world.apply(params, latent, *x, method="imagine")
-            decoded: Any = world.apply(params, after.features, method="decode")
+            decoded: Any = world.apply(params, after, method="decode")
             return after, two_hot.symexp(decoded)
 
         keys = jax.random.split(jax.random.key(3), 10)

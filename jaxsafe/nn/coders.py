@@ -1,0 +1,203 @@
+"""What a world model makes of observations, and what observations it makes of its latents.
+
+    vector     symlog, hidden layers;   back: hidden layers, symlog of the vector
+    picture    each layer halves it: a convolution, the largest of each 2 x 2, norm, SiLU
+               back: each layer doubles it: every pixel becomes 2 x 2, a convolution, norm, SiLU
+
+Convolutions are 5 x 5. What surrounds a picture is 0.
+
+Source: Hafner et al. (2025), "Mastering Diverse Control Tasks through World Models", Nature 640;
+    the layers of pictures are from the authors' code.
+"""
+
+import math
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsafe.config import ConfigError
+from jaxsafe.nn.cnn import patches
+from jaxsafe.nn.rssm import BlockDense, Head, Hidden, Latent, Size, fan_in
+from jaxsafe.nn.two_hot import symlog
+
+SIDE = 5  # of a convolution
+LEAST, MOST = 3, 16  # the sides that a picture may have after its last halving, as in the authors' code
+
+# ---- vectors -----------------------------------------------------------------------------------
+
+
+class VectorEncoder(nn.Module):
+    """Observations [..., O] -> what the posterior sees of them, [..., units]. Large numbers are
+    squeezed by symlog."""
+
+    size: Size
+
+    @nn.compact
+    def __call__(self, obs: jax.Array) -> jax.Array:
+        x = symlog(obs)
+        for _ in range(self.size.layers):
+            x = Hidden(self.size.units)(x)
+        return x
+
+
+class VectorDecoder(nn.Module):
+    """Latents -> symlog of the observation, [..., O]."""
+
+    size: Size
+    obs_size: int
+
+    @nn.compact
+    def __call__(self, latent: Latent) -> jax.Array:
+        return Head(self.size.layers, self.size.units, self.obs_size)(latent.features)
+
+    def loss(self, decoded: jax.Array, obs: jax.Array) -> jax.Array:
+        """The squared error of what `__call__` gave, summed over the observation: float [...]."""
+        return vector_loss(decoded, obs)
+
+
+def vector_loss(decoded: jax.Array, obs: jax.Array) -> jax.Array:
+    return ((decoded - symlog(obs)) ** 2).sum(-1)
+
+
+# ---- pictures ----------------------------------------------------------------------------------
+
+
+# [2, SIDE, places]: 1 where tap d of a convolution, at pixel a of a pair, reads this place of a picture
+PIXEL, TAP = np.mgrid[:2, :SIDE]
+SHRINK = np.float32((PIXEL + TAP)[..., None] == np.arange(SIDE + 1))
+GROW = np.float32((PIXEL + TAP)[..., None] // 2 == np.arange(SIDE // 2 + 1))  # its pixels are doubled
+
+
+class Convolution(nn.Module):
+    """A convolution whose results come in squares of 2 x 2 pixels, float [..., h, w, 2, 2, out].
+
+    The squares are those of the picture [..., 2 h, 2 w, C]. If it `grows`, the picture is
+    [..., h, w, C] and each of its pixels becomes a square. The results of a square are one product of a
+    matrix and of all pixels that they read. So few of these are copied, and on a CPU it is far faster
+    than XLA's own convolution: see `patches`.
+    """
+
+    out: int
+    grows: bool = False
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        kernel = self.param("kernel", fan_in(1.0), (SIDE, SIDE, x.shape[-1], self.out))
+        bias = self.param("bias", nn.initializers.zeros, (self.out,))
+        reads, stride = (GROW, 1) if self.grows else (SHRINK, 2)
+        matrix = jnp.einsum("ads,bet,deco->stcabo", reads, reads, kernel, precision="highest")
+        seen = patches(x, reads.shape[-1], stride)
+        squares = seen @ matrix.reshape(seen.shape[-1], 4 * self.out)
+        return squares.reshape(*squares.shape[:-1], 2, 2, self.out) + bias
+
+
+def normed(x: jax.Array) -> jax.Array:
+    """Each pixel normalised by its root mean square, then SiLU. Only in a module's `__call__`."""
+    return nn.silu(nn.RMSNorm(1e-4)(x))
+
+
+def doubled(squares: jax.Array) -> jax.Array:
+    """The picture of squares: [..., h, w, 2, 2, C] -> [..., 2 h, 2 w, C]."""
+    *front, height, width, _, _, channels = squares.shape
+    return jnp.moveaxis(squares, -4, -3).reshape(*front, 2 * height, 2 * width, channels)
+
+
+class PictureEncoder(nn.Module):
+    """Pictures uint8 [..., H, W, C] -> what the posterior sees of them, float [..., E]."""
+
+    size: Size
+
+    @nn.compact
+    def __call__(self, picture: jax.Array) -> jax.Array:
+        x = picture.astype(jnp.float32) / 255 - 0.5
+        for channels in self.size.channels:
+            x = normed(Convolution(channels)(x).max((-3, -2)))
+        return x.reshape(*x.shape[:-3], math.prod(x.shape[-3:]))
+
+
+class PictureDecoder(nn.Module):
+    """Latents -> pictures in [0, 1], float [..., H, W, C]."""
+
+    size: Size
+    shape: tuple[int, int, int]
+
+    @nn.compact
+    def __call__(self, latent: Latent) -> jax.Array:
+        channels, blocks = self.size.channels, self.size.blocks
+        height, width = (side // 2 ** len(channels) for side in self.shape[:2])
+        front = latent.deter.shape[:-1]
+        h = latent.deter.reshape(*front, blocks, self.size.deter // blocks)
+        of_h = BlockDense(height * width * channels[-1] // blocks)(h)  # a block has its own channels
+        of_h = jnp.moveaxis(of_h.reshape(*front, blocks, height, width, -1), -4, -2)
+        z = Hidden(2 * self.size.units)(latent.stoch)
+        of_z = nn.Dense(height * width * channels[-1], kernel_init=fan_in(1.0))(z)
+        shape = (*front, height, width, channels[-1])
+        x = normed(of_h.reshape(shape) + of_z.reshape(shape))
+        for out in channels[-2::-1]:
+            x = normed(doubled(Convolution(out, grows=True)(x)))
+        return nn.sigmoid(doubled(Convolution(self.shape[-1], grows=True)(x)))
+
+
+def picture_loss(decoded: jax.Array, picture: jax.Array) -> jax.Array:
+    return ((decoded - picture.astype(jnp.float32) / 255) ** 2).sum((-3, -2, -1))
+
+
+def check_picture(shape: tuple[int, ...], size: Size, name: str) -> None:
+    """Refuse a picture [H, W, C] that cannot be halved as often as the layers of this size do.
+
+    Raises:
+        ConfigError: with the nearest sides.
+    """
+    unit = 2 ** len(size.channels)
+    nearest = [unit * min(max(round(side / unit), LEAST), MOST) for side in shape[:2]]
+    if nearest != [*shape[:2]]:
+        (height, width), (high, wide) = shape[:2], nearest
+        raise ConfigError(
+            f"pictures of {width} x {height}: size={name} expects sides that {unit} divides, from "
+            f"{unit * LEAST} to {unit * MOST}; the nearest is env.vision_size=[{wide},{high}]"
+        )
+
+
+# ---- both --------------------------------------------------------------------------------------
+
+
+class Encoder(nn.Module):
+    """{'vision', 'vector'} -> what the posterior sees of them, float [..., E]. The vector may be
+    empty."""
+
+    size: Size
+
+    @nn.compact
+    def __call__(self, obs: dict[str, jax.Array]) -> jax.Array:
+        seen = [PictureEncoder(self.size)(obs["vision"])]
+        if obs["vector"].shape[-1]:
+            seen.append(VectorEncoder(self.size)(obs["vector"]))
+        return jnp.concatenate(seen, -1)
+
+
+class Decoder(nn.Module):
+    """Latents -> {'vision': pictures in [0, 1], 'vector': symlog of the vector}, if that is not empty.
+
+    shape: of a picture.
+    """
+
+    size: Size
+    shape: tuple[int, int, int]
+    obs_size: int
+
+    def setup(self) -> None:
+        parts: dict[str, Any] = {"vision": PictureDecoder(self.size, self.shape)}
+        if self.obs_size:
+            parts["vector"] = VectorDecoder(self.size, self.obs_size)
+        self.parts = parts
+
+    def __call__(self, latent: Latent) -> dict[str, jax.Array]:
+        return {name: part(latent) for name, part in self.parts.items()}
+
+    def loss(self, decoded: dict[str, jax.Array], obs: dict[str, jax.Array]) -> jax.Array:
+        """As of `VectorDecoder`, of both together."""
+        loss = picture_loss(decoded["vision"], obs["vision"])
+        return loss + vector_loss(decoded["vector"], obs["vector"]) if self.obs_size else loss

@@ -1,0 +1,54 @@
+"""Encoders and decoders of pictures: their convolutions against XLA's, and sizes that do not suit."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from compiling import FAST
+
+from jaxsafe.config import ConfigError
+from jaxsafe.nn import coders
+from jaxsafe.nn.rssm import SIZES, Latent
+
+
+def test_squares_are_a_convolution_of_the_picture_and_of_one_twice_as_large():
+    def both(x, grows):
+        layer = coders.Convolution(4, grows)
+        squares, params = layer.init_with_output(jax.random.key(1), x)
+        of = x.repeat(2, 1).repeat(2, 2) if grows else x
+        kernel, axes = params["params"]["kernel"], ("NHWC", "HWIO", "NHWC")
+        conv = partial(jax.lax.conv_general_dilated, dimension_numbers=axes)
+        return squares, conv(of, kernel, (1, 1), "SAME")
+
+    x = jax.random.normal(jax.random.key(0), (2, 6, 10, 3))
+    for grows, shape in ((False, (2, 3, 5, 2, 2, 4)), (True, (2, 6, 10, 2, 2, 4))):
+        squares, expected = jax.jit(lambda x, grows=grows: both(x, grows), compiler_options=FAST)(x)
+        assert squares.shape == shape
+        np.testing.assert_allclose(coders.doubled(squares), expected, atol=1e-5)
+
+
+def test_a_picture_has_sides_that_can_be_halved_or_is_refused_with_the_nearest():
+    for shape, size, nearest in (
+        ((40, 60, 3), "1m", r"60 x 40: size=1m .* 16 divides, from 48 to 256; .*=\[64,48\]"),
+        ((512, 64, 3), "1m", r"64 x 512: .*=\[64,256\]"),
+        ((4, 9, 3), "tiny", r"9 x 4: size=tiny .* 2 divides, from 6 to 32; .*=\[8,6\]"),
+    ):
+        with pytest.raises(ConfigError, match=nearest):
+            coders.check_picture(shape, SIZES[size], size)
+    coders.check_picture((48, 256, 9), SIZES["50m"], "50m")
+
+
+@pytest.mark.parametrize("obs_size, names", [(0, {"vision"}), (7, {"vision", "vector"})])
+def test_pictures_alone_are_an_observation_too(obs_size, names):
+    """And what is decoded has the shapes of what was seen, with the channels of two frames."""
+    size, latent = SIZES["1m"], Latent(jnp.zeros((3, 512)), jnp.zeros((3, 128)))
+    obs = {"vision": jnp.zeros((3, 48, 64, 6), jnp.uint8), "vector": jnp.zeros((3, obs_size))}
+    encoder, decoder = coders.Encoder(size), coders.Decoder(size, (48, 64, 6), obs_size)
+    seen, _ = jax.eval_shape(lambda: encoder.init_with_output(jax.random.key(0), obs))
+    assert seen.shape == (3, 3 * 4 * 16 + (64 if obs_size else 0))
+    decoded, _ = jax.eval_shape(lambda: decoder.init_with_output(jax.random.key(0), latent))
+    assert decoded.keys() == names
+    assert all(x.shape == obs[name].shape for name, x in decoded.items())
+    assert jax.eval_shape(decoder.loss, decoded, obs).shape == (3,)
