@@ -348,9 +348,7 @@ def off_policy(
         def batch_of(key: jax.Array) -> tuple[PyTree, jax.Array]:
             return replayed(key, source, cfg, axis_name)
 
-        def step(
-            nets: Trainable, x: tuple[jax.Array, jax.Array, PyTree]
-        ) -> tuple[Trainable, Metrics]:
+        def step(nets: Trainable, x: tuple[jax.Array, jax.Array, PyTree]) -> tuple[Trainable, Metrics]:
             number, key, batch = x
             when = GradientStep(number, at.remaining, key, ts.dual)
             new, metrics = learner.step(nets, batch, when, cfg, axis_name)
