@@ -246,11 +246,24 @@ def safety_value(params: dict[str, PyTree], features: jax.Array, cfg: Any) -> ja
 # ---- the shield --------------------------------------------------------------------------------
 
 
-def risk(env: Env, learned: Learned, latent: Latent, proposed: jax.Array, key: jax.Array) -> jax.Array:
-    """p, the share of dreams of the task's policy from `latent` that have a violation within T steps,
-    float [].
+class Dreamt(NamedTuple):
+    """m dreams of H states: their costs, float [H, m]; whether the episode goes on from them, bool
+    [H, m]; the cost that follows the last one, float [m]."""
 
-    proposed: float [A], with which dreams begin where `verify_action` is set.
+    cost: jax.Array
+    alive: jax.Array
+    value: jax.Array
+
+
+def risk(env: Env, learned: Learned, latent: Latent, proposed: jax.Array, key: jax.Array) -> jax.Array:
+    """p, the share of dreams from `latent` that have a violation within T steps, float []."""
+    return unsafe(*dreamt(env, learned, latent, proposed, key), learned.config).mean()
+
+
+def dreamt(env: Env, learned: Learned, latent: Latent, proposed: jax.Array, key: jax.Array) -> Dreamt:
+    """Dreams of the task's policy from `latent`.
+
+    proposed: float [A], with which they begin where `verify_action` is set.
     """
     cfg, params = learned.config, learned.params
     world = world_of(env, shielded_behaviour.all_heads, cfg)
@@ -268,17 +281,11 @@ def risk(env: Env, learned: Learned, latent: Latent, proposed: jax.Array, key: j
 
     keys = jax.random.split(key, cfg.imagine_steps)
     last, (cost, alive) = jax.lax.scan(step, start, (jnp.arange(cfg.imagine_steps), keys))
-    value = safety_value(params, last.features, cfg)
-    return unsafe(cost, alive, value, cfg).mean()
+    return Dreamt(cost, alive, safety_value(params, last.features, cfg))
 
 
 def unsafe(cost: jax.Array, alive: jax.Array, value: jax.Array, cfg: Any) -> jax.Array:
-    """Which dreams have a violation within T steps: R > C discount^T, bool [m].
-
-    Args:
-        cost, alive: of the H states that are dreamed, float and bool [H, m].
-        value: the cost that follows the last one, float [m].
-    """
+    """Which dreams have a violation within T steps: R > C discount^T, bool [m]. See `Dreamt`."""
 
     def backward(later: jax.Array, x: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
         cost, alive = x
@@ -393,10 +400,11 @@ def note(cfg: Any) -> str:
     m, eps, confidence = cfg.shield_rollouts, float(cfg.eps), float(cfg.confidence)
     counts = np.arange(m + 1)
     decides = np.asarray(overrules(jnp.asarray(counts / m, jnp.float32), cfg))
-    least = counts[decides][0] if decides.any() else "none"
     what = "dreams" if cfg.shield == "dreams" else "copies of the simulator"
+    least = int(counts[decides][0])
+    half = (least - 1 / 3) / (m + 1 / 3) if least else 0.0  # the median of Beta(least, m - least + 1)
     line = f"shield: overrules from {least} of {m} {what} with a violation"
-    line += f" within {cfg.shield_horizon} steps"
+    line += f" within {cfg.shield_horizon} steps, half the time where that has P = {half:.2g}"
     goal = f"P < {float(cfg.delta):g} with confidence {1 - confidence:g}"
     unknown = "; how wrong the learned model is, nobody knows" if cfg.shield == "dreams" else ""
     if cfg.rule == "binomial":
@@ -509,15 +517,11 @@ PENALTIES: dict[str, dict[str, Any]] = {
     "penl": {"penalty": "penl", "penalty_coef": 1.0},
     "copt": {"penalty": "copt", "penalty_coef": 1.0},
 }
-# its settings of Safety Gym's vectors, for env.wrap.action_repeat=2; the nearest size to its own
-AUTHORS: dict[str, Any] = {
-    "num_envs": 8, "horizon": 128, "learn_every": 2, "stagger": False, "replay_ratio": 64,
-    "n_step": 63, "learning_starts": 1024, "model_lr": 1e-4, "lr": 3e-5, "critic_lr": 3e-5,
-    "dyn_scale": 0.5, "replay_value": 0.0, "limit_ends": True, "size": "12m",
-}  # fmt: skip
 # its `medium` networks, for pictures of 64 x 64 alone and env.wrap.action_repeat=2; the nearest size
-PIXELS: dict[str, Any] = AUTHORS | PENALTIES["plpg"] | {"encoder": "cnn", "size": "50m"}
+PIXELS: dict[str, Any] = dreamer.AMBS | PENALTIES["plpg"] | {"encoder": "cnn", "size": "50m"}
 TRUE: dict[str, Any] = {"shield": "true_dynamics", "rule": "binomial", "shield_rollouts": 64}
+# fewer dreams, by the exact bound
+CPU: dict[str, Any] = dreamer.CPU | {"rule": "binomial", "shield_rollouts": 64}
 # for a problem of a ledge, some steps away
 LEDGE: dict[str, Any] = dreamer.LEVER | {
     "discount": 0.9, "imagine_steps": 6, "shield_rollouts": 32, "shield_horizon": 4, "eps": 0.05,
@@ -528,8 +532,8 @@ ROWS = {
         AMBSConfig,
         make,
         "Dreamer with a shield that dreams ahead, and a safe policy",
-        {name: AUTHORS | options for name, options in PENALTIES.items()}
-        | {"pixels": PIXELS, "true_dynamics": TRUE},
+        {name: dreamer.AMBS | options for name, options in PENALTIES.items()}
+        | {"pixels": PIXELS, "cpu": CPU, "true_dynamics": TRUE},
         holds="nothing",
         note=note,
         examine=examine,

@@ -190,6 +190,24 @@ def make(env: Env, axis_name: str | None = None, behaviour: Behaviour = blind) -
     return off_policy(env, dreaming_learner(env, behaviour), axis_name=axis_name)
 
 
+# danijar/dreamerv3 @e3f0224: its settings of vectors
+PROPRIO: dict[str, Any] = {
+    "num_envs": 16, "learn_every": 1, "replay_ratio": 1024, "n_step": 63, "replay_size": 5_000_000,
+    "learning_starts": 1024, "model_lr": 4e-5, "lr": 4e-5, "critic_lr": 4e-5,
+}  # fmt: skip
+# sacktock/AMBS @5184901: its settings of Safety Gym's vectors, for env.wrap.action_repeat=2; the size
+# is the nearest to its own
+AMBS: dict[str, Any] = {
+    "num_envs": 8, "horizon": 128, "learn_every": 2, "stagger": False, "replay_ratio": 64,
+    "n_step": 63, "learning_starts": 1024, "model_lr": 1e-4, "lr": 3e-5, "critic_lr": 3e-5,
+    "dyn_scale": 0.5, "replay_value": 0.0, "limit_ends": True, "size": "12m",
+}  # fmt: skip
+# for two cores and half an hour: small networks, short dreams, larger steps
+CPU: dict[str, Any] = {
+    "num_envs": 16, "replay_size": 200_000, "learning_starts": 1024, "size": "300k", "batch_size": 256,
+    "n_step": 15, "imagine_steps": 10, "model_lr": 1e-3, "lr": 5e-4, "critic_lr": 1e-3,
+    "lr_warmup": 500, "actor_grad": "reinforce",
+}  # fmt: skip
 # for a problem of two levers, whose next signs nobody can foresee
 LEVER: dict[str, Any] = {
     "num_envs": 16, "horizon": 16, "learn_every": 8, "replay_ratio": 8, "batch_size": 128, "n_step": 7,
@@ -202,6 +220,7 @@ ROWS = {
         DreamerConfig,
         make,
         "an actor that learns in the dreams of a world model, no constraint",
+        {"proprio": PROPRIO, "cpu": CPU},
         holds="nothing",
         lever=LEVER,
     ),
@@ -209,6 +228,7 @@ ROWS = {
         DreamerLagConfig,
         partial(make, behaviour=priced),
         "Dreamer with an augmented Lagrangian on the cost of its dreams",
+        {"ambs": AMBS, "cpu": CPU},
         lever=LEVER | {"mu_least": 0.05},  # with 1 the multiplier overshoots, and costs stay near 1.4
     ),
 }

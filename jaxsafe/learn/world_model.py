@@ -49,8 +49,8 @@ class WorldModelConfig(EncoderConfig, RoundConfig):
     # The discount of rewards: 1 - 1/333, as in the paper.
     discount: Share = 0.997
     cost_discount: Share = 0.997  # The discount of costs.
-    # The networks' size: millions of parameters, if pictures are observed. The paper's is 200m.
-    size: Literal["tiny", "1m", "12m", "25m", "50m", "100m", "200m"] = "1m"
+    # The networks' size: about the number of parameters, if pictures are observed. The paper's is 200m.
+    size: Literal["tiny", "300k", "1m", "12m", "25m", "50m", "100m", "200m"] = "1m"
     model_lr: Rate = 3e-4  # The model's learning rate, by LaProp. The authors have 4e-5.
     lr: Rate = 3e-4  # The actor's learning rate, by LaProp. The authors have 4e-5.
     critic_lr: Rate = 3e-4  # The critics' learning rate, by LaProp. The authors have 4e-5.

@@ -19,6 +19,7 @@ from jaxsafe.algos import ALGOS, ambs
 from jaxsafe.config import ConfigError
 from jaxsafe.learn.acting import Player
 from jaxsafe.learn.world_model import WorldModelConfig
+from jaxsafe.nn.rssm import SIZES
 from jaxsafe.types import Env, Shared
 
 NAMES = [name for name, row in ALGOS.items() if issubclass(row.config, WorldModelConfig)]
@@ -86,7 +87,8 @@ def test_published_settings_build(name):
         cfg = ALGOS[name].config(**settings)
         init = ALGOS[name].make(Corridor() if cfg.encoder == "none" else Dark()).init
         before = jax.eval_shape(partial(init, cfg=cfg, shared=START), jax.random.key(0))
-        assert before.params["model"]["params"]["memory"]["BlockDense_0"]["kernel"].shape[0] == 8
+        kernel = before.params["model"]["params"]["memory"]["BlockDense_0"]["kernel"]
+        assert kernel.shape[0] == SIZES[cfg.size].blocks
 
 
 @pytest.mark.parametrize(

@@ -41,7 +41,8 @@ def test_one_side_takes_fewer_dreams_and_a_learned_model_four_times_as_many():
     assert ambs.required_rollouts(0.09, 0.01, learned=True) == 1309
     assert ambs.required_rollouts(0.09, 0.01, one_sided=True, learned=True) == 1138
     line = ambs.note(CFG)
-    assert "from 6 of 512 dreams" in line and "285 with an exact model (512 are enough)" in line
+    assert "from 6 of 512 dreams" in line and "half the time where that has P = 0.011" in line
+    assert "285 with an exact model (512 are enough)" in line
     assert "and 1138 with" in line
     assert "too few" in ambs.note(dataclasses.replace(CFG, shield_rollouts=200))
 
@@ -55,7 +56,10 @@ def test_the_exact_bound_allows_more_than_hoeffdings(rollouts, allowed):
     exact = scipy.stats.binom.cdf(np.arange(rollouts + 1), rollouts, cfg.delta) > cfg.confidence
     np.testing.assert_array_equal(overruled, exact)
     assert not ambs.overrules(shares, dataclasses.replace(cfg, delta=jnp.inf)).any()
-    assert f"from {allowed + 1} of {rollouts} dreams" in ambs.note(cfg)
+    line = ambs.note(cfg)
+    assert f"from {allowed + 1} of {rollouts} dreams" in line
+    half = float(line.partition("P = ")[2].partition(":")[0])
+    np.testing.assert_allclose(scipy.stats.binom.sf(allowed, rollouts, half), 0.5, atol=0.02)
 
 
 def test_a_chain_that_is_a_little_off_is_at_most_as_much_off_as_the_bound_says():
