@@ -19,7 +19,7 @@ import numpy as np
 from jaxsafe import envs
 from jaxsafe.config import ConfigError, EpisodeCount, Index, Seed, convert, flat
 from jaxsafe.envs import SafetyGymConfig, VelocityConfig
-from jaxsafe.learn.acting import Player
+from jaxsafe.learn.acting import Player, first_actions
 from jaxsafe.report import evaluation, film, sweep_summary
 from jaxsafe.report.evaluation import Scores
 from jaxsafe.report.finish import finish
@@ -145,13 +145,14 @@ class Run:
         common = {*run_folder.INDEX} - {"seed"}
         return {name: x[:, 0] if name in common else x for name, x in whole.items()}
 
-    def policy(self, obs: jax.Array, key: jax.Array | None = None, index: int = 0) -> jax.Array:
+    def policy(self, obs: PyTree, key: jax.Array | None = None, index: int = 0) -> jax.Array:
         """The action of a trained policy, compiled; it may be used inside `jit`, `vmap` and `scan`.
 
         A policy with a memory acts as at the first step of an episode; for whole episodes see `player`.
 
         Args:
-            obs: float [..., obs_size] of `run.env(index)`, as the environment gives it.
+            obs: float [..., obs_size] of `run.env(index)`, as the environment gives it, or a dict of
+                that, 'vector', and pictures, 'vision'.
             key: a random key to sample with, anew for each row of a batch; None is the mean, which
                 `evaluate` uses too.
             index: which policy.
@@ -211,18 +212,8 @@ class Run:
     def _act(self) -> Any:
         algo = self._opened.algo
 
-        def act(every: PyTree, index: Any, obs: jax.Array, key: jax.Array | None) -> jax.Array:
-            learned = jax.tree.map(lambda x: x[index], every)
-
-            def one(obs: jax.Array, key: jax.Array | None) -> jax.Array:
-                return algo.policy.act(learned, algo.policy.init(learned), obs, key)[0]
-
-            if obs.ndim == 1:
-                return one(obs, key)
-            rows = obs.reshape(-1, obs.shape[-1])
-            keys = None if key is None else jax.random.split(key, len(rows))
-            actions = jax.vmap(one, in_axes=(0, None if key is None else 0))(rows, keys)
-            return actions.reshape(*obs.shape[:-1], -1)
+        def act(every: PyTree, index: Any, obs: PyTree, key: jax.Array | None) -> jax.Array:
+            return first_actions(algo.policy, jax.tree.map(lambda x: x[index], every), obs, key)
 
         return jax.jit(act)
 

@@ -1,5 +1,6 @@
 """Playing a policy: what training, evaluation, films, the live view and adapters have in common."""
 
+import math
 from typing import Any, NamedTuple
 
 import flax.struct
@@ -7,6 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxsafe.learn.batch import select_rows
+from jaxsafe.learn.observations import vector_of
 from jaxsafe.types import Env, Policy, PyTree, State
 
 
@@ -70,3 +72,20 @@ class Player(NamedTuple):
 def reset_carry(policy: Policy, learned: PyTree, carry: PyTree, first: jax.Array) -> PyTree:
     """`carry` [N, ...], with that of a new episode where `first` [N] holds."""
     return select_rows(first, policy.init(learned), carry)
+
+
+def first_actions(policy: Policy, learned: PyTree, obs: PyTree, key: jax.Array | None) -> jax.Array:
+    """The actions [..., A] in observations [...], as at the first step of an episode; the mean ones
+    where `key` is None."""
+
+    def one(obs: PyTree, key: jax.Array | None) -> jax.Array:
+        return policy.act(learned, policy.init(learned), obs, key)[0]
+
+    *batch, _ = vector_of(obs).shape
+    if not batch:
+        return one(obs, key)
+    count = math.prod(batch)
+    rows = jax.tree.map(lambda x: x.reshape(count, *x.shape[len(batch) :]), obs)
+    keys = None if key is None else jax.random.split(key, count)
+    actions = jax.vmap(one, in_axes=(0, None if key is None else 0))(rows, keys)
+    return actions.reshape(*batch, actions.shape[-1])

@@ -16,12 +16,13 @@ from toys import START, Corridor, Patch
 from jaxsafe.algos import ALGOS, dreamer
 from jaxsafe.config import ConfigError
 from jaxsafe.learn import world_model
+from jaxsafe.learn.acting import first_actions
 from jaxsafe.learn.observations import EncoderConfig, blank, check_observation, observation_like
 from jaxsafe.learn.offline import data_set
 from jaxsafe.learn.replay import Record
 from jaxsafe.learn.sequences import SequenceBatch
 from jaxsafe.run.dataset import read_dataset, write_dataset
-from jaxsafe.types import Shared
+from jaxsafe.types import Policy, Shared
 
 REPLAY: dict[str, Any] = {
     "num_envs": 32,
@@ -64,6 +65,18 @@ def test_the_listed_algorithms_take_pictures_and_all_others_refuse_them_in_one_l
     refused = ALGOS["seditor"]
     with pytest.raises(ConfigError, match="takes vectors"):
         jax.eval_shape(lambda: refused.make(Patch()).init(jax.random.key(0), refused.config(), START))
+
+
+def test_a_policy_acts_on_batches_of_pictures():
+    def act(learned, carry, obs, key):
+        return obs["vision"].sum((0, 1)) + obs["vector"], carry, {}
+
+    obs = {"vision": jnp.arange(2 * 3 * 4 * 4).reshape(2, 3, 4, 4, 1), "vector": jnp.ones((2, 3, 1))}
+    policy = Policy(lambda learned: (), act)
+    expected = obs["vision"].sum((2, 3)) + 1
+    np.testing.assert_array_equal(first_actions(policy, (), obs, None), expected)
+    alone = jax.tree.map(lambda x: x[1, 2], obs)
+    np.testing.assert_array_equal(first_actions(policy, (), alone, None), expected[1, 2])
 
 
 ON_POLICY = [("ppo_lag", {"trunk": "shared"}), ("cpo", {}), ("trpo_lag", {}), ("focops", {})]

@@ -19,6 +19,11 @@ TINY: dict[str, Any] = {
     "num_envs": 4, "horizon": 20, "minibatches": 2, "critic_epochs": 1, "hidden": (4, 4),
     "total_steps": 240, "eval_episodes": 0, "video": False,
 }  # fmt: skip
+SHIELD: dict[str, Any] = {
+    "preset": "cpu", "num_envs": 4, "horizon": 8, "learn_every": 8, "batch_size": 32, "replay_ratio": 2,
+    "n_step": 3, "replay_size": 128, "learning_starts": 32, "size": "tiny", "imagine_steps": 3,
+    "shield_rollouts": 4, "shield_horizon": 5, "total_steps": 128, "eval_episodes": 2,
+}  # fmt: skip
 SMALL = {  # what the settings of each become
     "quickstart": TINY | {"env.num_steps": 40},
     "sweep": TINY | {"num_seeds": 2},
@@ -26,11 +31,13 @@ SMALL = {  # what the settings of each become
     "own_algorithm": TINY,
     "comparison": TINY | {"num_seeds": 2},
     "offline": TINY,
+    "shielding": SHIELD,
 }
 MORE = {  # other lines of its parameters
     "offline": """\
 size = 80
 learning = {"total_updates": 20, "updates": 10, "batch_size": 8, "hidden": (4,), "eval_episodes": 4}""",
+    "shielding": "seen, ahead = 8, 5",
 }
 TASK = "toys:Corridor"  # of tests/, where a notebook has a `task`: compiles in seconds, and is cached
 FAST_XLA = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"

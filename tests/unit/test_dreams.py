@@ -1,0 +1,54 @@
+"""Looks inside a policy with a world model: what belongs to which step."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from toys import Corridor
+
+from jaxsafe.learn.acting import Player
+from jaxsafe.learn.dreaming import Memory
+from jaxsafe.nn.rssm import Latent
+from jaxsafe.nn.two_hot import symlog
+from jaxsafe.report import dreams
+from jaxsafe.types import Policy
+
+
+class Adding:
+    """A model whose latent is what it saw, and then the sum of the actions that it was told."""
+
+    def apply(self, params: Any, *args: Any, method: str) -> Any:
+        return getattr(self, method)(*args)
+
+    def imagine(self, latent, action, key):
+        return Latent(latent.deter + action.sum(), latent.stoch)
+
+    def decode(self, latent):
+        return symlog(latent.deter)
+
+
+def test_what_is_lived_seen_and_foreseen_belongs_to_its_step(monkeypatch):
+    """The latent of a step is of its observation, its action leads to the next, and what is foreseen
+    begins with the action of the step after which the eyes close."""
+    env: Any = Corridor(dt=0.2)
+
+    def act(learned, carry, obs, key):
+        action = jax.random.uniform(key, (2,), minval=-1.0)
+        return action, Memory(Latent(obs, jnp.zeros(1)), action), {"risk": obs[0]}
+
+    policy = Policy(lambda learned: Memory(Latent(jnp.zeros(4), jnp.zeros(1)), jnp.zeros(2)), act)
+    learned: Any = SimpleNamespace(config=None, params={"model": None})
+    player = Player(policy, learned, env)
+    monkeypatch.setattr(dreams, "world_of", lambda *_: Adding())
+    episode = dreams.lived(player, jax.random.key(0), 12)
+    np.testing.assert_array_equal(episode.latent.deter, episode.state.obs)
+    np.testing.assert_array_equal(episode.said["risk"], episode.state.obs[:, 0])
+    before = jax.tree.map(lambda x: x[:-1], episode.state)
+    after = jax.vmap(env.step)(before, episode.action[:-1])
+    np.testing.assert_allclose(after.obs, episode.state.obs[1:], rtol=1e-6)
+    np.testing.assert_allclose(dreams.painted(player, episode.latent), episode.state.obs, rtol=1e-5)
+    found = dreams.foreseen(player, episode, 3, 4, jax.random.key(1))
+    told = episode.action[3:7].sum(-1).cumsum()
+    np.testing.assert_allclose(found.deter, episode.state.obs[3] + told[:, None], rtol=1e-5)
