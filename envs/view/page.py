@@ -82,7 +82,7 @@ def serve_page(playback: Playback, title: str, port: int, open_browser: bool) ->
 
             def show() -> None:
                 renderer.camera = named_camera(renderer.stage.model, frame.camera)
-                frame.jpeg = as_jpeg(renderer.frame(playback.state))
+                frame.jpeg = as_jpeg(renderer.frame(playback.state, playback.shield_acts))
 
             playback.play(show, stopped.is_set)
         except Exception as error:  # raised again below, in the thread of whoever called

@@ -72,11 +72,13 @@ class Playback:
 
         def step(
             state: State, carry: PyTree, action: jax.Array, driven: jax.Array
-        ) -> tuple[State, PyTree]:
+        ) -> tuple[State, PyTree, dict[str, jax.Array]]:
+            said = {}
             if player:
-                chosen, carry = player.act(carry, state)
+                chosen, carry, said = player.decide(carry, state)
                 action = jnp.where(driven, action, chosen)
-            return world.step(state, action), carry
+                said = {name: jnp.where(driven, 0.0, x) for name, x in said.items()}
+            return world.step(state, action), carry, said
 
         self._reset, self._step = jax.jit(reset), jax.jit(step)
         self.reset(seed)
@@ -94,10 +96,11 @@ class Playback:
             forward, turn = pushed(self.held)
             action = np.float32(drive(self.env, forward, turn, self.steps))
             driven = np.bool_(forward or turn)
-            self.state, self._carry = jax.device_get(
+            self.state, self._carry, self.said = jax.device_get(
                 self._step(self.state, self._carry, action, driven)
             )
             self.steps += 1
+            self.overruled += self.shield_acts
             self.ret += float(self.state.reward)
             self.cost += float(self.state.cost)
             self.costs = self.costs + self.state.costs
@@ -106,8 +109,14 @@ class Playback:
                 self.ended = [ended, *self.ended][:LAST]
                 self._begin(self.seed + 1)
 
+    @property
+    def shield_acts(self) -> bool:
+        """Whether a shield overruled the policy at the last step."""
+        return bool(self.said.get("overruled", False))
+
     def _begin(self, seed: int) -> None:
         self.seed, self.steps, self.ret, self.cost = seed, 0, 0.0, 0.0
+        self.overruled, self.said = 0, dict[str, np.ndarray]()
         self.costs = np.zeros(len(self.env.cost_names))
         self.state: State
         self.state, self._carry = jax.device_get(self._reset(jax.random.key(seed)))
@@ -143,4 +152,15 @@ def figures(playback: Playback) -> dict[str, str]:
         "return": f"{playback.ret:.2f}",
         "cost": f"{playback.cost:.0f}",
         **{f"cost {name}": f"{value:.4g}" for name, value in named},
+        **shield(playback),
     }
+
+
+def shield(playback: Playback) -> dict[str, str]:
+    """What a shield does, if there is one."""
+    said = playback.said
+    if "overruled" not in said:
+        return {}
+    risk = {"risk": f"{float(said['risk']):.3f}"} if "risk" in said else {}
+    acts = "acts" if playback.shield_acts else "rests"
+    return {"shield": acts, "shield acted": f"{playback.overruled} steps", **risk}

@@ -56,9 +56,9 @@ class Renderer:
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
 
-    def frame(self, state: State) -> np.ndarray:
+    def frame(self, state: State, overruled: bool = False) -> np.ndarray:
         """The picture of one environment's state, uint8 [height, width, 3]; where the policy sees a
-        picture, with that one to the right."""
+        picture, with that one to the right. A light tells that a shield `overruled` the policy."""
         stage, every = self.stage, mujoco.mjtCatBit.mjCAT_ALL.value
         stage.move(state.physics)
         mujoco.mjv_updateScene(
@@ -70,6 +70,7 @@ class Renderer:
         mujoco.mjr_render(self._rect, self._geoms, self._context)
         mujoco.mjr_readPixels(pixels, None, self._rect, self._context)
         frame = pixels[::-1].copy()  # OpenGL's first row is at the bottom
+        frame = with_light(frame) if overruled else frame
         seen = stage.seen(state)
         return frame if seen is None else beside(frame, seen)
 
@@ -113,10 +114,11 @@ def render_episode(
     seconds = drawable(env).step_seconds * raw_steps(env)
     every = every or max(1, round(1 / (FPS * seconds)))
     times = range(0, last + 1, every)
-    frames = [draw.frame(jax.tree.map(lambda x, t=t: x[t], states)) for t in times]
-    if "overruled" in said:
-        acts = [said["overruled"][t : t + every].any() for t in times]
-        frames = [with_light(frame) if on else frame for frame, on in zip(frames, acts, strict=True)]
+    acts = said.get("overruled", np.zeros(steps, bool))
+    frames = [
+        draw.frame(jax.tree.map(lambda x, t=t: x[t], states), bool(acts[t : t + every].any()))
+        for t in times
+    ]
     if label is None:
         return frames
     returns, costs = np.cumsum(states.reward), np.cumsum(states.cost)

@@ -18,7 +18,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from toys import reflex
 
 from jaxsafe import envs
 from jaxsafe.commands import render as render_command
@@ -27,16 +26,24 @@ from jaxsafe.config import ConfigError
 from jaxsafe.envs.view import playback, window
 from jaxsafe.envs.view.driving import FRONT, drive, robot_of
 from jaxsafe.envs.view.page import as_bars, as_jpeg, as_table
+from jaxsafe.learn.acting import Player
 from jaxsafe.report import film
+from jaxsafe.types import Policy
 
 ROOT = Path(__file__).parent.parent.parent
 
 
 @pytest.fixture(scope="module")
 def session() -> playback.Playback:
-    """Of a policy that always turns left at half speed."""
+    """Of a policy that always turns left at half speed, and whose shield acts at every second step."""
     env = envs.make("point_goal0", engine="c", num_steps=6)
-    return playback.Playback(env, reflex(lambda obs: jnp.array([0.0, 0.5]), env), seed=3)
+
+    def act(learned, carry, obs, key):
+        said = {"overruled": carry % 2 == 1, "risk": jnp.float32(0.25)}
+        return jnp.array([0.0, 0.5]), carry + 1, said
+
+    policy = Policy(lambda learned: jnp.int32(0), act)
+    return playback.Playback(env, Player(policy, (), env), seed=3)
 
 
 @pytest.mark.parametrize(
@@ -103,6 +110,22 @@ def test_a_session_counts_and_goes_on_to_the_next_seed(session):
     assert last[:2] == (3, 6) and f"<td>{last.ret:.2f}</td>" in as_table(session)
     session.reset(3)
     np.testing.assert_array_equal(session.state.obs, first.obs)
+
+
+def test_it_says_when_a_shield_acts(session):
+    session.reset(3)
+    assert not session.shield_acts and "shield" not in playback.figures(session)
+    acts = []
+    for held in (set(), set(), set(), {"ArrowUp"}, set()):  # keys overrule a shield
+        session.held = held
+        session.step()
+        acts.append(session.shield_acts)
+    assert acts == [False, True, False, False, False]
+    session.reset(3)
+    for _ in range(4):
+        session.step()
+    said = playback.figures(session)
+    assert (said["shield"], said["shield acted"], said["risk"]) == ("acts", "2 steps", "0.250")
 
 
 def test_held_keys_take_over_from_the_policy(session):
