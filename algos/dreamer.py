@@ -10,6 +10,7 @@ from jaxsafe.config import Bounds, Weight, config
 from jaxsafe.learn.batch import pmean
 from jaxsafe.learn.dreaming import (
     Behaviour,
+    Judged,
     Outcome,
     Range,
     Scene,
@@ -150,25 +151,30 @@ def discounted_limit(env: Env, cfg: Any) -> jax.Array:
     return cfg.cost_limit / (env.episode_length * jnp.maximum(1 - cfg.cost_discount, 1e-6))
 
 
+def learn_cost(
+    trained: dict[str, PyTree], dreams: Dreams, scene: Scene
+) -> tuple[Judged, jax.Array, Metrics]:
+    """What the actor's dreams cost; the loss of the critic that says so, and metrics."""
+    cfg = scene.cfg
+    costs = scene.judge("critic_c", dreams, dreams.read["cost"], cfg.cost_discount)
+    loss = scene.critic_loss_with_rows(
+        trained, "critic_c", dreams, costs.returns, scene.batch.rows.cost, cfg.cost_discount
+    )
+    value = scene.over_dreams(costs.value[:-1])
+    return costs, loss, {"train/critic_loss_c": loss, "train/value_c": value}
+
+
 def learn_priced(trained: dict[str, PyTree], memory: PyTree, scene: Scene, key: jax.Array) -> Outcome:
     cfg, dual = scene.cfg, memory["dual"]
     found = learn_reward(trained, memory["range"], scene, key)
     dreams = found.dreams
-    costs = scene.judge("critic_c", dreams, dreams.read["cost"], cfg.cost_discount)
+    costs, critic_loss, of_cost = learn_cost(trained, dreams, scene)
     violation = costs.returns - discounted_limit(scene.env, cfg)
     penalty = dual.psi(violation)
     if cfg.actor_grad == "reinforce":
         penalty = fixed(dual.price(violation) * costs.advantage) * dreams.log_prob
-    critic_loss = scene.critic_loss_with_rows(
-        trained, "critic_c", dreams, costs.returns, scene.batch.rows.cost, cfg.cost_discount
-    )
     mean_violation = fixed(scene.over_dreams(violation))
-    metrics = {
-        "train/critic_loss_c": critic_loss,
-        "train/value_c": scene.over_dreams(costs.value[:-1]),
-        "train/dream_violation": mean_violation,
-        "train/lam": dual.lam,
-    }
+    metrics = of_cost | {"train/dream_violation": mean_violation, "train/lam": dual.lam}
     dual = dual.raised(pmean(mean_violation, scene.axis_name), cfg)
     loss = found.loss + scene.over_dreams(dreams.weight[:-1] * penalty) + critic_loss
     return Outcome(loss, {"range": found.range, "dual": dual}, found.metrics | metrics)
@@ -202,6 +208,17 @@ AMBS: dict[str, Any] = {
     "n_step": 63, "learning_starts": 1024, "model_lr": 1e-4, "lr": 3e-5, "critic_lr": 3e-5,
     "dyn_scale": 0.5, "replay_value": 0.0, "limit_ends": True, "size": "12m",
 }  # fmt: skip
+# PKU-Alignment/SafeDreamer @529221f: on vectors, for env.wrap.action_repeat=4; the size is the nearest
+# to its own
+VECTORS: dict[str, Any] = {
+    "num_envs": 8, "horizon": 128, "learn_every": 2, "stagger": False, "replay_ratio": 512,
+    "n_step": 63, "learning_starts": 1024, "model_lr": 1e-4, "lr": 3e-5, "critic_lr": 3e-5,
+    "dyn_scale": 0.5, "replay_value": 0.0, "actor_grad": "backprop", "size": "12m",
+}  # fmt: skip
+# its BSRP-Lag, whose mu is below 1 for 1.9 million gradient steps
+SAFE_DREAMER: dict[str, Any] = VECTORS | {
+    "cost_limit": 2.0, "lam_init": 1e-6, "mu_growth": 1e-5, "mu_least": 0.0,
+}  # fmt: skip
 # for two cores and half an hour: small networks, short dreams, larger steps
 CPU: dict[str, Any] = {
     "num_envs": 16, "replay_size": 200_000, "learning_starts": 1024, "size": "300k", "batch_size": 256,
@@ -228,7 +245,7 @@ ROWS = {
         DreamerLagConfig,
         partial(make, behaviour=priced),
         "Dreamer with an augmented Lagrangian on the cost of its dreams",
-        {"ambs": AMBS, "cpu": CPU},
+        {"ambs": AMBS, "safe_dreamer": SAFE_DREAMER, "cpu": CPU},
         lever=LEVER | {"mu_least": 0.05},  # with 1 the multiplier overshoots, and costs stay near 1.4
     ),
 }

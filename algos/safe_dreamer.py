@@ -1,0 +1,241 @@
+"""SafeDreamer, which plans in the dreams of a world model, among plans of a low cost."""
+
+from functools import partial
+from typing import Annotated, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxsafe.algos import dreamer
+from jaxsafe.config import Amount, Bounds, Cap, Iterations, Share, Weight, config
+from jaxsafe.learn.acting import Learned
+from jaxsafe.learn.bill import PriceClockConfig
+from jaxsafe.learn.dreaming import (
+    Behaviour,
+    Memory,
+    Outcome,
+    Scene,
+    dreaming_learner,
+    dreaming_policy,
+    no_range,
+    seen,
+)
+from jaxsafe.learn.off_policy import off_policy
+from jaxsafe.learn.planning import PlanConfig, cem, elites
+from jaxsafe.learn.row import Row
+from jaxsafe.learn.treatments import Treatment, no_treatment
+from jaxsafe.learn.world_model import critic_of, dream_returns, read, world_of
+from jaxsafe.nn.rssm import Latent
+from jaxsafe.nn.two_hot import BINS, two_hot_mean
+from jaxsafe.types import Algorithm, Count, Env, Policy, PyTree
+
+
+@config
+class OSRPConfig(PlanConfig, dreamer.DreamerConfig):
+    """OSRP: SafeDreamer that plans in dreams, among plans of a low cost.
+
+        R(a_1 .. a_H) = r_1 + discount k_1 ((1 - td_lambda) V(s_1) + td_lambda (r_2 + ..)),   V at s_H
+        C(a_1 .. a_H) = T / H  sum_h c_h,   T the steps of an episode
+        elites: the largest R among plans with C <= cost_limit;
+                if there are fewer of these than elites, the smallest C of all plans
+        acts with the first action of the mean that CEM finds
+
+    in dreams of Dreamer's model, which has a head of cost, c. V is the critic of Dreamer's actor, which
+    learns in dreams as in Dreamer, blind to cost. It does not act.
+
+    Source: Huang et al. (2024), "SafeDreamer: Safe Reinforcement Learning with World Models",
+    arXiv:2307.07176; the settings are from the authors' code.
+    Differs from it: Dreamer is the later one. The head of cost has no weight of its own. Plans are
+    drawn once for each environment, and are none of the actor's.
+    """
+
+    # The undiscounted cost that an episode may have, as in the authors' code.
+    cost_limit: Weight = 2.0
+    plan_steps: Iterations = 15  # H, steps that are planned ahead, as in the paper.
+    cem_iterations: Iterations = 6  # Times that the plans are improved, as in the paper.
+    plans: Amount = 500  # S, plans that are tried each time, as in the paper.
+    particles: Amount = 1  # Dreams of each plan, as in the authors' code.
+    # The best plans, which make the next mean and variance. As in the paper.
+    elites: Amount = 50
+    plan_var: Annotated[float, Bounds(0, 100)] = 1.0  # The variance at first, as in the authors' code.
+    mean_momentum: Share = 0.1  # The share of the old mean that is kept, as in the authors' code.
+    var_momentum: Share = 0.0  # The share of the old variance that is kept, as in the authors' code.
+
+
+@config
+class OSRPLagConfig(PriceClockConfig, OSRPConfig):
+    """OSRP-Lag: OSRP whose plans also pay for cost, at the price of a PID controller.
+
+        elites: the largest R - lam R_c, among the same plans as in OSRP
+        lam  = clip(pid_kp e + I + pid_kd max(0, J_c - J_c'), 0, price_max),   e = J_c - cost_limit
+        I   <- clip(I + pid_ki e, 0, price_max),   every `dual_every` steps
+
+    R_c is the return of cost, with a critic of its own. J_c is the smoothed cost of an episode, and
+    J_c' what it was before. The rest is as in OSRP.
+
+    Source: Huang et al. (2024), "SafeDreamer: Safe Reinforcement Learning with World Models",
+    arXiv:2307.07176; the settings are from the authors' code.
+    Differs from it: as OSRP, and there the price moves with each episode.
+    """
+
+    # Environment steps between two moves of the price. The authors' moves with each episode.
+    dual_every: Annotated[int, Bounds(1, 2**30)] = 1_000
+    # Environment steps before the price first moves, as in the authors' code.
+    dual_starts: Annotated[int, Bounds(0, 2**31 - 1)] = 5_000
+    pid_kp: Weight = 0.1  # Price for each unit of violation, as in the authors' code.
+    # Price that each unit of violation adds at each move, as in the authors' code.
+    pid_ki: Weight = 0.01
+    pid_kd: Weight = 0.01  # Price for each unit that the cost rose, as in the authors' code.
+    # Share of the past in the smoothed cost of an episode, as in the authors' code.
+    pid_smoothing: Share = 0.99
+    price_max: Cap = 0.1  # The highest price, as in the authors' code.
+
+
+# ---- learning ----------------------------------------------------------------------------------
+
+
+def learn_beside(trained: dict[str, PyTree], memory: PyTree, scene: Scene, key: jax.Array) -> Outcome:
+    """Dreamer's actor, and a critic of what it would cost."""
+    found = dreamer.learn_reward(trained, memory["range"], scene, key)
+    _, loss, metrics = dreamer.learn_cost(trained, found.dreams, scene)
+    return Outcome(found.loss + loss, {"range": found.range}, found.metrics | metrics)
+
+
+planned = Behaviour(
+    learn=dreamer.learn,
+    memory=lambda cfg: {"range": no_range()},
+    heads=(("cost", BINS),),
+    targets=lambda env, rows, cfg: {"cost": rows.cost},
+)
+planned_at_a_price = planned._replace(learn=learn_beside, critics=("critic_r", "critic_c"))
+
+
+class Price(NamedTuple):
+    """The price lam; what it remembers: the sum of violations, as a price, and the smoothed cost of an
+    episode, float []."""
+
+    lam: jax.Array
+    integral: jax.Array
+    cost: jax.Array
+
+
+def move_price(price: Price, episode_cost: jax.Array, cfg: Any, iteration: Count) -> Price:
+    cost = cfg.pid_smoothing * price.cost + (1 - cfg.pid_smoothing) * episode_cost
+    error = cost - cfg.cost_limit
+    integral = jnp.clip(price.integral + cfg.pid_ki * error, 0.0, cfg.price_max)
+    rise = jnp.maximum(0.0, cost - price.cost)
+    lam = jnp.clip(cfg.pid_kp * error + integral + cfg.pid_kd * rise, 0.0, cfg.price_max)
+    return Price(lam, integral, cost)
+
+
+controller = Treatment(
+    init=lambda cfg: Price(*jnp.zeros(3)),
+    update=move_price,
+    advantage=lambda price, adv_r, adv_c: adv_r - price.lam * adv_c,
+    metrics=lambda price: {"train/lam": price.lam},
+)
+
+
+# ---- planning ----------------------------------------------------------------------------------
+
+
+class Planning(NamedTuple):
+    """What the policy remembers: where it was, what it did there, and the mean of its plan, [H, A]."""
+
+    latent: Latent
+    action: jax.Array
+    mean: jax.Array
+
+
+def scores(
+    env: Env,
+    behaviour: Behaviour,
+    learned: Learned,
+    latent: Latent,
+    plans: jax.Array,
+    key: jax.Array,
+) -> tuple[jax.Array, jax.Array]:
+    """What `plans` [S, H, A] earn in dreams from `latent`, and what they cost in an episode: [S] each.
+    If there is a critic of cost, the first is less the price of the returns of cost."""
+    cfg, params = learned.config, learned.params
+    world = world_of(env, behaviour.all_heads, cfg)
+    dreams = (cfg.particles, len(plans))
+    start = jax.tree.map(lambda x: jnp.broadcast_to(x, (*dreams, *x.shape)), latent)
+
+    def step(now: Latent, x: tuple[jax.Array, jax.Array]) -> tuple[Latent, jax.Array]:
+        action, key = x
+        action = jnp.broadcast_to(action, (*dreams, action.shape[-1]))
+        after: Any = world.apply(params["model"], now, action, key, method="imagine")
+        return after, after.features
+
+    keys = jax.random.split(key, plans.shape[1])
+    later = jax.lax.scan(step, start, (jnp.moveaxis(plans, 1, 0), keys))[1]
+    features = jnp.concatenate([start.features[None], later])
+    says = read(world, params["model"], features)
+
+    def returns(of: str, critic: str, discount: jax.Array | float) -> jax.Array:
+        logits: Any = critic_of(cfg).apply(params[critic], features)
+        args = says[of], two_hot_mean(logits), says["cont"]
+        return dream_returns(*args, discount=discount, decay=cfg.td_lambda)[0].mean(0)
+
+    ret = returns("reward", "critic_r", cfg.discount)
+    if "critic_c" in behaviour.critics:
+        ret = controller.advantage(learned.dual, ret, returns("cost", "critic_c", cfg.cost_discount))
+    cost = says["cost"][1:].mean(1).sum(0)
+    return ret, env.episode_length / plans.shape[1] * cost
+
+
+def planning(env: Env, behaviour: Behaviour) -> Policy:
+    """The policy that plans anew at each step, in dreams."""
+    dreamers = dreaming_policy(env, behaviour)
+
+    def init(learned: Learned) -> Planning:
+        mean = jnp.zeros((learned.config.plan_steps, env.action_size))
+        return Planning(*dreamers.init(learned), mean)
+
+    def act(
+        learned: Learned, carry: Planning, obs: Any, key: jax.Array | None
+    ) -> tuple[jax.Array, Planning, dict[str, Any]]:
+        latent_key, plan_key = (None, jax.random.key(0)) if key is None else jax.random.split(key)
+        memory = Memory(carry.latent, carry.action)
+        latent = seen(env, behaviour, learned, memory, obs, latent_key)
+        score = partial(scores, env, behaviour, learned, latent)
+        mean = cem(score, elites, carry.mean, (), plan_key, learned.config)
+        return mean[0], Planning(latent, mean[0], jnp.concatenate([mean[1:], mean[-1:]])), {}
+
+    return Policy(init=init, act=act)
+
+
+# ---- rows --------------------------------------------------------------------------------------
+
+
+def make(
+    env: Env,
+    axis_name: str | None = None,
+    behaviour: Behaviour = planned,
+    treatment: Treatment = no_treatment,
+) -> Algorithm:
+    learner = dreaming_learner(env, behaviour, planning(env, behaviour))
+    return off_policy(env, learner, treatment, axis_name)
+
+
+LEVER: dict[str, Any] = dreamer.LEVER | {
+    "plan_steps": 1, "plans": 64, "elites": 8, "cem_iterations": 4, "cost_limit": 2.5,
+}  # fmt: skip
+
+ROWS = {
+    "osrp": Row(
+        OSRPConfig,
+        make,
+        "SafeDreamer: planning in a world model's dreams, among plans of a low cost",
+        {"safe_dreamer": dreamer.VECTORS},
+        lever=LEVER,
+    ),
+    "osrp_lag": Row(
+        OSRPLagConfig,
+        partial(make, behaviour=planned_at_a_price, treatment=controller),
+        "OSRP whose plans also pay for cost, at the price of a PID controller",
+        {"safe_dreamer": dreamer.VECTORS},
+        lever=LEVER | {"dual_every": 256, "dual_starts": 512},
+    ),
+}
