@@ -1,5 +1,6 @@
 """Playing a policy: what training, evaluation, films, the live view and adapters have in common."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import flax.struct
@@ -8,6 +9,12 @@ import jax.numpy as jnp
 
 from jaxsafe.learn.batch import select_rows
 from jaxsafe.types import Env, Policy, PyTree, State
+
+# What acts in N environments at once, and begins its carry anew where `first` holds:
+# (carry [N, ...], State of N, first [N], key) -> action [N, A], carry, what it says, float [N] by name
+ActInAll = Callable[
+    [PyTree, State, jax.Array, jax.Array], tuple[jax.Array, PyTree, dict[str, jax.Array]]
+]
 
 
 @flax.struct.dataclass
@@ -65,6 +72,14 @@ class Player(NamedTuple):
         """As `act`, and what the policy reports beside its action."""
         obs = state if self.policy.privileged(self.learned) else state.obs
         return self.policy.act(self.learned, carry, obs, key)
+
+    def act_in_all(
+        self, carry: PyTree, state: State, first: jax.Array, key: jax.Array
+    ) -> tuple[jax.Array, PyTree, dict[str, jax.Array]]:
+        """Sampled actions in N environments: an `ActInAll`."""
+        carry = reset_carry(self.policy, self.learned, carry, first)
+        action, carry, said = jax.vmap(self.decide)(carry, state, jax.random.split(key, len(first)))
+        return action, carry, jax.tree.map(jnp.float32, said)
 
 
 def reset_carry(policy: Policy, learned: PyTree, carry: PyTree, first: jax.Array) -> PyTree:

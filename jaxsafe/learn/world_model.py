@@ -14,9 +14,9 @@ import jax.numpy as jnp
 import optax
 
 from jaxsafe.config import Amount, Iterations, Norm, Rate, Share, Weight, config
-from jaxsafe.learn.off_policy import RoundConfig
 from jaxsafe.learn.replay import Record
 from jaxsafe.learn.sequences import SequenceBatch
+from jaxsafe.learn.timetable import RoundConfig
 from jaxsafe.nn.gaussian import Gaussian, entropy, log_prob, sample
 from jaxsafe.nn.rssm import (
     SIZES,

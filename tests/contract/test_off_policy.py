@@ -269,10 +269,10 @@ def test_the_last_observation_of_an_episode_has_a_row_and_the_next_row_is_a_rese
                replay_size=400, stagger=False)  # fmt: skip
     keys = jax.random.split(jax.random.key(1), 40)
 
-    def behave(carry, state, first, key):
+    def act(carry, state, first, key):
         return jnp.zeros((5, 1)), carry, {}
 
-    _, (rows, steps) = jax.jit(lambda x: collect_records(env, behave, x, keys))(ts.stepping)
+    _, (rows, steps) = jax.jit(lambda x: collect_records(env, act, x, keys))(ts.stepping)
     name, clock, life = np.moveaxis(np.asarray(rows.obs), -1, 0)
     last = np.asarray(rows.terminated | rows.truncated)
     assert rows.first[0].all() and (np.asarray(rows.first[1:]) == last[:-1]).all()
