@@ -8,7 +8,7 @@ from pathlib import Path
 from jaxsafe.commands.guard import guarded
 from jaxsafe.commands.jaxsafe import called
 from jaxsafe.interop import migrate, migrate_commands
-from jaxsafe.run.arguments import fail
+from jaxsafe.run.flags import fail
 
 COMMANDS = {"ambs": migrate_commands.ambs, "alf": migrate_commands.alf}
 

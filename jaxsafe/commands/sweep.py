@@ -10,7 +10,8 @@ from jaxsafe.commands.jaxsafe import called
 from jaxsafe.report.finish import finish
 from jaxsafe.report.sweep_summary import summarise
 from jaxsafe.run import files, sweep
-from jaxsafe.run.arguments import fail, read_values
+from jaxsafe.run.arguments import read_values
+from jaxsafe.run.flags import fail
 from jaxsafe.run.progress import Reporter
 
 EPILOG = """\

@@ -11,7 +11,7 @@ from jaxsafe import algos, envs
 from jaxsafe.config import ConfigError
 from jaxsafe.envs.safety_gym import suite
 from jaxsafe.interop import migrate
-from jaxsafe.run import arguments
+from jaxsafe.run import arguments, hydra_jobs
 
 # What OmniSafe 0.5.0 and later takes where nothing is said: PPOLag, and what is other of TRPO.
 PPO_LAG: dict[str, Any] = {
@@ -138,7 +138,7 @@ PLAIN = ["env=point_goal1", "env.rules=safety_gymnasium"]
 
 def migrated(config: dict[str, Any], algo: str, env: str = "SafetyPointGoal1-v0") -> migrate.Migrated:
     found = migrate.omnisafe(config, algo, env)
-    arguments.check_arguments(found.argv)  # train.py takes it
+    hydra_jobs.check_arguments(found.argv)  # train.py takes it
     return found
 
 
@@ -274,7 +274,7 @@ EVALUATED = ["total_steps=1000000", "eval_episodes=1", "eval_every=10000"]
 )  # fmt: skip
 def test_the_defaults_of_planning_are_the_published_preset_on_coordinates(theirs, config):
     found = migrate.omnisafe(config, theirs, "SafetyPointGoal1-v0-modelbased")
-    arguments.check_arguments(found.argv)
+    hydra_jobs.check_arguments(found.argv)
     own = f"algo={migrate.algorithms()[theirs]}"
     start = [*PLAIN, "env.observation=coordinates", own, "preset=published", "compat=omnisafe"]
     assert found.argv[:6] == start
@@ -290,7 +290,7 @@ def test_the_defaults_of_planning_are_the_published_preset_on_coordinates(theirs
 def test_planning_in_velocity_tasks_has_their_preset(theirs, changed):
     config = {"defaults": {"LOOP": LOOP, "PETS": PETS}[theirs], "SafetyAntVelocity-v1": ANT[theirs]}
     found = migrate.omnisafe(config, theirs, "SafetyAntVelocity-v1")
-    arguments.check_arguments(found.argv)
+    hydra_jobs.check_arguments(found.argv)
     start = [
         "env=ant_velocity",
         f"algo={theirs.lower()}",
@@ -555,7 +555,7 @@ def test_an_engine_dict_is_the_nearest_environment_and_the_rest():
     expected = ["env.hazards_num=3", "env.hazards_locations=[[1.0,1.0],[-1.0,0.5]]"]
     assert sorted(found.argv) == sorted(["env=point_push1", *expected, "env.constrain_indicator=false"])
     assert {line.key for line in found.lines} == set(config)
-    request = arguments.check_arguments(found.argv)
+    request = hydra_jobs.check_arguments(found.argv)
     assert expected[1] in request.argv
     for name, message in (("hazard_num", "did you mean 'hazards_num'"), ("awake", "of Engine")):
         with pytest.raises(ConfigError, match=message):

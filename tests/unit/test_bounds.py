@@ -18,7 +18,8 @@ from jaxsafe.config import Amount, Bounds, ConfigError, Share, convert, flat, fr
 from jaxsafe.envs.wrap import WrapConfig
 from jaxsafe.learn.conventions import conventions
 from jaxsafe.run import sweep
-from jaxsafe.run.arguments import check_arguments, compose, read_values
+from jaxsafe.run.arguments import compose, read_values
+from jaxsafe.run.hydra_jobs import check_arguments
 from jaxsafe.run.plain import as_text
 from jaxsafe.run.settings import (
     Settings,
