@@ -17,7 +17,6 @@ from jaxsafe import algos, envs
 from jaxsafe.config import Amount, Bounds, ConfigError, Share, convert, flat, from_dict, shown
 from jaxsafe.envs.wrap import WrapConfig
 from jaxsafe.learn.conventions import conventions
-from jaxsafe.run import sweep
 from jaxsafe.run.arguments import compose, read_values
 from jaxsafe.run.hydra_jobs import check_arguments
 from jaxsafe.run.plain import as_text
@@ -29,6 +28,7 @@ from jaxsafe.run.settings import (
     settings_from_config,
     settings_from_options,
 )
+from jaxsafe.run.sweep_plan import plan
 
 CONFIGS = {name: row.config for name, row in algos.ALGOS.items()}
 CONFIGS |= {
@@ -177,7 +177,7 @@ def test_a_sweep_is_judged_before_its_settings_are_listed(texts):
     begun = time.monotonic()
     with pytest.raises(ConfigError, match=HUGE[texts]):
         given = read_values(["env=toys:Corridor", *texts.split()])
-        sweep.plan(given.options, given.several)
+        plan(given.options, given.several)
     assert time.monotonic() - begun < 10
 
 
