@@ -11,6 +11,8 @@ from jaxsafe import algos, envs
 from jaxsafe.config import ConfigError
 from jaxsafe.envs.safety_gym import suite
 from jaxsafe.interop import migrate
+from jaxsafe.interop.migrate.model_based import REPEAT
+from jaxsafe.interop.migrate.on_policy import ON_POLICY
 from jaxsafe.run import arguments, hydra_jobs
 
 # What OmniSafe 0.5.0 and later takes where nothing is said: PPOLag, and what is other of TRPO.
@@ -417,9 +419,9 @@ def test_every_option_that_a_key_becomes_exists_in_its_family():
     for name, family in migrate.FAMILIES.items():
         rows = [row for row in algos.ALGOS.values() if migrate.family_of(row) == name]
         fields = {f"algo.{f.name}" for row in rows for f in dataclasses.fields(row.config)}
-        fields |= {"algo", "env", "env.rules", "seed", "total_steps", "num_envs", migrate.REPEAT}
+        fields |= {"algo", "env", "env.rules", "seed", "total_steps", "num_envs", REPEAT}
         fields |= {"dataset", "total_updates", "eval_episodes", "eval_every"}
-        own = {k: r for k, r in family.rules.items() if r != migrate.OMNISAFE.get(k)} or family.rules
+        own = {k: r for k, r in family.rules.items() if r != ON_POLICY.get(k)} or family.rules
         assert {o for rule in own.values() for o in rule.ours.split()} <= fields
 
 
