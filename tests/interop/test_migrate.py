@@ -391,6 +391,13 @@ def test_what_has_no_counterpart_is_named(algo, key, value, reason):
     assert len(found.argv) == 5
 
 
+def test_a_key_of_another_algorithm_or_a_value_of_another_type_is_lost_and_no_more():
+    """An option of LOOP with PETS; a list where a word stands."""
+    for key, value, algo in (("alpha", 0.1, "PETS"), ("adv_estimation_method", ["gae"], "PPOLag")):
+        found = migrated({"algo_cfgs": {key: value}}, algo)
+        assert lost(found) == [f"algo_cfgs.{key}"]
+
+
 def test_two_keys_of_one_option_say_which_counts():
     sizes = {"actor": {"hidden_sizes": [32]}, "critic": {"hidden_sizes": [64]}}
     found = migrated({"model_cfgs": sizes}, "PPOLag")
@@ -500,6 +507,18 @@ def test_offline_configs_count_gradient_steps_and_keep_a_path():
             "PPOLag",
             "point_goal1",
             "batch_size=0: expected a whole number between 1 and",
+        ),
+        (
+            {"algo_cfgs": {"warmup_epochs": None}},
+            "SACLag",
+            "point_goal1",
+            "warmup_epochs=None: expected a whole number",
+        ),
+        (
+            {"opt_s": {"temperature": {"max": [1, 2]}}},
+            "CRABS",
+            "pendulum_swing",
+            r"algo.temperature=\[1, 2\]: expected a number",
         ),
         ({}, "PPOlag", "point_goal1", "did you mean 'PPOLag'"),
         ({}, "CRABS", "SafetyPointGoal1-v0", "CRABS is for SafeInvertedPendulumSwing-v2 alone"),

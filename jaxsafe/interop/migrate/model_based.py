@@ -99,6 +99,8 @@ def beside(value: Any, facts: Facts) -> dict[str, Any] | None:
 
 def cooling(value: Any, facts: Facts) -> dict[str, Any]:
     """LOOP's temperature. Multiplied by alpha_gamma at each gradient step it is soon next to 0."""
+    if LOOPS not in facts.options:
+        return {"algo.alpha_init": value}
     falls = facts.values.get("algo_cfgs.alpha_discount", facts.options["algo.alpha_init"] == COLD)
     fixed = facts.real("algo_cfgs.alpha", 0.2)
     return {"algo.alpha_init": COLD if falls else fixed}

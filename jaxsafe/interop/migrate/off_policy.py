@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from jaxsafe.config import Amount, convert
+from jaxsafe.config import Amount, Period, convert
 from jaxsafe.interop.migrate.on_policy import ON_POLICY
 from jaxsafe.interop.migrate.rules import Facts, Rule, Translate, always, computed, ignored
 from jaxsafe.learn.bill import PriceClockConfig
@@ -42,7 +42,8 @@ def per_move(option: str) -> Translate:
 
 
 def warm_up(value: Any, facts: Facts) -> dict[str, Any]:
-    return {"algo.dual_starts": value * facts.whole("algo_cfgs.steps_per_epoch", 2000)}
+    epochs = convert(value, Period, "algo_cfgs.warmup_epochs")
+    return {"algo.dual_starts": epochs * facts.whole("algo_cfgs.steps_per_epoch", 2000)}
 
 
 def temperature(on: Any, facts: Facts) -> dict[str, Any]:
@@ -65,8 +66,8 @@ def epochs(value: Any, facts: Facts) -> dict[str, Any]:
 
 def hottest(value: Any, facts: Facts) -> dict[str, Any] | None:
     """Of a range whose two ends are one number here."""
-    ends = {facts.values.get(f"opt_s.temperature.{end}", value) for end in ("min", "max")}
-    return {"algo.temperature": value} if len(ends) == 1 else None
+    ends = [facts.values.get(f"opt_s.temperature.{end}", value) for end in ("min", "max")]
+    return {"algo.temperature": value} if ends[0] == ends[1] else None
 
 
 OFF_POLICY: dict[str, Rule] = ON_POLICY | {

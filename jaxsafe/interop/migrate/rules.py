@@ -73,7 +73,10 @@ def switch(option: str, off: float, note: str) -> Rule:
 
 
 def named(option: str, names: dict[str, str], note: str) -> Rule:
-    return Rule(option, note, lambda word, facts: {option: names[word]} if word in names else None)
+    def turn(word: Any, facts: Facts) -> dict[str, Any] | None:
+        return {option: names[word]} if isinstance(word, str) and word in names else None
+
+    return Rule(option, note, turn)
 
 
 def always(*values: Any, note: str) -> Rule:
