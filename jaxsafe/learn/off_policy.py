@@ -210,27 +210,39 @@ def off_policy(
         return act
 
     def learn(ts: TrainState, at: Round, key: jax.Array) -> tuple[TrainState, Metrics]:
-        """The gradient steps of a round if it is ready, each on a batch of its own."""
+        """The gradient steps of a round if it is ready, each on a batch of its own.
+
+        If they lead to anything that is not finite, none of them takes effect. A GPU spends as long on
+        launching a gradient step as on computing it, so what all of them need is done once: all batches
+        are drawn before the first, and the outcome is checked after the last.
+        """
         cfg, count = ts.config, timetable_of(ts.config, axis_name).gradient_steps
         if not count:
             return ts, {}
-        batch_size = cfg.batch_size // device_count(axis_name)
         share = remaining(at.iteration, cfg)
+        batch_size = cfg.batch_size // device_count(axis_name)
         source = Source(ts.replay, at.after, ts.normaliser, batch_size, cfg.n_step)
 
-        def step(nets: Trainable, x: tuple[jax.Array, jax.Array]) -> tuple[Trainable, Metrics]:
-            number, key = x
-            draw_key, step_key = jax.random.split(device_key(key, axis_name))
-            batch, dropped = learner.replayed(draw_key, source, cfg, axis_name)
-            when = GradientStep(number, share, step_key, ts.dual)
-            new, metrics = learner.step(nets, batch, when, cfg, axis_name)
-            finite = psum(~all_finite(new), axis_name) == 0
-            lost = {"train/nonfinite": dropped + ~finite}
-            return select(finite, new, nets), jax.tree.map(jnp.float32, metrics | lost)
+        def keys_of(key: jax.Array) -> jax.Array:
+            return jax.random.split(device_key(key, axis_name))
+
+        def batch_of(key: jax.Array) -> tuple[PyTree, jax.Array]:
+            return learner.replayed(key, source, cfg, axis_name)
+
+        def step(nets: Trainable, x: tuple[jax.Array, jax.Array, PyTree]) -> tuple[Trainable, Metrics]:
+            number, key, batch = x
+            when = GradientStep(number, share, key, ts.dual)
+            nets, metrics = learner.step(nets, batch, when, cfg, axis_name)
+            return nets, jax.tree.map(jnp.float32, metrics)
 
         def steps(nets: Trainable) -> tuple[Trainable, Metrics]:
+            keys = jax.vmap(keys_of)(jax.random.split(key, count))
+            batches, dropped = jax.vmap(batch_of)(keys[:, 0])
             numbers = at.first_step + jnp.arange(count)
-            return jax.lax.scan(step, nets, (numbers, jax.random.split(key, count)))
+            new, metrics = jax.lax.scan(step, nets, (numbers, keys[:, 1], batches))
+            finite = psum(~all_finite(new), axis_name) == 0
+            lost = {"train/nonfinite": jnp.float32(dropped + ~finite)}
+            return select(finite, new, nets), metrics | lost
 
         like = jax.eval_shape(steps, ts.nets)[1]
         nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
