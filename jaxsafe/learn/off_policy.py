@@ -20,7 +20,7 @@ import jax.numpy as jnp
 
 from jaxsafe.config import Norm, Rate, Share, Units, config
 from jaxsafe.learn.acting import ActInAll, Learned, Player, learned_of
-from jaxsafe.learn.batch import all_finite, device_count, device_key, masked_mean, psum, select
+from jaxsafe.learn.batch import all_finite, device_key, masked_mean, psum, select
 from jaxsafe.learn.bill import charge, empty_bill, settle
 from jaxsafe.learn.constraints import Names, check_cost_names, metrics_by_constraint, signal
 from jaxsafe.learn.learner import GradientStep, Learner, policy_by
@@ -216,12 +216,11 @@ def off_policy(
         launching a gradient step as on computing it, so what all of them need is done once: all batches
         are drawn before the first, and the outcome is checked after the last.
         """
-        cfg, count = ts.config, timetable_of(ts.config, axis_name).gradient_steps
-        if not count:
+        cfg, table = ts.config, timetable_of(ts.config, axis_name)
+        if not table.gradient_steps:
             return ts, {}
         share = remaining(at.iteration, cfg)
-        batch_size = cfg.batch_size // device_count(axis_name)
-        source = Source(ts.replay, at.after, ts.normaliser, batch_size, cfg.n_step)
+        source = Source(ts.replay, at.after, ts.normaliser, table.batch, cfg.n_step)
 
         def keys_of(key: jax.Array) -> jax.Array:
             return jax.random.split(device_key(key, axis_name))
@@ -236,9 +235,9 @@ def off_policy(
             return nets, jax.tree.map(jnp.float32, metrics)
 
         def steps(nets: Trainable) -> tuple[Trainable, Metrics]:
-            keys = jax.vmap(keys_of)(jax.random.split(key, count))
+            keys = jax.vmap(keys_of)(jax.random.split(key, table.gradient_steps))
             batches, dropped = jax.vmap(batch_of)(keys[:, 0])
-            numbers = at.first_step + jnp.arange(count)
+            numbers = at.first_step + jnp.arange(table.gradient_steps)
             new, metrics = jax.lax.scan(step, nets, (numbers, keys[:, 1], batches))
             finite = psum(~all_finite(new), axis_name) == 0
             lost = {"train/nonfinite": jnp.float32(dropped + ~finite)}

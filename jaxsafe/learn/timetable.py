@@ -9,7 +9,7 @@ The training loop counts iterations. Everything else is a function of that count
 all members of a `vmap`. With `num_envs` environments on all devices together, a row is `num_envs`
 environment steps, and a round takes
 
-    gradient steps = replay_ratio * num_envs * learn_every / batch_size
+    gradient steps = replay_ratio * num_envs * learn_every / batch
 """
 
 import math
@@ -33,6 +33,9 @@ from jaxsafe.learn.batch import device_count
 from jaxsafe.learn.replay import Span, held, ring_rows
 from jaxsafe.learn.rollout import check_steps
 from jaxsafe.types import Shared
+
+BATCH = 1024  # transitions of a gradient step, where the user does not say
+BATCHES = range(64, 16 * BATCH + 1)  # and where BATCH does not fit
 
 
 @config
@@ -62,8 +65,9 @@ class RoundConfig(ReplayConfig):
     # Steps of each environment between two rounds of gradient steps.
     learn_every: Amount = 1
     replay_ratio: Amount = 16  # Transitions replayed for each environment step. OmniSafe has 256.
-    # Transitions of a gradient step, of all devices together. OmniSafe has 256.
-    batch_size: Amount = 1024
+    # Transitions of a gradient step, of all devices together. null: 1024 or, where that makes no whole
+    # number of gradient steps, the nearest size that does. OmniSafe has 256.
+    batch_size: Amount | None = None
     n_step: Iterations = 1  # Rewards summed before the critics' value. OmniSafe has 1.
 
 
@@ -90,6 +94,7 @@ class Timetable(NamedTuple):
 
     rounds: of an iteration.
     rows, gradient_steps: of a round.
+    batch: transitions of a gradient step, on this device.
     ring: rows that the ring has room for.
     warm_up: rows before the first gradient step.
     """
@@ -97,6 +102,7 @@ class Timetable(NamedTuple):
     rounds: int
     rows: int
     gradient_steps: int
+    batch: int
     ring: int
     warm_up: int
 
@@ -133,17 +139,23 @@ def timetable_of(cfg: ReplayConfig, axis_name: str | None) -> Timetable:
     ring = ring_rows(cfg.replay_size, num_envs, cfg.horizon)
     warm_up = -(-cfg.learning_starts // num_envs)
     if not isinstance(cfg, RoundConfig):  # no gradient steps, so there is nothing to go round for
-        return Timetable(1, cfg.horizon, 0, ring, warm_up)
+        return Timetable(1, cfg.horizon, 0, 0, ring, warm_up)
     check_rounds(cfg)
-    if cfg.batch_size % devices:
-        raise ConfigError(f"batch_size={cfg.batch_size} does not split over {devices} devices")
-    gradient_steps = steps_of_round(cfg, num_envs)
-    if cfg.batch_size > ring * num_envs or ring <= cfg.n_step:
+    batch = batch_of(cfg, num_envs, devices)
+    gradient_steps = steps_of_round(cfg, num_envs, batch)
+    if batch > ring * num_envs or ring <= cfg.n_step:
         raise ConfigError(
             f"replay_size={cfg.replay_size} holds {ring} steps of {num_envs} environments: expected "
-            f"at least batch_size={cfg.batch_size} transitions and more than n_step={cfg.n_step} steps"
+            f"at least batch_size={batch} transitions and more than n_step={cfg.n_step} steps"
         )
-    return Timetable(cfg.horizon // cfg.learn_every, cfg.learn_every, gradient_steps, ring, warm_up)
+    return Timetable(
+        rounds=cfg.horizon // cfg.learn_every,
+        rows=cfg.learn_every,
+        gradient_steps=gradient_steps,
+        batch=batch // devices,
+        ring=ring,
+        warm_up=warm_up,
+    )
 
 
 def check_rounds(cfg: RoundConfig) -> None:
@@ -155,32 +167,48 @@ def check_rounds(cfg: RoundConfig) -> None:
         )
 
 
-def steps_of_round(cfg: RoundConfig, num_envs: int) -> int:
+def batch_of(cfg: RoundConfig, num_envs: int, devices: int) -> int:
+    """The transitions of a gradient step, of all devices together.
+
+    Raises:
+        ConfigError: `batch_size` does not split over the devices.
+    """
+    if cfg.batch_size is None:
+        transitions = cfg.replay_ratio * num_envs * cfg.learn_every
+        fits = [n for n in BATCHES if transitions % n == 0 and n % devices == 0]
+        return min(fits, key=lambda n: abs(math.log(n / BATCH)), default=BATCH)
+    if cfg.batch_size % devices:
+        raise ConfigError(f"batch_size={cfg.batch_size} does not split over {devices} devices")
+    return cfg.batch_size
+
+
+def steps_of_round(cfg: RoundConfig, num_envs: int, batch: int) -> int:
     """The gradient steps of a round.
 
     Raises:
         ConfigError: `replay_ratio` asks for no whole number of them.
     """
     transitions = cfg.replay_ratio * num_envs * cfg.learn_every
-    if transitions % cfg.batch_size:
+    if transitions % batch:
         raise ConfigError(
             f"replay_ratio={cfg.replay_ratio}: {cfg.replay_ratio} x num_envs={num_envs} x "
             f"learn_every={cfg.learn_every} transitions are no whole number of batches of "
-            f"{cfg.batch_size}; the nearest that fit are {' or '.join(fitting(cfg, num_envs))}"
+            f"{batch}; the nearest that fit are {' or '.join(fitting(cfg, num_envs, batch))}"
         )
-    return transitions // cfg.batch_size
+    return transitions // batch
 
 
-def fitting(cfg: RoundConfig, num_envs: int) -> list[str]:
+def fitting(cfg: RoundConfig, num_envs: int, batch: int) -> list[str]:
     """The nearest value of each setting that makes whole gradient steps, where there is one."""
     steps, replayed = num_envs * cfg.learn_every, num_envs * cfg.replay_ratio
-    least = cfg.batch_size // math.gcd(cfg.batch_size, steps)  # ratios that fit are multiples of it
-    choices = {
-        "replay_ratio": [least * max(1, round(cfg.replay_ratio / least))],
-        "batch_size": divisors(cfg.replay_ratio * steps)[::-1],  # of two as near, the larger one
-        "learn_every": [n for n in divisors(cfg.horizon) if replayed * n % cfg.batch_size == 0],
-    }
-    return [f"{name}={nearest(found, getattr(cfg, name))}" for name, found in choices.items() if found]
+    least = batch // math.gcd(batch, steps)  # ratios that fit are multiples of it
+    ratio = least * max(1, round(cfg.replay_ratio / least))
+    size = nearest(divisors(cfg.replay_ratio * steps)[::-1], batch)  # of two as near, the larger one
+    every = [n for n in divisors(cfg.horizon) if replayed * n % batch == 0]
+    found = [f"replay_ratio={ratio}", f"batch_size={size}"]
+    if every:
+        found.append(f"learn_every={nearest(every, cfg.learn_every)}")
+    return found
 
 
 def nearest(numbers: list[int], to: int) -> int:

@@ -287,10 +287,10 @@ def check_meaning(plain: dict[str, Any]) -> None:
         "minibatches",
         "epochs",
         "cg_iterations",
-        "batch_size",
         "updates",
     ):
         assert plain.get(f"algo.{part}", 1) >= 1, part
+    assert plain.get("algo.batch_size") is None or plain["algo.batch_size"] >= 1
     for part in ("discount", "cost_discount", "gae_lambda", "pid_smoothing", "simmer_smoothing", "tau"):
         assert 0 <= plain.get(f"algo.{part}", 0) <= 1, part
     for part in (
