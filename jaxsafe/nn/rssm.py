@@ -103,17 +103,23 @@ class Head(nn.Module):
 
 
 class BlockDense(nn.Module):
-    """A linear layer of each block, float [..., blocks, I] -> [..., blocks, out]."""
+    """A linear layer of each block, float [..., blocks, I] -> [..., blocks, out].
+
+    shared: float [..., J], further inputs, which every block sees after its own.
+    """
 
     out: int
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
-        shape = (*x.shape[-2:], self.out)
+    def __call__(self, x: jax.Array, shared: jax.Array | None = None) -> jax.Array:
+        blocks, own = x.shape[-2:]
+        inputs = own + (0 if shared is None else shared.shape[-1])
         init = nn.initializers.variance_scaling(1.0, "fan_in", "truncated_normal", batch_axis=(0,))
-        kernel = self.param("kernel", init, shape)
-        bias = self.param("bias", nn.initializers.zeros, (shape[0], self.out))
-        return jnp.einsum("...bi,bio->...bo", x, kernel) + bias
+        kernel = self.param("kernel", init, (blocks, inputs, self.out))
+        y = jnp.einsum("...bi,bio->...bo", x, kernel[:, :own])
+        if shared is not None:  # no copy of them for each block
+            y += jnp.einsum("...j,bjo->...bo", shared, kernel[:, own:])
+        return y + self.param("bias", nn.initializers.zeros, (blocks, self.out))
 
 
 class Memory(nn.Module):
@@ -137,8 +143,7 @@ class Memory(nn.Module):
         def join(x: jax.Array) -> jax.Array:
             return x.reshape(*x.shape[:-2], blocks * width)
 
-        every = jnp.broadcast_to(u[..., None, :], (*u.shape[:-1], blocks, u.shape[-1]))
-        y = join(BlockDense(width)(jnp.concatenate([split(latent.deter), every], -1)))
+        y = join(BlockDense(width)(split(latent.deter), u))
         y = nn.silu(nn.RMSNorm(1e-4)(y))
         reset, candidate, gate = jnp.split(BlockDense(3 * width)(split(y)), 3, axis=-1)
         keep = 1 - nn.sigmoid(join(gate) - 1)
