@@ -10,11 +10,11 @@ import jax.numpy as jnp
 from jaxsafe.learn.batch import select_rows
 from jaxsafe.types import Env, Policy, PyTree, State
 
-# What acts in N environments at once, and begins its carry anew where `first` holds:
-# (carry [N, ...], State of N, first [N], key) -> action [N, A], carry, what it says, float [N] by name
-ActInAll = Callable[
-    [PyTree, State, jax.Array, jax.Array], tuple[jax.Array, PyTree, dict[str, jax.Array]]
-]
+# action [N, A], carry [N, ...], what is said beside it, float [N] by name
+Acted = tuple[jax.Array, PyTree, dict[str, jax.Array]]
+# What acts in N environments at once, and begins its carry anew where `first` [N] holds:
+# (carry, State of N, first, key) -> Acted
+ActInAll = Callable[[PyTree, State, jax.Array, jax.Array], Acted]
 
 
 @flax.struct.dataclass
@@ -73,9 +73,7 @@ class Player(NamedTuple):
         obs = state if self.policy.privileged(self.learned) else state.obs
         return self.policy.act(self.learned, carry, obs, key)
 
-    def act_in_all(
-        self, carry: PyTree, state: State, first: jax.Array, key: jax.Array
-    ) -> tuple[jax.Array, PyTree, dict[str, jax.Array]]:
+    def act_in_all(self, carry: PyTree, state: State, first: jax.Array, key: jax.Array) -> Acted:
         """Sampled actions in N environments: an `ActInAll`."""
         carry = reset_carry(self.policy, self.learned, carry, first)
         action, carry, said = jax.vmap(self.decide)(carry, state, jax.random.split(key, len(first)))

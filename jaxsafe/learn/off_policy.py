@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxsafe.config import Norm, Rate, Share, Units, config
-from jaxsafe.learn.acting import ActInAll, Learned, Player, learned_of
+from jaxsafe.learn.acting import Acted, ActInAll, Learned, Player, learned_of
 from jaxsafe.learn.batch import all_finite, device_key, masked_mean, psum, select
 from jaxsafe.learn.bill import charge, empty_bill, settle
 from jaxsafe.learn.constraints import Names, check_cost_names, metrics_by_constraint, signal
@@ -202,9 +202,7 @@ def off_policy(
             return Player(learner.policy, learned, env).act_in_all
         explore = learner.explore or learner.act
 
-        def act(
-            carry: PyTree, state: State, first: jax.Array, key: jax.Array
-        ) -> tuple[jax.Array, PyTree, dict[str, jax.Array]]:
+        def act(carry: PyTree, state: State, first: jax.Array, key: jax.Array) -> Acted:
             return explore(learned, network_inputs(learned.normaliser, state.obs), key), carry, {}
 
         return act
@@ -282,15 +280,13 @@ def normalises(cfg: Any) -> bool:
 def at_random_while(random: jax.Array, act: ActInAll, shape: tuple[int, int]) -> ActInAll:
     """`act`, or actions [N, A] from everywhere while `random` [] holds, when `act` says only zeros."""
 
-    def either(
-        carry: PyTree, state: State, first: jax.Array, key: jax.Array
-    ) -> tuple[jax.Array, PyTree, dict[str, jax.Array]]:
+    def either(carry: PyTree, state: State, first: jax.Array, key: jax.Array) -> Acted:
         act_key, random_key = jax.random.split(key)
 
-        def chosen(carry: PyTree) -> tuple[jax.Array, PyTree, dict[str, jax.Array]]:
+        def chosen(carry: PyTree) -> Acted:
             return act(carry, state, first, act_key)
 
-        def at_random(carry: PyTree) -> tuple[jax.Array, PyTree, dict[str, jax.Array]]:
+        def at_random(carry: PyTree) -> Acted:
             action = jax.random.uniform(random_key, shape, minval=-1.0, maxval=1.0)
             silent = {k: jnp.zeros(x.shape) for k, x in jax.eval_shape(chosen, carry)[2].items()}
             return action, carry, silent

@@ -29,7 +29,7 @@ from jaxsafe.config import (
     check_values,
     config,
 )
-from jaxsafe.learn.acting import Learned, learned_of, reset_carry
+from jaxsafe.learn.acting import Acted, Learned, learned_of, reset_carry
 from jaxsafe.learn.augment import Augmentation, no_augmentation
 from jaxsafe.learn.batch import all_finite, batch_mean, device_key, psum, select
 from jaxsafe.learn.constraints import (
@@ -330,9 +330,7 @@ def on_policy_loop(env: Env, method: Method, axis_name: str | None) -> Algorithm
         """A rollout of the policy, in the task as the augmentation makes it."""
         learned = learned_of(ts)
 
-        def act(
-            carry: PyTree, state: State, first: jax.Array, key: jax.Array
-        ) -> tuple[jax.Array, PyTree, dict[str, jax.Array]]:
+        def act(carry: PyTree, state: State, first: jax.Array, key: jax.Array) -> Acted:
             carry = reset_carry(gaussian_policy, learned, carry, first)
             dist, carry = decide(learned, carry, state.obs)
             action = sample(dist, key)

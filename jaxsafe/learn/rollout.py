@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsafe.config import ConfigError
-from jaxsafe.learn.acting import ActInAll
+from jaxsafe.learn.acting import Acted, ActInAll
 from jaxsafe.learn.batch import select_rows
 from jaxsafe.types import Env, PyTree, State
 
@@ -139,9 +139,7 @@ def never(episode: Episode) -> jax.Array:
 def memoryless(act: Callable[[PyTree, jax.Array], tuple[jax.Array, jax.Array]]) -> ActInAll:
     """What acts by (obs [N, ...], key) -> action, log_prob, and remembers nothing."""
 
-    def act_in_all(
-        carry: PyTree, state: State, first: jax.Array, key: jax.Array
-    ) -> tuple[jax.Array, PyTree, dict[str, jax.Array]]:
+    def act_in_all(carry: PyTree, state: State, first: jax.Array, key: jax.Array) -> Acted:
         action, log_prob = act(state.obs, key)
         return action, carry, {"log_prob": log_prob}
 
