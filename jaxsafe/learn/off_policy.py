@@ -153,7 +153,7 @@ def off_policy(
             number, key = x
             gather_key, learn_key = jax.random.split(key)
             at = table.at(number, shared)
-            # what is refitted is so after the rounds, and is no good to act by before that
+            # a model is fitted after the rounds; until it first is, there is nothing to act by
             random = (at if learner.refit is None else table.at(0, shared)).warming_up
             ts, steps, skipped = gather(ts, at, random, gather_key)
             ts, metrics = learn(ts, at, learn_key)

@@ -138,8 +138,10 @@ def timetable_of(cfg: ReplayConfig, axis_name: str | None) -> Timetable:
     num_envs = cfg.num_envs * devices
     ring = ring_rows(cfg.replay_size, num_envs, cfg.horizon)
     warm_up = -(-cfg.learning_starts // num_envs)
-    if not isinstance(cfg, RoundConfig):  # no gradient steps, so there is nothing to go round for
-        return Timetable(1, cfg.horizon, 0, 0, ring, warm_up)
+    if not isinstance(cfg, RoundConfig):  # it takes no gradient steps on rows of the replay
+        return Timetable(
+            rounds=1, rows=cfg.horizon, gradient_steps=0, batch=0, ring=ring, warm_up=warm_up
+        )
     check_rounds(cfg)
     batch = batch_of(cfg, num_envs, devices)
     gradient_steps = steps_of_round(cfg, num_envs, batch)
