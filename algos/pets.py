@@ -9,7 +9,6 @@ import jax.numpy as jnp
 from jaxsafe.config import Amount, Bounds, Iterations, Weight, config
 from jaxsafe.learn.bill import PriceClockConfig
 from jaxsafe.learn.model_based import ModelBasedConfig, model_based
-from jaxsafe.learn.off_policy import ReplayConfig
 from jaxsafe.learn.planning import (
     Planner,
     cautious_cost,
@@ -20,6 +19,7 @@ from jaxsafe.learn.planning import (
     worst_cost,
 )
 from jaxsafe.learn.row import Row
+from jaxsafe.learn.timetable import ReplayConfig
 from jaxsafe.learn.treatments import Treatment
 from jaxsafe.types import Count
 

@@ -190,8 +190,9 @@ def planning(env: Env, behaviour: Behaviour) -> Policy:
     dreamers = dreaming_policy(env, behaviour)
 
     def init(learned: Learned) -> Planning:
+        start: Any = dreamers.init(learned)
         mean = jnp.zeros((learned.config.plan_steps, env.action_size))
-        return Planning(*dreamers.init(learned), mean)
+        return Planning(start.latent, start.action, mean)
 
     def act(
         learned: Learned, carry: Planning, obs: Any, key: jax.Array | None

@@ -174,6 +174,8 @@ python scripts/train.py env=hopper_velocity algo=ppo_lag
 
 {pictures}
 
+[What algorithms earn here](../results/velocity/README.md), beside OmniSafe.
+
 ## Sizes
 
 {table}
@@ -404,7 +406,7 @@ def trained() -> list[SettingRun]:
         preset, compat = run.config["preset"], run.config["compat"]
         return run.env, compat if compat != "none" else preset if preset != "fast" else ""
 
-    folders = [HERE / "results" / name for name in ("goal", "button", "push", "omnisafe")]
+    folders = [HERE / "results" / name for name in ("goal", "button", "push", "omnisafe", "velocity")]
     return sorted(read(folders), key=place)
 
 
@@ -416,7 +418,7 @@ def measured(name: str) -> str:
         if run.config["algo.name"] != name:
             continue
         ret, cost = (report.cell(stats.of_measure(k, run.values[k]), ".2f") for k in ("return", "cost"))
-        rules, compat = run.config["env.rules"], run.config["compat"]
+        rules, compat = run.config.get("env.rules", "safety_gym"), run.config["compat"]
         how = f"`{run.env}`, preset {run.config['preset']}, {len(run.seeds)} seeds"
         how += f", `compat={compat}`" if compat != "none" else ""
         how += f", `env.rules={rules}`" if rules != "safety_gym" else ""

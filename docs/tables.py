@@ -9,6 +9,7 @@ from pathlib import Path
 from jaxsafe import algos
 from jaxsafe.envs import SafetyGym, make
 from jaxsafe.interop import migrate
+from jaxsafe.interop.migrate.on_policy import ON_POLICY
 from jaxsafe.learn.conventions import Convention, conventions
 from jaxsafe.report.tables import between_marks
 
@@ -84,7 +85,7 @@ def omnisafe_keys() -> str:
     keys with which they do otherwise than the on-policy algorithms, or which those do not have."""
     lines = ["| algorithms | OmniSafe | here | |", "|---|---|---|---|"]
     for kind, family in reversed(migrate.FAMILIES.items()):
-        common = {} if family.rules is migrate.OMNISAFE else migrate.OMNISAFE
+        common = {} if family.rules is ON_POLICY else ON_POLICY
         for key, rule in family.rules.items():
             if rule != common.get(key):
                 ours = ", ".join(f"`{option}`" for option in rule.ours.split()) or "no option"

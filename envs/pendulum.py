@@ -17,7 +17,8 @@ from typing import Annotated, Any, Literal
 import jax
 import jax.numpy as jnp
 
-from jaxsafe.config import Amount, Bounds, Weight, check_values
+from jaxsafe.config import Amount, Bounds, Weight
+from jaxsafe.envs.plain import PlainEnv
 from jaxsafe.learn.certificate import interval_barrier
 from jaxsafe.types import State
 
@@ -25,7 +26,7 @@ Angle = Annotated[float, Bounds(1e-3, 3.0)]  # rad
 
 
 @dataclass(frozen=True)
-class Pendulum:
+class Pendulum(PlainEnv):
     """Hold a pendulum at `goal` with a motor that is too weak to lift it from everywhere.
 
     Observation [2]: angle from upright (rad), angular velocity (rad/s).
@@ -40,24 +41,9 @@ class Pendulum:
     threshold: Angle = 1.5  # rad
     num_steps: Amount = 200  # time limit, of steps of 0.05 s
 
-    def __post_init__(self) -> None:
-        check_values(self, "env.")
-
-    @property
-    def obs_size(self) -> int:
-        return 2
-
-    @property
-    def action_size(self) -> int:
-        return 1
-
-    @property
-    def episode_length(self) -> int:
-        return self.num_steps
-
-    @property
-    def cost_names(self) -> tuple[str, ...]:
-        return ("fallen",)
+    obs_size = 2
+    action_size = 1
+    cost_names = ("fallen",)
 
     def barrier(self, obs: jax.Array) -> jax.Array:
         """At most 1 where `obs` [..., 2] is safe: float [...]."""
@@ -79,7 +65,7 @@ class Pendulum:
 
 
 @dataclass(frozen=True)
-class CartPendulum:
+class CartPendulum(PlainEnv):
     """Keep a pendulum on its cart, and the cart on its rail, while doing what `task` pays.
 
     Observation [4]: place of the cart (m), angle from upright (rad), and their velocities.
@@ -93,24 +79,9 @@ class CartPendulum:
     penalty: Weight = 10.0  # what an unsafe step costs in reward
     num_steps: Amount = 1000  # time limit, of steps of 0.04 s
 
-    def __post_init__(self) -> None:
-        check_values(self, "env.")
-
-    @property
-    def obs_size(self) -> int:
-        return 4
-
-    @property
-    def action_size(self) -> int:
-        return 1
-
-    @property
-    def episode_length(self) -> int:
-        return self.num_steps
-
-    @property
-    def cost_names(self) -> tuple[str, ...]:
-        return ("unsafe",)
+    obs_size = 4
+    action_size = 1
+    cost_names = ("unsafe",)
 
     def barrier(self, obs: jax.Array) -> jax.Array:
         """At most 1 where `obs` [..., 4] is safe: float [...]."""

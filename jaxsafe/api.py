@@ -36,6 +36,7 @@ from jaxsafe.run.policies import ROBOT, RunPolicies, open_run
 from jaxsafe.run.progress import Reporter
 from jaxsafe.run.session import Session
 from jaxsafe.run.settings import load, nested, settings_from_config, settings_from_options, yours
+from jaxsafe.run.sweep_plan import plan
 from jaxsafe.types import Env, PyTree
 
 __all__ = [
@@ -325,7 +326,7 @@ def sweep(env: Any = None, algo: Any = None, **options: Any) -> SweepResult:
         KeyboardInterrupt: stopped, with a checkpoint.
     """
     choice = chosen(env, algo)
-    asked = sweeps.plan(*asked_for(choice, options), choice.extras)
+    asked = plan(*asked_for(choice, options), choice.extras)
     report = Reporter(hosted=True)
     choice.say_whose(report)
     resume_command = "the same call of jaxsafe.sweep"

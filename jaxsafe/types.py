@@ -102,13 +102,13 @@ class Shared(NamedTuple):
 
 
 class Clocks(NamedTuple):
-    """What one update takes of one seed: environment steps, and gradient steps.
+    """What one `update` takes of one seed: environment steps, and gradient steps.
 
-    Gradient steps of passes that stop early count, too.
+    Gradient steps of passes that stop early count, too. Users know them as `updates`.
     """
 
     steps: int
-    updates: int
+    gradient_steps: int
 
 
 class Algorithm(NamedTuple):

@@ -20,7 +20,8 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
-from jaxsafe.config import Amount, Bounds, check_values
+from jaxsafe.config import Amount, Bounds
+from jaxsafe.envs.plain import PlainEnv
 from jaxsafe.envs.racing.car import OFF_ROAD, Car, drive, length, parked, rolling, rotated, wheels
 from jaxsafe.envs.racing.track import (
     HALF_WIDTH,
@@ -68,7 +69,7 @@ class World:
 
 
 @dataclass(frozen=True)
-class CarRacing:
+class CarRacing(PlainEnv):
     """A lap of a random track. Pure functions `reset(key)` and `step(state, action)`; callers `vmap`.
 
     Observation float [35], or [44] with obstacles:
@@ -86,20 +87,11 @@ class CarRacing:
     obstacle_every: Annotated[int, Bounds(0, 20)] = 0  # tiles; 0: there are no obstacles
     num_steps: Amount = 1000  # time limit, of steps of 0.02 s
 
-    def __post_init__(self) -> None:
-        check_values(self, "env.")
+    action_size = 3
 
     @property
     def obs_size(self) -> int:
         return 11 + 2 * AHEAD + (3 * NEXT if self.obstacle_every else 0)
-
-    @property
-    def action_size(self) -> int:
-        return 3
-
-    @property
-    def episode_length(self) -> int:
-        return self.num_steps
 
     @property
     def cost_names(self) -> tuple[str, ...]:

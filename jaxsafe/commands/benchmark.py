@@ -28,11 +28,11 @@ from jaxsafe import algos, envs
 from jaxsafe.commands.guard import guarded
 from jaxsafe.config import Amount, ConfigError, Devices, Iterations, Period
 from jaxsafe.learn.observations import EncoderConfig
-from jaxsafe.learn.off_policy import ReplayConfig
 from jaxsafe.learn.rollout import collect, init_rollout, memoryless
+from jaxsafe.learn.timetable import ReplayConfig
 from jaxsafe.run import run_folder
-from jaxsafe.run.arguments import fail, number
 from jaxsafe.run.devices import check_devices, device_name, use_compilation_cache
+from jaxsafe.run.flags import fail, number
 from jaxsafe.run.programs import build
 from jaxsafe.run.settings import TrainConfig, find_algo
 from jaxsafe.types import Shared

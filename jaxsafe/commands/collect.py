@@ -9,9 +9,9 @@ from typing import Any
 
 from jaxsafe.commands.guard import guarded
 from jaxsafe.config import ConfigError, Seed, convert, nearest
-from jaxsafe.run.arguments import fail
 from jaxsafe.run.collect import Ingredient, Size, data_file, shares, write
 from jaxsafe.run.devices import use_compilation_cache
+from jaxsafe.run.flags import fail
 from jaxsafe.run.interrupts import Interrupts
 from jaxsafe.run.policies import CODE, open_run
 

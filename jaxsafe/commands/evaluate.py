@@ -8,8 +8,8 @@ from jaxsafe.commands.guard import guarded
 from jaxsafe.config import EpisodeCount, Seed
 from jaxsafe.learn.constraints import limits_in_words, limits_of
 from jaxsafe.report.evaluation import evaluate
-from jaxsafe.run.arguments import fail, number
 from jaxsafe.run.devices import use_compilation_cache
+from jaxsafe.run.flags import fail, number
 from jaxsafe.run.interrupts import Interrupts
 from jaxsafe.run.policies import CODE, open_run
 

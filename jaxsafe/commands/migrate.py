@@ -7,10 +7,11 @@ from pathlib import Path
 
 from jaxsafe.commands.guard import guarded
 from jaxsafe.commands.jaxsafe import called
-from jaxsafe.interop import migrate, migrate_commands
-from jaxsafe.run.arguments import fail
+from jaxsafe.interop import migrate
+from jaxsafe.interop.migrate import from_commands
+from jaxsafe.run.flags import fail
 
-COMMANDS = {"ambs": migrate_commands.ambs, "alf": migrate_commands.alf}
+COMMANDS = {"ambs": from_commands.ambs, "alf": from_commands.alf}
 
 
 def main() -> int:
@@ -22,7 +23,7 @@ def command() -> int:
     about = migrate.__doc__ or ""
     parser = argparse.ArgumentParser(
         description=about.partition("\n")[0],
-        epilog=f"{about.partition(chr(10) * 2)[2]}\n{migrate_commands.__doc__}",
+        epilog=f"{about.partition(chr(10) * 2)[2]}\n{from_commands.__doc__}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.error = fail  # type: ignore[method-assign]

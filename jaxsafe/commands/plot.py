@@ -23,7 +23,7 @@ from jaxsafe.report.comparison import write
 from jaxsafe.report.group import group, ordered, telling
 from jaxsafe.report.published import read_published
 from jaxsafe.report.read import read
-from jaxsafe.run.arguments import fail
+from jaxsafe.run.flags import fail
 
 
 def main() -> int:

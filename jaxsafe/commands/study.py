@@ -32,7 +32,7 @@ from jaxsafe.report import studies, study_files
 from jaxsafe.report.read import read_one
 from jaxsafe.report.studies import Study
 from jaxsafe.run import files, run_folder
-from jaxsafe.run.arguments import fail, number
+from jaxsafe.run.flags import fail, number
 from jaxsafe.run.settings import load
 
 ROOT = Path(jaxsafe.__file__).parent.parent

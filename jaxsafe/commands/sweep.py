@@ -10,8 +10,10 @@ from jaxsafe.commands.jaxsafe import called
 from jaxsafe.report.finish import finish
 from jaxsafe.report.sweep_summary import summarise
 from jaxsafe.run import files, sweep
-from jaxsafe.run.arguments import fail, read_values
+from jaxsafe.run.arguments import read_values
+from jaxsafe.run.flags import fail
 from jaxsafe.run.progress import Reporter
+from jaxsafe.run.sweep_plan import plan
 
 EPILOG = """\
 Options are those of training (jaxsafe train --help), and
@@ -43,7 +45,7 @@ def command() -> int:
     if args.summary:
         print(summarise(args.summary), end="")
         return 0
-    asked = sweep.plan(given.options, given.several)
+    asked = plan(given.options, given.several)
     resume_command = f"{called('sweep')} {shlex.join(sys.argv[1:])}"
     try:
         return sweep.train(asked, resume_command, Reporter(), sweep.After(finish, summarise))

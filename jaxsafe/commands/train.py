@@ -11,7 +11,7 @@ from jaxsafe.commands.guard import guarded
 from jaxsafe.commands.jaxsafe import called
 from jaxsafe.report.finish import finish
 from jaxsafe.run import distributed, help, session
-from jaxsafe.run.arguments import each_job
+from jaxsafe.run.hydra_jobs import each_job
 from jaxsafe.run.progress import Reporter
 from jaxsafe.run.session import Session
 from jaxsafe.run.settings import Settings, settings_from_config, yours

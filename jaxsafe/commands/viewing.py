@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from jaxsafe.config import ConfigError, Index, Seed
-from jaxsafe.run.arguments import fail, number
 from jaxsafe.run.devices import use_compilation_cache
+from jaxsafe.run.flags import fail, number
 from jaxsafe.run.policies import CODE, ROBOT, RunPolicy, open_run
 
 

@@ -10,7 +10,8 @@ from jaxsafe.envs.view import page, window
 from jaxsafe.envs.view.backend import NoDisplay
 from jaxsafe.envs.view.playback import Playback
 from jaxsafe.report.film import NoVideo
-from jaxsafe.run.arguments import compose, number
+from jaxsafe.run.arguments import compose
+from jaxsafe.run.flags import number
 from jaxsafe.run.settings import make_env
 
 

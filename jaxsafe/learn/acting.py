@@ -1,6 +1,7 @@
 """Playing a policy: what training, evaluation, films, the live view and adapters have in common."""
 
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import flax.struct
@@ -10,6 +11,12 @@ import jax.numpy as jnp
 from jaxsafe.learn.batch import select_rows
 from jaxsafe.learn.observations import vector_of
 from jaxsafe.types import Env, Policy, PyTree, State
+
+# action [N, A], carry [N, ...], what is said beside it, float [N] by name
+Acted = tuple[jax.Array, PyTree, dict[str, jax.Array]]
+# What acts in N environments at once, and begins its carry anew where `first` [N] holds:
+# (carry, State of N, first, key) -> Acted
+ActInAll = Callable[[PyTree, State, jax.Array, jax.Array], Acted]
 
 
 @flax.struct.dataclass
@@ -67,6 +74,12 @@ class Player(NamedTuple):
         """As `act`, and what the policy reports beside its action."""
         obs = state if self.policy.privileged(self.learned) else state.obs
         return self.policy.act(self.learned, carry, obs, key)
+
+    def act_in_all(self, carry: PyTree, state: State, first: jax.Array, key: jax.Array) -> Acted:
+        """Sampled actions in N environments: an `ActInAll`."""
+        carry = reset_carry(self.policy, self.learned, carry, first)
+        action, carry, said = jax.vmap(self.decide)(carry, state, jax.random.split(key, len(first)))
+        return action, carry, jax.tree.map(jnp.float32, said)
 
 
 def reset_carry(policy: Policy, learned: PyTree, carry: PyTree, first: jax.Array) -> PyTree:

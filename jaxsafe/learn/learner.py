@@ -4,11 +4,12 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 
 from jaxsafe.learn.acting import Learned
 from jaxsafe.learn.next_step_rollout import Stepping, arrival_record
 from jaxsafe.learn.normalise import network_inputs
-from jaxsafe.learn.replay import Record, Source
+from jaxsafe.learn.replay import Record, Source, Transitions, draw, transitions, usable
 from jaxsafe.learn.steps import Trainable
 from jaxsafe.types import Metrics, Policy, PyTree, Shared
 
@@ -31,6 +32,18 @@ class GradientStep(NamedTuple):
     first_obs: PyTree = ()
 
 
+def drawn_transitions(
+    key: jax.Array, source: Source, cfg: Any, axis_name: str | None
+) -> tuple[Transitions, jax.Array]:
+    """A batch of transitions with normalised observations, and how many of them are not finite."""
+    index = draw(key, source.ring, source.span, source.rows)
+    discounts = {"discount": cfg.discount, "cost_discount": cfg.cost_discount}
+    found = transitions(source.ring, source.span, index, n_step=source.n_step, **discounts)
+    batch, dropped = usable(found, axis_name)
+    obs, next_obs = (network_inputs(source.normaliser, x) for x in (batch.obs, batch.next_obs))
+    return batch._replace(obs=obs, next_obs=next_obs), dropped
+
+
 def by_policy(learned: Learned, obs: jax.Array, key: jax.Array | None) -> jax.Array:
     raise TypeError("this learner acts by its policy")
 
@@ -46,27 +59,27 @@ class Learner(NamedTuple):
     act(learned, obs [..., O], key) -> action [..., A], the mean one where key is None. `learned` holds
         networks, `params`, the treatment's state, `dual`, and `config`.
     explore(learned, obs [N, O], key) -> action [N, A], how training acts; None: as `act`.
-    random_start(learned) -> bool [], whether actions are random during the warm-up; None: they are.
+    random_start(learned) -> bool [], whether actions are random during the warm-up.
     policy: for methods that remember something, or that look into the simulator. They act and explore
         by this policy. `act` and `explore` are then not used.
     refit(nets, replay, shared, key, cfg, axis_name) -> (Trainable, metrics), after the rounds of an
-        update; None where there is nothing to refit.
+        iteration; None where there is nothing to refit.
     record(cfg) -> what makes a row of the replay: (stepping, action [N, A]) -> Record.
     replayed(key, source, cfg, axis_name) -> (batch, number dropped), what a gradient step draws from a
-        replay. None: Transitions.
+        replay.
     """
 
     init: Callable[[jax.Array, int, int, Any], Trainable]
     step: Callable[[Trainable, Any, GradientStep, Any, str | None], tuple[Trainable, Metrics]]
     act: Callable[[Learned, jax.Array, jax.Array | None], jax.Array] = by_policy
     explore: Callable[[Learned, jax.Array, jax.Array], jax.Array] | None = None
-    random_start: Callable[[Learned], jax.Array] | None = None
+    random_start: Callable[[Learned], jax.Array] = lambda learned: jnp.bool_(True)
     policy: Policy | None = None
     refit: (
         Callable[[Trainable, Any, Shared, jax.Array, Any, str | None], tuple[Trainable, Metrics]] | None
     ) = None
     record: Callable[[Any], Callable[[Stepping, jax.Array], Record]] = lambda cfg: arrival_record
-    replayed: Callable[[jax.Array, Source, Any, str | None], tuple[Any, jax.Array]] | None = None
+    replayed: Callable[[jax.Array, Source, Any, str | None], tuple[Any, jax.Array]] = drawn_transitions
 
 
 def policy_by(learner: Learner) -> Policy:

@@ -12,6 +12,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
+from jaxsafe.learn.acting import ActInAll
 from jaxsafe.learn.batch import select_rows
 from jaxsafe.learn.replay import Record
 from jaxsafe.learn.rollout import Bad, Episode, RolloutState, bad_of, mended, restart, sums
@@ -69,15 +70,9 @@ def arrival_record(stepping: Stepping, action: jax.Array) -> Record:
     )
 
 
-# (carry [N, ...], State of N, first [N], key) -> action [N, A], carry, what it says beside it
-Behaviour = Callable[
-    [PyTree, State, jax.Array, jax.Array], tuple[jax.Array, PyTree, dict[str, jax.Array]]
-]
-
-
 def collect_records(
     env: Env,
-    behave: Behaviour,
+    act: ActInAll,
     stepping: Stepping,
     keys: jax.Array,
     describe: Callable[[Stepping, jax.Array], Record] = arrival_record,
@@ -85,8 +80,6 @@ def collect_records(
     """One step of every environment for each of `keys` [T], or a reset where its episode has ended.
 
     Args:
-        behave: (carry [N, ...], State of N, first [N], key) -> action [N, A], carry, what it says
-            beside the action, float [N] by name. It begins its carry anew where `first` holds.
         describe: what is recorded of where the environments are, and of the actions that they take.
     Returns:
         The environments afterwards, and the records, [T, N, ...].
@@ -94,7 +87,7 @@ def collect_records(
 
     def step(now: Stepping, key: jax.Array) -> tuple[Stepping, tuple[Record, StepRecord]]:
         act_key, reset_key = jax.random.split(key)
-        action, carry, said = behave(now.rollout.carry, now.rollout.state, now.first, act_key)
+        action, carry, said = act(now.rollout.carry, now.rollout.state, now.first, act_key)
         record = describe(now, action)
         state = jax.vmap(env.step)(now.rollout.state, record.action)
         rollout = dataclasses.replace(

@@ -1,11 +1,10 @@
 """The off-policy loop: rollout, replay, gradient steps, as one pure update.
 
-An update is `horizon` steps of every environment. They go in rounds. A round is `learn_every` steps,
-whose rows are written into the replay, and then the gradient steps that `replay_ratio` asks for. After
-the rounds a method may refit a model, and the price on cost moves if it is due.
+An update is an iteration of `jaxsafe.learn.timetable`. It goes in rounds, and each round gathers rows
+and then learns from the replay. After the rounds a method may refit a model, and the price on cost
+moves if it is due: see `jaxsafe.learn.bill`.
 
-What a method adds to this is a `Learner`, and a `Treatment` of the constraint, whose price moves on a
-clock of environment steps: see `jaxsafe.learn.bill`.
+What a method adds to this is a `Learner`, and a `Treatment` of the constraint.
 
 `jit(update)` compiles an iteration. `vmap(update, in_axes=(0, None))` runs seeds or floats of the
 config side by side. `shard_map(update)` with `axis_name` set splits environments, replay and batch over
@@ -13,30 +12,15 @@ devices. Each device then holds `cfg.num_envs` environments of its own, and the 
 """
 
 import dataclasses
-import math
-from collections.abc import Iterable
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 
-from jaxsafe.config import (
-    Amount,
-    Bounds,
-    ConfigError,
-    EndOfDecay,
-    Iterations,
-    Norm,
-    Rate,
-    Share,
-    Units,
-    Weight,
-    check_values,
-    config,
-)
-from jaxsafe.learn.acting import Learned, Player, learned_of, reset_carry
-from jaxsafe.learn.batch import all_finite, device_count, device_key, masked_mean, psum, select
+from jaxsafe.config import Norm, Rate, Share, Units, config
+from jaxsafe.learn.acting import Acted, ActInAll, Learned, Player, learned_of
+from jaxsafe.learn.batch import all_finite, device_key, masked_mean, psum, select
 from jaxsafe.learn.bill import charge, empty_bill, settle
 from jaxsafe.learn.constraints import Names, check_cost_names, metrics_by_constraint, signal
 from jaxsafe.learn.learner import GradientStep, Learner, policy_by
@@ -44,56 +28,13 @@ from jaxsafe.learn.metrics import step_metrics
 from jaxsafe.learn.next_step_rollout import Stepping, StepRecord, collect_records, started
 from jaxsafe.learn.normalise import init_normaliser, merge, network_inputs
 from jaxsafe.learn.observations import check_observation, vector_of
-from jaxsafe.learn.replay import (
-    Record,
-    Source,
-    Span,
-    Transitions,
-    draw,
-    empty_ring,
-    held,
-    ring_rows,
-    transitions,
-    usable,
-    write,
-)
+from jaxsafe.learn.replay import Record, Source, empty_ring, write
 from jaxsafe.learn.returns import LostTime, expected_length, no_lost_time
-from jaxsafe.learn.rollout import check_steps, init_rollout
+from jaxsafe.learn.rollout import init_rollout
 from jaxsafe.learn.steps import Trainable, remaining
+from jaxsafe.learn.timetable import Round, RoundConfig, timetable_of
 from jaxsafe.learn.treatments import Treatment, no_treatment
-from jaxsafe.types import Algorithm, Clocks, Count, Env, Metrics, PyTree, Shared, State
-
-
-@config
-class ReplayConfig:
-    """What all algorithms with a replay share."""
-
-    # Environments side by side, of all devices together. OmniSafe has 1.
-    num_envs: Amount = 1024
-    horizon: Amount = 16  # Steps of each environment in an update.
-    stagger: bool = True  # Whether the first episodes start at different ages, so that ends spread out.
-    # The iteration at which whatever decays reaches 0. inf: the last one of `total_steps`.
-    total_iterations: EndOfDecay = float("inf")
-    # Transitions kept, rounded to whole updates. As in OmniSafe.
-    replay_size: Annotated[int, Bounds(1, 2**31 - 1)] = 1_000_000
-    # Environment steps with random actions and without learning, as in OmniSafe.
-    learning_starts: Annotated[int, Bounds(0, 2**31 - 1)] = 10_000
-    discount: Share = 0.99  # The discount of rewards, as in OmniSafe.
-    cost_discount: Share = 0.99  # The discount of costs, as in OmniSafe.
-    # The undiscounted cost that an episode may have. Unconstrained algorithms only draw it in plots.
-    cost_limit: Weight = 25.0
-
-
-@config
-class RoundConfig(ReplayConfig):
-    """What algorithms share that take gradient steps on rows of a replay."""
-
-    # Steps of each environment between two rounds of gradient steps.
-    learn_every: Amount = 1
-    replay_ratio: Amount = 16  # Transitions replayed for each environment step. OmniSafe has 256.
-    # Transitions of a gradient step, of all devices together. OmniSafe has 256.
-    batch_size: Amount = 1024
-    n_step: Iterations = 1  # Rewards summed before the critics' value. OmniSafe has 1.
+from jaxsafe.types import Algorithm, Clocks, Env, Metrics, PyTree, Shared, State
 
 
 @config
@@ -143,60 +84,27 @@ class TrainState:
     lost_time: LostTime
     key: jax.Array
 
+    @property
+    def nets(self) -> Trainable:
+        return Trainable(self.params, self.opt_state)
 
-class RoundCarry(NamedTuple):
-    """What passes from one round to the next."""
-
-    nets: Trainable
-    normaliser: PyTree
-    stepping: Stepping
-    replay: Record
-
-
-class RoundClock(NamedTuple):
-    """Where a round stands in the run. All but `remaining` is the same for all members.
-
-    before, after: Span, what the ring holds before and after the rows of the round are written.
-    warming_up: bool [], whether actions are random.
-    ready: bool [], whether there is enough in the ring to learn from.
-    gradient_steps: int32 [], those of the run that were due before this round.
-    remaining: float [], the share of training that is left.
-    """
-
-    before: Span
-    after: Span
-    warming_up: jax.Array
-    ready: jax.Array
-    gradient_steps: jax.Array
-    remaining: jax.Array
+    def with_nets(self, nets: Trainable) -> "TrainState":
+        return dataclasses.replace(self, params=nets.params, opt_state=nets.opt_state)
 
 
 class RoundReport(NamedTuple):
     """What a round came to.
 
-    steps: StepRecord [learn_every, N].
-    metrics: of its gradient steps, [updates] each.
-    ready: see `RoundClock`.
+    steps: StepRecord [rows, N].
     skipped: bool [], whether the normaliser left out its observations because they are not finite.
+    learned: bool [], whether gradient steps were taken.
+    metrics: of these, [gradient_steps] each.
     """
 
     steps: StepRecord
-    metrics: Metrics
-    ready: jax.Array
     skipped: jax.Array
-
-
-class Priced(NamedTuple):
-    """The price on cost after an update.
-
-    dual: the treatment's state. bill: Bill since the price last moved. failed: bool [], whether a move
-    was left out because the new price is not finite.
-    """
-
-    dual: PyTree
-    bill: PyTree
+    learned: jax.Array
     metrics: Metrics
-    failed: jax.Array
 
 
 def off_policy(
@@ -207,12 +115,10 @@ def off_policy(
 ) -> Algorithm:
     """The algorithm that `learner` makes of the loop, with a price on cost that `treatment` moves."""
     policy = policy_by(learner)
-    explore = learner.explore or learner.act
-    replayed = learner.replayed or drawn_transitions
     priced = treatment is not no_treatment
 
     def init(key: jax.Array, cfg: Any, shared: Shared) -> TrainState:
-        sizes = sizes_of(cfg, axis_name)
+        rows = timetable_of(cfg, axis_name).ring
         names = treatment.constrained_costs(cfg)
         check_cost_names(names, env)
         cfg = jax.tree.map(jnp.float32, cfg)
@@ -221,7 +127,7 @@ def off_policy(
         check_observation(rollout.state.obs, cfg)
         nets = learner.init(params_key, env.obs_size, env.action_size, cfg)
         dual = treatment.init(cfg)
-        normaliser = init_normaliser(env.obs_size) if sizes.normalises else ()
+        normaliser = init_normaliser(env.obs_size) if normalises(cfg) else ()
         carry = policy.init(Learned(cfg, nets.params, dual, normaliser))
         every = jax.tree.map(lambda x: jnp.broadcast_to(x, (cfg.num_envs, *x.shape)), carry)
         stepping = started(dataclasses.replace(rollout, carry=every))
@@ -234,190 +140,184 @@ def off_policy(
             bill=empty_bill(cfg, names) if priced else (),
             normaliser=normaliser,
             stepping=stepping,
-            replay=empty_ring(learner.record(cfg)(stepping, actions), sizes.rows),
+            replay=empty_ring(learner.record(cfg)(stepping, actions), rows),
             lost_time=no_lost_time(),
             key=key,
         )
 
     def update(ts: TrainState, shared: Shared) -> tuple[TrainState, Metrics]:
-        sizes = sizes_of(ts.config, axis_name)
+        table = timetable_of(ts.config, axis_name)
         key, rounds_key = jax.random.split(ts.key)
 
-        def one_round(
-            now: RoundCarry, x: tuple[jax.Array, jax.Array]
-        ) -> tuple[RoundCarry, RoundReport]:
+        def one_round(ts: TrainState, x: tuple[jax.Array, jax.Array]) -> tuple[TrainState, RoundReport]:
             number, key = x
             gather_key, learn_key = jax.random.split(key)
-            at = round_clock(number, shared, sizes, ts.config, learner.refit is not None)
-            now, steps, skipped = gather(ts, now, at, gather_key)
+            at = table.at(number, shared)
+            # a model is fitted after the rounds; until it first is, there is nothing to act by
+            random = (at if learner.refit is None else table.at(0, shared)).warming_up
+            ts, steps, skipped = gather(ts, at, random, gather_key)
+            ts, metrics = learn(ts, at, learn_key)
+            return ts, RoundReport(steps, skipped, at.ready, metrics)
 
-            def learn(nets: Trainable) -> tuple[Trainable, Metrics]:
-                return gradient_steps(ts, now._replace(nets=nets), at, learn_key)
-
-            like = jax.eval_shape(learn, now.nets)[1]
-            nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
-            nets, metrics = jax.lax.cond(at.ready, learn, lambda nets: (nets, nothing), now.nets)
-            return now._replace(nets=nets), RoundReport(steps, metrics, at.ready, skipped)
-
-        now = RoundCarry(Trainable(ts.params, ts.opt_state), ts.normaliser, ts.stepping, ts.replay)
-        numbers, keys = jnp.arange(sizes.rounds), jax.random.split(rounds_key, sizes.rounds)
-        now, rounds = jax.lax.scan(one_round, now, (numbers, keys))
-
-        refit_key = jax.random.fold_in(rounds_key, sizes.rounds)
-        nets, refitted = refit(ts, now, shared, refit_key)
-
-        steps = jax.tree.map(lambda x: x.reshape(ts.config.horizon, *x.shape[2:]), rounds.steps)
-        taken = steps.real.sum()
-        length, lost_time = expected_length(ts.lost_time, env.episode_length, steps, taken, axis_name)
-        after = pay(ts, steps, length, shared.iteration)
-        metrics = means_of_gradient_steps(rounds.metrics, rounds.ready) | after.metrics
-        names = treatment.constrained_costs(ts.config)
-        metrics |= metrics_of_steps(env, steps, length, names, axis_name)
-        lost = rounds.metrics["train/nonfinite"].sum() + rounds.skipped.sum() + after.failed
-        lost += refitted.pop("train/nonfinite", 0)
-        metrics |= refitted | {"train/nonfinite": lost}
-        ts = dataclasses.replace(
-            ts,
-            params=nets.params,
-            opt_state=nets.opt_state,
-            dual=after.dual,
-            bill=after.bill,
-            normaliser=now.normaliser,
-            stepping=now.stepping,
-            replay=now.replay,
-            lost_time=lost_time,
-            key=key,
+        keys = jax.random.split(rounds_key, table.rounds)
+        ts, rounds = jax.lax.scan(one_round, ts, (jnp.arange(table.rounds), keys))
+        ts, refitted = refit(ts, shared, jax.random.fold_in(rounds_key, table.rounds))
+        steps = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rounds.steps)
+        length, lost_time = expected_length(
+            ts.lost_time, env.episode_length, steps, steps.real.sum(), axis_name
         )
-        return ts, jax.tree.map(jnp.float32, metrics)
+        ts, paid = pay(ts, steps, length, shared)
+        names = treatment.constrained_costs(ts.config)
+        metrics = united(
+            means_of_gradient_steps(rounds.metrics, rounds.learned),
+            {"train/nonfinite": rounds.skipped.sum()},
+            paid,
+            metrics_of_steps(env, steps, length, names, axis_name),
+            refitted,
+        )
+        return dataclasses.replace(ts, lost_time=lost_time, key=key), metrics
 
     def gather(
-        ts: TrainState, now: RoundCarry, at: RoundClock, key: jax.Array
-    ) -> tuple[RoundCarry, StepRecord, jax.Array]:
-        """The environment steps of a round, and whether the normaliser had to skip them."""
-        cfg, sizes = ts.config, sizes_of(ts.config, axis_name)
-        learned = Learned(cfg, now.nets.params, ts.dual, now.normaliser)
-        random = at.warming_up
-        if learner.random_start is not None:
-            random &= learner.random_start(learned)
-
-        def behave(
-            carry: PyTree, state: State, first: jax.Array, key: jax.Array
-        ) -> tuple[jax.Array, PyTree, dict[str, jax.Array]]:
-            explore_key, random_key = jax.random.split(key)
-
-            def chosen(carry: PyTree) -> tuple[jax.Array, PyTree, dict[str, jax.Array]]:
-                if learner.policy is not None:
-                    player = Player(policy, learned, env)
-                    return act_in_all(player, carry, state, first, explore_key)
-                obs = network_inputs(now.normaliser, state.obs)
-                return explore(learned, obs, explore_key), carry, {}
-
-            def at_random(carry: PyTree) -> tuple[jax.Array, PyTree, dict[str, jax.Array]]:
-                shape = (cfg.num_envs, env.action_size)
-                action = jax.random.uniform(random_key, shape, minval=-1.0, maxval=1.0)
-                silent = {k: jnp.zeros(x.shape) for k, x in jax.eval_shape(chosen, carry)[2].items()}
-                return action, carry, silent
-
-            return jax.lax.cond(random, at_random, chosen, carry)
-
-        keys = jax.random.split(device_key(key, axis_name), sizes.every)
-        stepping, (rows, steps) = collect_records(env, behave, now.stepping, keys, learner.record(cfg))
-        normaliser, skipped = now.normaliser, jnp.bool_(False)
-        if sizes.normalises:
+        ts: TrainState, at: Round, random: jax.Array, key: jax.Array
+    ) -> tuple[TrainState, StepRecord, jax.Array]:
+        """The rows of a round, and whether the normaliser had to skip them."""
+        learned = learned_of(ts)
+        random &= learner.random_start(learned)
+        act = at_random_while(random, exploring(learned), (ts.config.num_envs, env.action_size))
+        keys = jax.random.split(device_key(key, axis_name), timetable_of(ts.config, axis_name).rows)
+        describe = learner.record(ts.config)
+        stepping, (rows, steps) = collect_records(env, act, ts.stepping, keys, describe)
+        normaliser, skipped = ts.normaliser, jnp.bool_(False)
+        if normalises(ts.config):
             merged = merge(normaliser, vector_of(rows.obs), axis_name)
             finite = all_finite(merged)
             normaliser, skipped = select(finite, merged, normaliser), ~finite
-        replay = write(now.replay, rows, at.before)
-        return RoundCarry(now.nets, normaliser, stepping, replay), steps, skipped
+        replay = write(ts.replay, rows, at.before)
+        ts = dataclasses.replace(ts, stepping=stepping, replay=replay, normaliser=normaliser)
+        return ts, steps, skipped
 
-    def gradient_steps(
-        ts: TrainState, now: RoundCarry, at: RoundClock, key: jax.Array
-    ) -> tuple[Trainable, Metrics]:
-        """The gradient steps of a round, each on a batch of its own. Metrics are [updates].
+    def exploring(learned: Learned) -> ActInAll:
+        """How training acts."""
+        if learner.policy is not None:
+            return Player(learner.policy, learned, env).act_in_all
+        explore = learner.explore or learner.act
+
+        def act(carry: PyTree, state: State, first: jax.Array, key: jax.Array) -> Acted:
+            return explore(learned, network_inputs(learned.normaliser, state.obs), key), carry, {}
+
+        return act
+
+    def learn(ts: TrainState, at: Round, key: jax.Array) -> tuple[TrainState, Metrics]:
+        """The gradient steps of a round if it is ready, each on a batch of its own.
 
         If they lead to anything that is not finite, none of them takes effect. A GPU spends as long on
         launching a gradient step as on computing it, so what all of them need is done once: all batches
         are drawn before the first, and the outcome is checked after the last.
         """
-        cfg, sizes = ts.config, sizes_of(ts.config, axis_name)
-        source = Source(now.replay, at.after, now.normaliser, sizes.batch, sizes.n_step)
+        cfg, table = ts.config, timetable_of(ts.config, axis_name)
+        if not table.gradient_steps:
+            return ts, {}
+        share = remaining(at.iteration, cfg)
+        source = Source(ts.replay, at.after, ts.normaliser, table.batch, cfg.n_step)
 
         def keys_of(key: jax.Array) -> jax.Array:
             return jax.random.split(device_key(key, axis_name))
 
         def batch_of(key: jax.Array) -> tuple[PyTree, jax.Array]:
-            return replayed(key, source, cfg, axis_name)
+            return learner.replayed(key, source, cfg, axis_name)
 
         def step(nets: Trainable, x: tuple[jax.Array, jax.Array, PyTree]) -> tuple[Trainable, Metrics]:
             number, key, batch = x
-            when = GradientStep(number, at.remaining, key, ts.dual)
-            new, metrics = learner.step(nets, batch, when, cfg, axis_name)
-            return new, jax.tree.map(jnp.float32, metrics)
+            when = GradientStep(number, share, key, ts.dual)
+            nets, metrics = learner.step(nets, batch, when, cfg, axis_name)
+            return nets, jax.tree.map(jnp.float32, metrics)
 
-        keys = jax.vmap(keys_of)(jax.random.split(key, sizes.updates))
-        batches, dropped = jax.vmap(batch_of)(keys[:, 0])
-        numbers = at.gradient_steps + jnp.arange(sizes.updates)
-        nets, metrics = jax.lax.scan(step, now.nets, (numbers, keys[:, 1], batches))
-        finite = psum(~all_finite(nets), axis_name) == 0
-        lost = {"train/nonfinite": jnp.float32(dropped + ~finite)}
-        return select(finite, nets, now.nets), metrics | lost
+        def steps(nets: Trainable) -> tuple[Trainable, Metrics]:
+            keys = jax.vmap(keys_of)(jax.random.split(key, table.gradient_steps))
+            batches, dropped = jax.vmap(batch_of)(keys[:, 0])
+            numbers = at.first_step + jnp.arange(table.gradient_steps)
+            new, metrics = jax.lax.scan(step, nets, (numbers, keys[:, 1], batches))
+            finite = psum(~all_finite(new), axis_name) == 0
+            lost = {"train/nonfinite": jnp.float32(dropped + ~finite)}
+            return select(finite, new, nets), metrics | lost
 
-    def refit(
-        ts: TrainState, now: RoundCarry, shared: Shared, key: jax.Array
-    ) -> tuple[Trainable, Metrics]:
-        """What the learner does after the rounds of an update."""
+        like = jax.eval_shape(steps, ts.nets)[1]
+        nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
+        nets, metrics = jax.lax.cond(at.ready, steps, lambda nets: (nets, nothing), ts.nets)
+        return ts.with_nets(nets), metrics
+
+    def refit(ts: TrainState, shared: Shared, key: jax.Array) -> tuple[TrainState, Metrics]:
+        """What the learner does after the rounds of an iteration."""
         if learner.refit is None:
-            return now.nets, {}
-        return learner.refit(now.nets, now.replay, shared, key, ts.config, axis_name)
+            return ts, {}
+        nets, metrics = learner.refit(ts.nets, ts.replay, shared, key, ts.config, axis_name)
+        return ts.with_nets(nets), metrics
 
-    def pay(ts: TrainState, steps: StepRecord, length: jax.Array, iteration: Count) -> Priced:
-        """The steps of an update are put on the bill, and the price moves if it is due."""
+    def pay(
+        ts: TrainState, steps: StepRecord, length: jax.Array, shared: Shared
+    ) -> tuple[TrainState, Metrics]:
+        """The steps of an iteration are put on the bill, and the price moves if it is due."""
         if not priced:
-            return Priced((), (), {}, jnp.bool_(False))
+            return ts, {}
         cfg, names = ts.config, treatment.constrained_costs(ts.config)
         bill = charge(ts.bill, signal(env, steps, names), steps.real, axis_name)
-        dual, bill, failed = settle(treatment, ts.dual, bill, length, cfg, iteration)
-        return Priced(dual, bill, metrics_by_constraint(treatment.metrics(dual), names), failed)
+        dual, bill, failed = settle(treatment, ts.dual, bill, length, cfg, shared.iteration)
+        metrics = metrics_by_constraint(treatment.metrics(dual), names)
+        return dataclasses.replace(ts, dual=dual, bill=bill), metrics | {"train/nonfinite": failed}
 
     def clocks(cfg: Any) -> Clocks:
-        sizes = sizes_of(cfg, None)
-        return Clocks(cfg.num_envs * cfg.horizon, sizes.rounds * sizes.updates)
+        table = timetable_of(cfg, None)
+        return Clocks(cfg.num_envs * cfg.horizon, table.rounds * table.gradient_steps)
 
     return Algorithm(init, update, policy, learned_of, lambda learned: env, clocks)
 
 
-def act_in_all(
-    player: Player, carry: PyTree, state: State, first: jax.Array, key: jax.Array
-) -> tuple[jax.Array, PyTree, dict[str, jax.Array]]:
-    """The actions [N, A] of a policy in N environments, its carries, begun anew at `first` [N], and
-    what it says beside the actions, float [N] by name."""
-    carry = reset_carry(player.policy, player.learned, carry, first)
-    action, carry, said = jax.vmap(player.decide)(carry, state, jax.random.split(key, len(first)))
-    return action, carry, jax.tree.map(jnp.float32, said)
+def normalises(cfg: Any) -> bool:
+    """Whether the loop keeps a normaliser of observations."""
+    return isinstance(cfg, OffPolicyConfig) and cfg.obs_normalize
 
 
-def drawn_transitions(
-    key: jax.Array, source: Source, cfg: Any, axis_name: str | None
-) -> tuple[Transitions, jax.Array]:
-    """A batch of transitions with normalised observations, and how many of them are not finite."""
-    index = draw(key, source.ring, source.span, source.rows)
-    discounts = {"discount": cfg.discount, "cost_discount": cfg.cost_discount}
-    found = transitions(source.ring, source.span, index, n_step=source.n_step, **discounts)
-    batch, dropped = usable(found, axis_name)
-    obs, next_obs = (network_inputs(source.normaliser, x) for x in (batch.obs, batch.next_obs))
-    return batch._replace(obs=obs, next_obs=next_obs), dropped
+def at_random_while(random: jax.Array, act: ActInAll, shape: tuple[int, int]) -> ActInAll:
+    """`act`, or actions [N, A] from everywhere while `random` [] holds, when `act` says only zeros."""
+
+    def either(carry: PyTree, state: State, first: jax.Array, key: jax.Array) -> Acted:
+        act_key, random_key = jax.random.split(key)
+
+        def chosen(carry: PyTree) -> Acted:
+            return act(carry, state, first, act_key)
+
+        def at_random(carry: PyTree) -> Acted:
+            action = jax.random.uniform(random_key, shape, minval=-1.0, maxval=1.0)
+            silent = {k: jnp.zeros(x.shape) for k, x in jax.eval_shape(chosen, carry)[2].items()}
+            return action, carry, silent
+
+        return jax.lax.cond(random, at_random, chosen, carry)
+
+    return either
 
 
-def means_of_gradient_steps(metrics: Metrics, ready: jax.Array) -> Metrics:
-    """Means over the steps [rounds, updates] of the rounds that were `ready`, NaN where there are none.
+# ---- metrics -----------------------------------------------------------------------------------
 
-    A metric that a step does not have is NaN there.
+
+def united(*parts: Metrics) -> Metrics:
+    """All metrics, in float32. What was not finite is added up."""
+    lost = sum(part.get("train/nonfinite", 0) for part in parts)
+    metrics = {name: x for part in parts for name, x in part.items()} | {"train/nonfinite": lost}
+    return jax.tree.map(jnp.float32, metrics)
+
+
+def means_of_gradient_steps(metrics: Metrics, learned: jax.Array) -> Metrics:
+    """Means over the steps [rounds, steps] of the rounds that `learned`, NaN where there are none.
+
+    A metric that a step does not have is NaN there. What was not finite is added up.
     """
 
     def mean(x: jax.Array) -> jax.Array:
-        return masked_mean(x, ready[:, None] & ~jnp.isnan(x), None)
+        return masked_mean(x, learned[:, None] & ~jnp.isnan(x), None)
 
-    return jax.tree.map(mean, metrics)
+    if not metrics:
+        return {}
+    return jax.tree.map(mean, metrics) | {"train/nonfinite": metrics["train/nonfinite"].sum()}
 
 
 def metrics_of_steps(
@@ -434,114 +334,3 @@ def metrics_of_steps(
         **{f"train/cost_estimate_{n}": rate(charged[..., k]) * length for k, n in enumerate(names)},
         **{f"train/{name}": rate(x) for name, x in steps.said.items()},
     }
-
-
-# ---- sizes and clocks -------------------------------------------------------------------------
-
-
-class Sizes(NamedTuple):
-    """What follows from the config.
-
-    rounds: of an update.
-    every, updates: steps of each environment, and gradient steps, in a round.
-    batch: rows of a device's share of a batch.
-    n_step: steps of a transition, at most.
-    rows: of the replay.
-    warm_up: rows, of each environment, that are taken with random actions.
-    normalises: whether observations are normalised.
-    """
-
-    rounds: int
-    every: int
-    updates: int
-    batch: int
-    n_step: int
-    rows: int
-    warm_up: int
-    normalises: bool
-
-
-def sizes_of(cfg: Any, axis_name: str | None) -> Sizes:
-    """Sizes, for `cfg.num_envs` environments on each device.
-
-    Raises:
-        ConfigError: sizes out of their bounds, or that do not fit each other.
-    """
-    check_values(cfg)
-    check_steps(cfg.num_envs, cfg.horizon)
-    devices = device_count(axis_name)
-    num_envs = cfg.num_envs * devices
-    rows = ring_rows(cfg.replay_size, num_envs, cfg.horizon)
-    warm_up = -(-cfg.learning_starts // num_envs)
-    if not isinstance(cfg, RoundConfig):  # no gradient steps on rows of the replay
-        return Sizes(1, cfg.horizon, 0, 0, 1, rows, warm_up, False)
-    if cfg.horizon % cfg.learn_every:
-        choices = [n for n in range(1, cfg.horizon + 1) if cfg.horizon % n == 0]
-        nearest = min(choices, key=lambda n: abs(n - cfg.learn_every))
-        raise ConfigError(
-            f"learn_every={cfg.learn_every}: expected a divisor of horizon={cfg.horizon}; "
-            f"the nearest is {nearest}"
-        )
-    if cfg.batch_size % devices:
-        raise ConfigError(f"batch_size={cfg.batch_size} does not split over {devices} devices")
-    steps = num_envs * cfg.learn_every  # environment steps of a round
-    replayed = cfg.replay_ratio * steps
-    updates = round(replayed / cfg.batch_size)
-    if not math.isclose(updates * cfg.batch_size, replayed):
-        raise ConfigError(
-            f"replay_ratio={cfg.replay_ratio}: {cfg.replay_ratio} x num_envs={num_envs} x "
-            f"learn_every={cfg.learn_every} transitions are no whole number of batches of "
-            f"{cfg.batch_size}; {fitting(cfg, steps)}"
-        )
-    if cfg.batch_size > rows * num_envs or rows <= cfg.n_step:
-        raise ConfigError(
-            f"replay_size={cfg.replay_size} holds {rows} steps of {num_envs} environments: expected "
-            f"at least batch_size={cfg.batch_size} transitions and more than n_step={cfg.n_step} steps"
-        )
-    return Sizes(
-        rounds=cfg.horizon // cfg.learn_every,
-        every=cfg.learn_every,
-        updates=updates,
-        batch=cfg.batch_size // devices,
-        n_step=cfg.n_step,
-        rows=rows,
-        warm_up=warm_up,
-        normalises=isinstance(cfg, OffPolicyConfig) and cfg.obs_normalize,
-    )
-
-
-def round_clock(number: jax.Array, shared: Shared, sizes: Sizes, cfg: Any, refits: bool) -> RoundClock:
-    """The clock at round `number` of an iteration. A learner that refits something does so at the end
-    of an iteration, so its warm-up lasts until then."""
-    iteration, since = jnp.asarray(shared.iteration), shared.since
-    written = number * sizes.every  # rows of this iteration, before the round
-    filled = (iteration - since) * cfg.horizon + written + sizes.every
-    acted = iteration * cfg.horizon + (0 if refits else written)  # rows of the whole run
-    return RoundClock(
-        before=held(sizes.rows, cfg.horizon, written, iteration, since),
-        after=held(sizes.rows, cfg.horizon, written + sizes.every, iteration, since),
-        warming_up=acted < sizes.warm_up,
-        ready=filled >= jnp.maximum(sizes.warm_up, 2),
-        gradient_steps=(iteration * sizes.rounds + number) * sizes.updates,
-        remaining=remaining(iteration, cfg),
-    )
-
-
-def fitting(cfg: Any, steps: int) -> str:
-    """The nearest settings that make whole gradient steps of a round of `steps` environment steps."""
-
-    def nearest(name: str, choices: Iterable[int]) -> list[str]:
-        found = sorted(choices, key=lambda n: abs(n - getattr(cfg, name)))[:1]
-        return [f"{name}={n}" for n in found]
-
-    replayed, batch = round(cfg.replay_ratio * steps), cfg.batch_size
-    unit = batch // math.gcd(batch, steps)
-    small = [n for n in range(1, math.isqrt(replayed) + 1) if replayed % n == 0]
-    rounds = [n for n in range(1, cfg.horizon + 1) if cfg.horizon % n == 0]
-    fits = [n for n in rounds if replayed // cfg.learn_every * n % batch == 0]
-    options = [
-        *nearest("replay_ratio", [unit * max(1, round(cfg.replay_ratio / unit))]),
-        *nearest("batch_size", [*small, *(replayed // n for n in small)]),
-        *nearest("learn_every", fits),
-    ]
-    return f"the nearest that fit are {' or '.join(options)}"

@@ -29,7 +29,7 @@ from jaxsafe.config import (
     check_values,
     config,
 )
-from jaxsafe.learn.acting import Learned, learned_of, reset_carry
+from jaxsafe.learn.acting import Acted, Learned, learned_of, reset_carry
 from jaxsafe.learn.augment import Augmentation, no_augmentation
 from jaxsafe.learn.batch import all_finite, batch_mean, device_key, psum, select
 from jaxsafe.learn.constraints import (
@@ -70,7 +70,7 @@ from jaxsafe.learn.surrogates import Surrogate, with_entropy
 from jaxsafe.learn.treatments import Treatment
 from jaxsafe.nn.gaussian import entropy, log_prob, sample
 from jaxsafe.nn.networks import action_dist, stack, stack_critics
-from jaxsafe.types import Algorithm, Clocks, Env, Metrics, PyTree, Shared
+from jaxsafe.types import Algorithm, Clocks, Env, Metrics, PyTree, Shared, State
 
 
 @config
@@ -330,18 +330,16 @@ def on_policy_loop(env: Env, method: Method, axis_name: str | None) -> Algorithm
         """A rollout of the policy, in the task as the augmentation makes it."""
         learned = learned_of(ts)
 
-        def behave(
-            carry: PyTree, obs: PyTree, first: jax.Array, key: jax.Array
-        ) -> tuple[jax.Array, jax.Array, PyTree]:
+        def act(carry: PyTree, state: State, first: jax.Array, key: jax.Array) -> Acted:
             carry = reset_carry(gaussian_policy, learned, carry, first)
-            dist, carry = decide(learned, carry, obs)
+            dist, carry = decide(learned, carry, state.obs)
             action = sample(dist, key)
-            return action, log_prob(dist, action), carry
+            return action, carry, {"log_prob": log_prob(dist, action)}
 
         pool = augmentation.renew(ts.rollout.pool, ts.config, ts.dual)
         return collect(
             task(learned),
-            behave,
+            act,
             dataclasses.replace(ts.rollout, pool=pool),
             device_key(key, axis_name),
             ts.config.horizon,

@@ -17,12 +17,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsafe.config import ConfigError
+from jaxsafe.learn.acting import Acted, ActInAll
 from jaxsafe.learn.batch import select_rows
 from jaxsafe.types import Env, PyTree, State
 
 MOST_STEPS = 2**31 - 1  # environment steps of an update, which int32 counts
-# (carry [N, ...], obs [N, ...], first [N], key) -> action [N, A], log_prob [N], carry
-Behaviour = Callable[[PyTree, PyTree, jax.Array, jax.Array], tuple[jax.Array, jax.Array, PyTree]]
 
 
 def check_steps(num_envs: int, horizon: int) -> None:
@@ -137,14 +136,19 @@ def never(episode: Episode) -> jax.Array:
     return jnp.bool_(False)
 
 
-def memoryless(act: Callable[[PyTree, jax.Array], tuple[jax.Array, jax.Array]]) -> Behaviour:
-    """The behaviour of a policy that remembers nothing: (obs [N, ...], key) -> action, log_prob."""
-    return lambda carry, obs, first, key: (*act(obs, key), carry)
+def memoryless(act: Callable[[PyTree, jax.Array], tuple[jax.Array, jax.Array]]) -> ActInAll:
+    """What acts by (obs [N, ...], key) -> action, log_prob, and remembers nothing."""
+
+    def act_in_all(carry: PyTree, state: State, first: jax.Array, key: jax.Array) -> Acted:
+        action, log_prob = act(state.obs, key)
+        return action, carry, {"log_prob": log_prob}
+
+    return act_in_all
 
 
 def collect(
     env: Env,
-    behave: Behaviour,
+    act: ActInAll,
     rollout: RolloutState,
     key: jax.Array,
     horizon: int,
@@ -153,17 +157,16 @@ def collect(
     """Step all environments `horizon` times.
 
     Args:
-        behave: (carry [N, ...], obs [N, ...], first [N], key) -> action [N, A], log_prob [N], carry. It
-            begins its carry anew where `first` holds; see `memoryless`.
+        act: says its `log_prob`; see `memoryless`.
         stop: sums so far -> bool [N], where a step terminates its episode besides the environment.
     """
 
     def step(rollout: RolloutState, key: jax.Array) -> tuple[RolloutState, Trajectory]:
         action_key, reset_key = jax.random.split(key)
         lost = ~finite(rollout.state.obs)  # by its reset
-        obs = cleared(lost, rollout.state.obs)
+        seen = dataclasses.replace(rollout.state, obs=cleared(lost, rollout.state.obs))
         first = rollout.steps == 0
-        action, log_prob, carry = behave(rollout.carry, obs, first, action_key)
+        action, carry, said = act(rollout.carry, seen, first, action_key)
         state = jax.vmap(env.step)(rollout.state, action)
         bad = bad_of(state)
         bad = bad._replace(obs=bad.obs | lost)
@@ -175,10 +178,10 @@ def collect(
         truncated = ((steps >= env.episode_length) | state.truncated | bad.any) & ~terminated
         done = terminated | truncated
         record = Trajectory(
-            obs=obs,
+            obs=seen.obs,
             first=first,
             action=action,
-            log_prob=log_prob,
+            log_prob=said["log_prob"],
             reward=state.reward,
             cost=state.cost,
             costs=state.costs,

@@ -15,9 +15,9 @@ import optax
 
 from jaxsafe.config import Amount, Iterations, Norm, Rate, Share, Weight, config
 from jaxsafe.learn.observations import EncoderConfig, observation_like
-from jaxsafe.learn.off_policy import RoundConfig
 from jaxsafe.learn.replay import Record
 from jaxsafe.learn.sequences import SequenceBatch
+from jaxsafe.learn.timetable import RoundConfig
 from jaxsafe.nn.coders import Decoder, Encoder, VectorDecoder, VectorEncoder, check_picture
 from jaxsafe.nn.gaussian import Gaussian, entropy, log_prob, sample
 from jaxsafe.nn.rssm import SIZES, Beliefs, Head, Latent, WorldModel, kl
@@ -88,12 +88,13 @@ def world_of(env: Env, heads: dict[str, int], cfg: Any) -> WorldModel:
         ConfigError: pictures whose sides do not suit the model's size.
     """
     size = SIZES[cfg.size]
-    coders: Any = VectorEncoder(size), VectorDecoder(size, env.obs_size)
-    if cfg.encoder == "cnn":
+    if cfg.encoder == "none":
+        encoder, decoder = VectorEncoder(size), VectorDecoder(size, env.obs_size)
+    else:
         shape = observation_like(env)["vision"].shape
         check_picture(shape, size, cfg.size)
-        coders = Encoder(size), Decoder(size, shape, env.obs_size)
-    return WorldModel(size, *coders, tuple(heads.items()))
+        encoder, decoder = Encoder(size), Decoder(size, shape, env.obs_size)
+    return WorldModel(size, encoder, decoder, tuple(heads.items()))
 
 
 def actor_of(env: Env, cfg: Any) -> Head:

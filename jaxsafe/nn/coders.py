@@ -67,8 +67,8 @@ def vector_loss(decoded: jax.Array, obs: jax.Array) -> jax.Array:
 
 # [2, SIDE, places]: 1 where tap d of a convolution, at pixel a of a pair, reads this place of a picture
 PIXEL, TAP = np.mgrid[:2, :SIDE]
-SHRINK = np.float32((PIXEL + TAP)[..., None] == np.arange(SIDE + 1))
-GROW = np.float32((PIXEL + TAP)[..., None] // 2 == np.arange(SIDE // 2 + 1))  # its pixels are doubled
+SHRINK = ((PIXEL + TAP)[..., None] == np.arange(SIDE + 1)).astype(np.float32)
+GROW = ((PIXEL + TAP)[..., None] // 2 == np.arange(SIDE // 2 + 1)).astype(np.float32)  # all doubled
 
 
 class Convolution(nn.Module):
@@ -112,7 +112,7 @@ class PictureEncoder(nn.Module):
 
     @nn.compact
     def __call__(self, picture: jax.Array) -> jax.Array:
-        x = picture.astype(jnp.float32) / 255 - 0.5
+        x: Any = picture.astype(jnp.float32) / 255 - 0.5
         for channels in self.size.channels:
             x = normed(Convolution(channels)(x).max((-3, -2)))
         return x.reshape(*x.shape[:-3], math.prod(x.shape[-3:]))

@@ -60,9 +60,10 @@ def holds_study(folder: Path) -> bool:
 
 
 def name_of(run: str) -> str:
-    """What the folder of a run is called: 'point_goal1-cpo' for 'env=point_goal1 algo=cpo'."""
+    """What the folder of a run is called: 'point_goal1-cpo-seed_1' for 'env=point_goal1 algo=cpo
+    seed=1'. As a value of `run_dir` it needs no quotes."""
     words = [re.sub("^(env|algo)=", "", word) for word in run.split()]
-    return re.sub(r"[^\w.=+-]+", "_", "-".join(words))
+    return re.sub(r"[^\w.+-]+", "_", "-".join(words))
 
 
 def read(folder: Path) -> Condensed:

@@ -12,12 +12,12 @@ from jaxsafe.report.read import read_one
 from jaxsafe.report.tables import Table
 from jaxsafe.run import files
 from jaxsafe.run.settings import NO_EXTRAS, Extras
-from jaxsafe.run.sweep import read_folder
+from jaxsafe.run.sweep_folder import read_folder
 
 
 def rows_of(folder: Path, extras: Extras = NO_EXTRAS) -> list[Group]:
     """A row for each setting that has begun."""
-    swept = read_folder(folder)["swept"]
+    swept = read_folder(folder).swept
     runs = [run for path in files.runs_in(folder) for run in read_one(path, extras)]
     return group(runs, swept) if runs else []
 

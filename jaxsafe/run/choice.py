@@ -146,7 +146,7 @@ def full_names(choice: Chosen, options: dict[str, Any], *more: str) -> dict[str,
 
 
 def asked_for(choice: Chosen, options: dict[str, Any]) -> tuple[dict[str, Any], dict[str, list[Any]]]:
-    """What to sweep, as `run.sweep.plan` takes it: a list holds the values of an option.
+    """What to sweep, as `run.sweep_plan.plan` takes it: a list holds the values of an option.
 
     Raises:
         ConfigError: a list is empty, or there is no such option.

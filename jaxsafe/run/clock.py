@@ -28,11 +28,11 @@ class Unit(NamedTuple):
 
 
 def unit(clocks: Clocks) -> Unit:
-    return Unit("steps", clocks.steps) if clocks.steps else Unit("updates", clocks.updates)
+    return Unit("steps", clocks.steps) if clocks.steps else Unit("updates", clocks.gradient_steps)
 
 
 def after(iteration: int, clocks: Clocks) -> Progress:
-    return Progress(iteration, iteration * clocks.steps, iteration * clocks.updates)
+    return Progress(iteration, iteration * clocks.steps, iteration * clocks.gradient_steps)
 
 
 def iterations(train_cfg: TrainConfig, clocks: Clocks) -> int:
@@ -43,7 +43,8 @@ def iterations(train_cfg: TrainConfig, clocks: Clocks) -> int:
     """
     name, total, each, kind = "total_steps", train_cfg.total_steps, clocks.steps, "environment"
     if train_cfg.total_updates is not None:
-        name, total, each, kind = "total_updates", train_cfg.total_updates, clocks.updates, "gradient"
+        name, total, kind = "total_updates", train_cfg.total_updates, "gradient"
+        each = clocks.gradient_steps
     if not each:
         raise ConfigError(f"{name}={total}: the algorithm takes no {kind} steps")
     return -(-total // each)

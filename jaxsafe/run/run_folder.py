@@ -124,8 +124,14 @@ def installed(package: str) -> str | None:
         return None
 
 
+CODE = ("--", ":/", ":(top,exclude)docs")  # as paths of git
+
+
 def commit() -> str | None:
-    """The commit of the source tree, '-dirty' if it has changes; None outside a repository."""
+    """The commit of the source tree, '-dirty' if it has changes; None outside a repository.
+
+    Changes of docs/ do not count: that is where studies put their results.
+    """
 
     def git(*args: str) -> str:
         where = Path(jaxsafe.__file__).parent
@@ -136,7 +142,7 @@ def commit() -> str | None:
     try:
         tracked = git("ls-files", "--error-unmatch", "__init__.py")  # not some other project's tree
         return (
-            git("rev-parse", "HEAD") + ("-dirty" if git("status", "--porcelain") else "")
+            git("rev-parse", "HEAD") + ("-dirty" if git("status", "--porcelain", *CODE) else "")
             if tracked
             else None
         )

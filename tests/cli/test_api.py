@@ -25,9 +25,10 @@ from jaxsafe.learn.steps import adam_epochs
 from jaxsafe.learn.surrogates import clipped
 from jaxsafe.learn.treatments import penalty
 from jaxsafe.report.evaluation import evaluate
-from jaxsafe.run import checkpoint, programs, progress, run_folder, sweep
+from jaxsafe.run import checkpoint, programs, progress, run_folder
 from jaxsafe.run.arguments import compose
 from jaxsafe.run.settings import Settings, nested, settings_from_options, to_plain
+from jaxsafe.run.sweep_plan import Sweep, plan
 
 TINY: dict[str, Any] = {
     "num_envs": 4, "horizon": 8, "minibatches": 2, "epochs": 1, "critic_epochs": 1, "hidden": (4, 4),
@@ -324,9 +325,9 @@ def test_an_interrupt_with_nothing_to_save_leaves_the_program_running(monkeypatc
 # ---- sweeps ----------------------------------------------------------------------------------
 
 
-def planned(env: Any, algo: Any = None, **options: Any) -> sweep.Sweep:
+def planned(env: Any, algo: Any = None, **options: Any) -> Sweep:
     choice = api.chosen(env, algo)
-    return sweep.plan(*api.asked_for(choice, options), choice.extras)
+    return plan(*api.asked_for(choice, options), choice.extras)
 
 
 def test_a_sweep_takes_lists_for_values_and_tuples_for_lists():

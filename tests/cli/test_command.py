@@ -36,6 +36,7 @@ from jaxsafe.learn.conventions import conventions
 from jaxsafe.run import (
     arguments,
     checkpoint,
+    hydra_jobs,
     loop,
     policies,
     programs,
@@ -132,14 +133,14 @@ def test_help_and_cfg_show_every_option_with_its_default(capsys):
 
 
 def test_published_settings_are_defaults_that_the_command_line_overrides():
-    request = arguments.check_arguments(["preset=published", "algo=cpo"])
+    request = hydra_jobs.check_arguments(["preset=published", "algo=cpo"])
     setting = next(iter(algos.ALGOS["cpo"].published.values()))
     assert request.groups["algo"]["cpo"].items() >= setting.items()
 
 
 def test_every_chosen_name_has_its_options_and_no_other():
     texts = ["-m", "env=car_push1,Safexp-PointGoal1-v0", "algo=cpo,trpo"]
-    groups = arguments.check_arguments(texts).groups
+    groups = hydra_jobs.check_arguments(texts).groups
     chosen = {group: {name for name, options in g.items() if options} for group, g in groups.items()}
     assert chosen == {"env": {"car_push1", "point_goal1"}, "algo": {"cpo", "trpo"}}
 

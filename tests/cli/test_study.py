@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import shutil
 import signal
 import subprocess
@@ -18,6 +19,7 @@ from jaxsafe.config import ConfigError
 from jaxsafe.report import plots, studies, study_files
 from jaxsafe.report.read import read, read_one
 from jaxsafe.run import run_folder
+from jaxsafe.run.arguments import compose
 from jaxsafe.run.checkpoint import Progress
 
 ROOT = Path(__file__).parent.parent.parent
@@ -161,21 +163,22 @@ def test_an_interrupted_study_continues_with_what_is_left(toy, tmp_path, monkeyp
     runs = tmp_path / "runs"
     arguments = (toy.folder, "--runs", runs)
     assert call(monkeypatch, *arguments, train=train) == 130
-    assert "left to do: point_goal1-ppo_lag-algo.dual_lr=0.2\n" in capsys.readouterr().out
+    assert "left to do: point_goal1-ppo_lag-algo.dual_lr_0.2\n" in capsys.readouterr().out
     assert call(monkeypatch, *arguments, "--list") == 0
     assert (
         capsys.readouterr().out
-        == "point_goal1-cpo: done\npoint_goal1-ppo_lag-algo.dual_lr=0.2: to do\n"
+        == "point_goal1-cpo: done\npoint_goal1-ppo_lag-algo.dual_lr_0.2: to do\n"
     )
     assert call(monkeypatch, *arguments, "--commands") == 0
     (line,) = capsys.readouterr().out.splitlines()
-    folder = runs / "toy" / "point_goal1-ppo_lag-algo.dual_lr=0.2"
+    folder = runs / "toy" / "point_goal1-ppo_lag-algo.dual_lr_0.2"
     assert line.startswith("python scripts/train.py ") and line.endswith(
         f" run_dir={folder} resume=true"
     )
+    assert compose(shlex.split(line)[2:]).train.run_dir == str(folder)
     shutil.rmtree(runs / "toy" / asked[1])
     assert call(monkeypatch, *arguments, train=train) == 0
-    assert asked == ["point_goal1-cpo", *["point_goal1-ppo_lag-algo.dual_lr=0.2"] * 2]
+    assert asked == ["point_goal1-cpo", *["point_goal1-ppo_lag-algo.dual_lr_0.2"] * 2]
     assert call(monkeypatch, *arguments, train=train) == 0 and len(asked) == 3
     assert {p.name for p in toy.folder.iterdir()} == {
         "study.yaml",

@@ -29,6 +29,8 @@ from jaxsafe.run.programs import build, members
 from jaxsafe.run.progress import Reporter
 from jaxsafe.run.session import Session
 from jaxsafe.run.settings import TrainConfig, settings_from_config
+from jaxsafe.run.sweep_folder import open_folder
+from jaxsafe.run.sweep_plan import Sweep, plan
 
 SMALL = [
     "env=toys:Corridor", "env.half_width=0.01", "algo=ppo_lag", "num_envs=4", "algo.horizon=8",
@@ -38,9 +40,9 @@ SMALL = [
 GRID = ["algo.cost_limit=0.5,5", "algo.dual_lr=0.01,1", "num_seeds=2"]
 
 
-def planned(*texts: str) -> sweep.Sweep:
+def planned(*texts: str) -> Sweep:
     given = arguments.read_values([*texts])
-    return sweep.plan(given.options, given.several)
+    return plan(given.options, given.several)
 
 
 def train(folder: Path, *texts: str) -> None:
@@ -160,7 +162,7 @@ def test_a_sweep_over_a_named_limit_from_training_to_summary(tmp_path, capsys):
     assert "wall over 50" in found[1].rows
     for other in (["algo.clip=0.1,0.2", "num_seeds=2"], ["algo.cost_limits.wall=1,50", "num_seeds=2"]):
         with pytest.raises(ConfigError, match="belongs to another sweep: algo"):
-            sweep.open_folder(planned(*SMALL, *other, "eval_episodes=2", f"run_dir={folder}"))
+            open_folder(planned(*SMALL, *other, "eval_episodes=2", f"run_dir={folder}"))
 
 
 def test_limits_of_named_costs_swept_have_lines_of_their_own(tmp_path, monkeypatch):
@@ -288,7 +290,7 @@ def test_the_memory_decides_how_many_members_run_at_once(monkeypatch):
 def test_a_folder_of_another_sweep_is_refused_and_a_longer_one_is_not(finished, tmp_path):
     def opened(*texts: str) -> dict[str, int]:
         asked = planned(*SMALL, *texts, f"run_dir={finished}")
-        return sweep.open_folder(asked)
+        return open_folder(asked)
 
     assert [*opened(*GRID, "total_steps=1e6").values()] == [8]
     with pytest.raises(ConfigError, match=r"another sweep: seed is 0 there, 3 here"):
@@ -299,7 +301,7 @@ def test_a_folder_of_another_sweep_is_refused_and_a_longer_one_is_not(finished, 
         opened(*GRID, "algo.epochs=1,2")
     (tmp_path / "config.yaml").touch()
     with pytest.raises(ConfigError, match="holds something else than a sweep"):
-        sweep.open_folder(planned(*SMALL, *GRID, f"run_dir={tmp_path}"))
+        open_folder(planned(*SMALL, *GRID, f"run_dir={tmp_path}"))
 
 
 def test_the_policies_of_a_group_are_evaluated_setting_by_setting(finished):

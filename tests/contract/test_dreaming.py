@@ -4,7 +4,7 @@ import dataclasses
 import os
 import subprocess
 import sys
-from functools import cache, partial
+from functools import cache
 from typing import Any
 
 import jax
@@ -88,8 +88,10 @@ class Dark(Corridor):
 def test_published_settings_build(name):
     for settings in ALGOS[name].published.values():
         cfg = ALGOS[name].config(**settings)
-        init = ALGOS[name].make(Corridor() if cfg.encoder == "none" else Dark()).init
-        before = jax.eval_shape(partial(init, cfg=cfg, shared=START), jax.random.key(0))
+        algo = ALGOS[name].make(Corridor() if cfg.encoder == "none" else Dark())
+        before = jax.eval_shape(
+            lambda key, cfg=cfg, algo=algo: algo.init(key, cfg, START), jax.random.key(0)
+        )
         kernel = before.params["model"]["params"]["memory"]["BlockDense_0"]["kernel"]
         assert kernel.shape[0] == SIZES[cfg.size].blocks
 

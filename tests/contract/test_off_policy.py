@@ -22,6 +22,7 @@ from jaxsafe.learn.acting import Player
 from jaxsafe.learn.models import EnsembleConfig
 from jaxsafe.learn.next_step_rollout import collect_records
 from jaxsafe.learn.off_policy import OffPolicyConfig
+from jaxsafe.learn.timetable import timetable_of
 from jaxsafe.types import Env, Shared, State
 
 NAMES = [
@@ -230,6 +231,21 @@ def test_sizes_that_do_not_fit_are_refused_with_the_nearest_that_do(settings, me
         start("sac", **settings)
 
 
+@pytest.mark.parametrize(
+    "num_envs, batch, gradient_steps",
+    [(4, 64, 1), (16, 256, 1), (100, 800, 2), (1000, 1000, 16), (1024, 1024, 16), (4096, 1024, 64)],
+)
+def test_a_batch_follows_the_number_of_environments_so_that_the_replay_ratio_stays(
+    num_envs, batch, gradient_steps
+):
+    cfg = ALGOS["sac_lag"].config(num_envs=num_envs)
+    table = timetable_of(cfg, None)
+    assert (table.batch, table.gradient_steps) == (batch, gradient_steps)
+    assert batch * gradient_steps == cfg.replay_ratio * num_envs * table.rows
+    with pytest.raises(ConfigError, match=r"batches of 1024; .* replay_ratio=1024 or batch_size=16"):
+        timetable_of(dataclasses.replace(cfg, num_envs=1), None)  # 16 are too few to learn from
+
+
 def test_the_clocks_count_environment_steps_and_gradient_steps():
     cfg = ALGOS["sac"].config(**TINY)
     assert ALGOS["sac"].make(Corridor()).clocks(cfg) == (8 * 6, 3 * (4 * 8 * 2 // 32))
@@ -252,7 +268,6 @@ class Sized(Ticker):
 
 def test_a_million_transitions_of_point_goal1_take_little_room():
     algo, cfg = ALGOS["sac"].make(Sized()), ALGOS["sac"].config(num_envs=1000, replay_size=1_000_000)
-    cfg = dataclasses.replace(cfg, batch_size=4000)
     ts = jax.eval_shape(lambda key: algo.init(key, cfg, START), jax.random.key(0))
     transitions = ts.replay.reward.size
     size = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(ts.replay))
@@ -269,10 +284,10 @@ def test_the_last_observation_of_an_episode_has_a_row_and_the_next_row_is_a_rese
                replay_size=400, stagger=False)  # fmt: skip
     keys = jax.random.split(jax.random.key(1), 40)
 
-    def behave(carry, state, first, key):
+    def act(carry, state, first, key):
         return jnp.zeros((5, 1)), carry, {}
 
-    _, (rows, steps) = jax.jit(lambda x: collect_records(env, behave, x, keys))(ts.stepping)
+    _, (rows, steps) = jax.jit(lambda x: collect_records(env, act, x, keys))(ts.stepping)
     name, clock, life = np.moveaxis(np.asarray(rows.obs), -1, 0)
     last = np.asarray(rows.terminated | rows.truncated)
     assert rows.first[0].all() and (np.asarray(rows.first[1:]) == last[:-1]).all()

@@ -50,7 +50,7 @@ def test_the_algorithms_by_adam_share_a_trunk_and_the_others_say_that_they_do_no
             with pytest.raises(ConfigError, match="trunk=shared: expected separate"):
                 build(cfg)
         return
-    assert algo.clocks(cfg).updates == cfg.POLICY_STEPS * cfg.epochs * cfg.minibatches
+    assert algo.clocks(cfg).gradient_steps == cfg.POLICY_STEPS * cfg.epochs * cfg.minibatches
     before, after, metrics = shapes(name, Ticker(), trunk="shared")
     chex.assert_trees_all_equal_structs(before, after)
     assert [*before.params] == ["actor"] and before.opt_state["critics"] == ()

@@ -100,8 +100,8 @@ def test_a_time_limit_truncates_and_frames_do_not_leak_into_the_next_episode():
     env = FrameStack(TimeLimit(Ticker(), 3), 2)
     rollout = init_rollout(env, jax.random.key(0), 2, False)
 
-    def act(carry: Any, obs: jax.Array, first: jax.Array, key: jax.Array) -> Any:
-        return jnp.zeros((2, 1)), jnp.zeros(2), carry
+    def act(carry: Any, state: State, first: jax.Array, key: jax.Array) -> Any:
+        return jnp.zeros((2, 1)), carry, {"log_prob": jnp.zeros(2)}
 
     _, traj = jax.jit(lambda r: collect(env, act, r, jax.random.key(1), 7))(rollout)
     np.testing.assert_array_equal(np.flatnonzero(traj.truncated[:, 0]), [2, 5])

@@ -11,7 +11,9 @@ from jaxsafe import algos, envs
 from jaxsafe.config import ConfigError
 from jaxsafe.envs.safety_gym import suite
 from jaxsafe.interop import migrate
-from jaxsafe.run import arguments
+from jaxsafe.interop.migrate.model_based import REPEAT
+from jaxsafe.interop.migrate.on_policy import ON_POLICY
+from jaxsafe.run import arguments, hydra_jobs
 
 # What OmniSafe 0.5.0 and later takes where nothing is said: PPOLag, and what is other of TRPO.
 PPO_LAG: dict[str, Any] = {
@@ -138,7 +140,7 @@ PLAIN = ["env=point_goal1", "env.rules=safety_gymnasium"]
 
 def migrated(config: dict[str, Any], algo: str, env: str = "SafetyPointGoal1-v0") -> migrate.Migrated:
     found = migrate.omnisafe(config, algo, env)
-    arguments.check_arguments(found.argv)  # train.py takes it
+    hydra_jobs.check_arguments(found.argv)  # train.py takes it
     return found
 
 
@@ -274,7 +276,7 @@ EVALUATED = ["total_steps=1000000", "eval_episodes=1", "eval_every=10000"]
 )  # fmt: skip
 def test_the_defaults_of_planning_are_the_published_preset_on_coordinates(theirs, config):
     found = migrate.omnisafe(config, theirs, "SafetyPointGoal1-v0-modelbased")
-    arguments.check_arguments(found.argv)
+    hydra_jobs.check_arguments(found.argv)
     own = f"algo={migrate.algorithms()[theirs]}"
     start = [*PLAIN, "env.observation=coordinates", own, "preset=published", "compat=omnisafe"]
     assert found.argv[:6] == start
@@ -290,7 +292,7 @@ def test_the_defaults_of_planning_are_the_published_preset_on_coordinates(theirs
 def test_planning_in_velocity_tasks_has_their_preset(theirs, changed):
     config = {"defaults": {"LOOP": LOOP, "PETS": PETS}[theirs], "SafetyAntVelocity-v1": ANT[theirs]}
     found = migrate.omnisafe(config, theirs, "SafetyAntVelocity-v1")
-    arguments.check_arguments(found.argv)
+    hydra_jobs.check_arguments(found.argv)
     start = [
         "env=ant_velocity",
         f"algo={theirs.lower()}",
@@ -389,6 +391,13 @@ def test_what_has_no_counterpart_is_named(algo, key, value, reason):
     assert len(found.argv) == 5
 
 
+def test_a_key_of_another_algorithm_or_a_value_of_another_type_is_lost_and_no_more():
+    """An option of LOOP with PETS; a list where a word stands."""
+    for key, value, algo in (("alpha", 0.1, "PETS"), ("adv_estimation_method", ["gae"], "PPOLag")):
+        found = migrated({"algo_cfgs": {key: value}}, algo)
+        assert lost(found) == [f"algo_cfgs.{key}"]
+
+
 def test_two_keys_of_one_option_say_which_counts():
     sizes = {"actor": {"hidden_sizes": [32]}, "critic": {"hidden_sizes": [64]}}
     found = migrated({"model_cfgs": sizes}, "PPOLag")
@@ -417,9 +426,9 @@ def test_every_option_that_a_key_becomes_exists_in_its_family():
     for name, family in migrate.FAMILIES.items():
         rows = [row for row in algos.ALGOS.values() if migrate.family_of(row) == name]
         fields = {f"algo.{f.name}" for row in rows for f in dataclasses.fields(row.config)}
-        fields |= {"algo", "env", "env.rules", "seed", "total_steps", "num_envs", migrate.REPEAT}
+        fields |= {"algo", "env", "env.rules", "seed", "total_steps", "num_envs", REPEAT}
         fields |= {"dataset", "total_updates", "eval_episodes", "eval_every"}
-        own = {k: r for k, r in family.rules.items() if r != migrate.OMNISAFE.get(k)} or family.rules
+        own = {k: r for k, r in family.rules.items() if r != ON_POLICY.get(k)} or family.rules
         assert {o for rule in own.values() for o in rule.ours.split()} <= fields
 
 
@@ -499,6 +508,18 @@ def test_offline_configs_count_gradient_steps_and_keep_a_path():
             "point_goal1",
             "batch_size=0: expected a whole number between 1 and",
         ),
+        (
+            {"algo_cfgs": {"warmup_epochs": None}},
+            "SACLag",
+            "point_goal1",
+            "warmup_epochs=None: expected a whole number",
+        ),
+        (
+            {"opt_s": {"temperature": {"max": [1, 2]}}},
+            "CRABS",
+            "pendulum_swing",
+            r"algo.temperature=\[1, 2\]: expected a number",
+        ),
         ({}, "PPOlag", "point_goal1", "did you mean 'PPOLag'"),
         ({}, "CRABS", "SafetyPointGoal1-v0", "CRABS is for SafeInvertedPendulumSwing-v2 alone"),
         ({}, "", "point_goal1", "add --algo"),
@@ -555,7 +576,7 @@ def test_an_engine_dict_is_the_nearest_environment_and_the_rest():
     expected = ["env.hazards_num=3", "env.hazards_locations=[[1.0,1.0],[-1.0,0.5]]"]
     assert sorted(found.argv) == sorted(["env=point_push1", *expected, "env.constrain_indicator=false"])
     assert {line.key for line in found.lines} == set(config)
-    request = arguments.check_arguments(found.argv)
+    request = hydra_jobs.check_arguments(found.argv)
     assert expected[1] in request.argv
     for name, message in (("hazard_num", "did you mean 'hazards_num'"), ("awake", "of Engine")):
         with pytest.raises(ConfigError, match=message):

@@ -6,7 +6,7 @@ import pytest
 from shell import typed
 
 from jaxsafe.config import ConfigError
-from jaxsafe.interop.migrate_commands import alf, ambs
+from jaxsafe.interop.migrate.from_commands import alf, ambs
 from jaxsafe.learn.observations import observation_like
 from jaxsafe.run.arguments import compose
 from jaxsafe.run.settings import make_env

@@ -16,7 +16,6 @@ from toys import START, Corridor, Ledge
 from jaxsafe.algos import ALGOS, ambs
 from jaxsafe.config import ConfigError
 from jaxsafe.learn.acting import Learned, Player
-from jaxsafe.learn.off_policy import act_in_all
 from jaxsafe.learn.world_model import dream, dream_returns
 from jaxsafe.nn.gaussian import Gaussian
 from jaxsafe.nn.rssm import Latent
@@ -297,7 +296,7 @@ def test_the_executed_action_is_one_of_the_two_and_is_what_is_remembered():
         at = dataclasses.replace(learned.config, delta=delta, eps=jnp.float32(0))
         player = Player(algo.policy, dataclasses.replace(learned, config=at), env)
         carry = jax.tree.map(lambda x: jnp.zeros((4, *x.shape)), player.begin())
-        return act_in_all(player, carry, state, jnp.ones(4, bool), jax.random.key(2))
+        return player.act_in_all(carry, state, jnp.ones(4, bool), jax.random.key(2))
 
     task, memory, said = acted(jnp.float32(jnp.inf), state)
     safe, memory_safe, said_safe = acted(jnp.float32(-1), state)

@@ -17,8 +17,8 @@ from jaxsafe import algos, envs
 from jaxsafe.config import Amount, Bounds, ConfigError, Share, convert, flat, from_dict, shown
 from jaxsafe.envs.wrap import WrapConfig
 from jaxsafe.learn.conventions import conventions
-from jaxsafe.run import sweep
-from jaxsafe.run.arguments import check_arguments, compose, read_values
+from jaxsafe.run.arguments import compose, read_values
+from jaxsafe.run.hydra_jobs import check_arguments
 from jaxsafe.run.plain import as_text
 from jaxsafe.run.settings import (
     Settings,
@@ -28,6 +28,7 @@ from jaxsafe.run.settings import (
     settings_from_config,
     settings_from_options,
 )
+from jaxsafe.run.sweep_plan import plan
 
 CONFIGS = {name: row.config for name, row in algos.ALGOS.items()}
 CONFIGS |= {
@@ -176,7 +177,7 @@ def test_a_sweep_is_judged_before_its_settings_are_listed(texts):
     begun = time.monotonic()
     with pytest.raises(ConfigError, match=HUGE[texts]):
         given = read_values(["env=toys:Corridor", *texts.split()])
-        sweep.plan(given.options, given.several)
+        plan(given.options, given.several)
     assert time.monotonic() - begun < 10
 
 
@@ -286,10 +287,10 @@ def check_meaning(plain: dict[str, Any]) -> None:
         "minibatches",
         "epochs",
         "cg_iterations",
-        "batch_size",
         "updates",
     ):
         assert plain.get(f"algo.{part}", 1) >= 1, part
+    assert plain.get("algo.batch_size") is None or plain["algo.batch_size"] >= 1
     for part in ("discount", "cost_discount", "gae_lambda", "pid_smoothing", "simmer_smoothing", "tau"):
         assert 0 <= plain.get(f"algo.{part}", 0) <= 1, part
     for part in (

@@ -1,6 +1,7 @@
 """Encoders and decoders of pictures: their convolutions against XLA's, and sizes that do not suit."""
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +17,8 @@ from jaxsafe.nn.rssm import SIZES, Latent
 def test_squares_are_a_convolution_of_the_picture_and_of_one_twice_as_large():
     def both(x, grows):
         layer = coders.Convolution(4, grows)
-        squares, params = layer.init_with_output(jax.random.key(1), x)
+        found: Any = layer.init_with_output(jax.random.key(1), x)
+        squares, params = found
         of = x.repeat(2, 1).repeat(2, 2) if grows else x
         kernel, axes = params["params"]["kernel"], ("NHWC", "HWIO", "NHWC")
         conv = partial(jax.lax.conv_general_dilated, dimension_numbers=axes)

@@ -177,11 +177,11 @@ def test_a_row_says_whether_what_the_environment_reports_made_it_jump():
     env, keys = Ticker(episode_length=3), jax.random.split(jax.random.key(1), 8)
     stepping = started(init_rollout(env, jax.random.key(0), 2, stagger=False))
 
-    def behave(carry, state, first, key):
+    def act(carry, state, first, key):
         return jnp.zeros((2, 1)), carry, {}
 
     ticks = record_by(dataclasses.replace(Config(), jump="ticks"))  # it reports a tick of each step
-    run = jax.jit(lambda x: collect_records(env, behave, x, keys, ticks), compiler_options=FAST)
+    run = jax.jit(lambda x: collect_records(env, act, x, keys, ticks), compiler_options=FAST)
     rows: Any = run(stepping)[1][0]
     np.testing.assert_array_equal(rows.jump, ~rows.first)
     assert rows.first.sum() == 2 * 2

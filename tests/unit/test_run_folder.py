@@ -147,7 +147,7 @@ def test_progress_reads_the_newest_manifest(tmp_path):
 
 
 def test_the_command_of_a_run_is_recorded_as_it_was_typed(tmp_path, monkeypatch):
-    # `arguments.read` puts ++ before a named limit, which the command line does not take
+    # `as_hydra_reads` puts ++ before a named limit, which the command line does not take
     monkeypatch.setattr(sys, "argv", ["train.py", "algo=cpo", "++algo.cost_limits.hazards=5"])
     run_folder.append_versions(tmp_path, "cpu", None)
     (start,) = json.loads((tmp_path / "versions.json").read_text())

@@ -17,7 +17,6 @@ from jaxsafe.learn import world_model
 from jaxsafe.learn.acting import Player
 from jaxsafe.learn.dreaming import Range, moved
 from jaxsafe.learn.next_step_rollout import collect_records, started
-from jaxsafe.learn.off_policy import act_in_all
 from jaxsafe.learn.replay import Record, Source, Span
 from jaxsafe.learn.rollout import init_rollout
 from jaxsafe.learn.sequences import SequenceBatch, drawn_sequences
@@ -175,12 +174,12 @@ def echoed(latents: rssm.Latent) -> jax.Array:
 def recorded(env: Any, steps: int) -> Record:
     """Rows [T, N] of three environments with random actions, of the loop's own rollout."""
 
-    def behave(carry, state, first, key):
+    def act(carry, state, first, key):
         return jax.random.uniform(key, (3, 1), minval=-1.0), carry, {}
 
     def play(key):
         stepping = started(init_rollout(env, key, 3, stagger=False))
-        return collect_records(env, behave, stepping, jax.random.split(key, steps))[1][0]
+        return collect_records(env, act, stepping, jax.random.split(key, steps))[1][0]
 
     return jax.jit(play, compiler_options=FAST)(jax.random.key(1))
 
@@ -234,11 +233,8 @@ def test_the_policy_remembers_what_the_model_learns_from():
 
     @jax.jit
     def both(stepping, keys):
-        def behave(carry, state, first, key):
-            return act_in_all(likeliest, carry, state, first, key)
-
         def step(stepping, key):
-            stepping, (rows, _) = collect_records(env, behave, stepping, key[None])
+            stepping, (rows, _) = collect_records(env, likeliest.act_in_all, stepping, key[None])
             row = jax.tree.map(lambda x: x[0], rows)
             return stepping, (row, stepping.rollout.carry.latent)
 

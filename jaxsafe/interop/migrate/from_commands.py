@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 from jaxsafe import envs
 from jaxsafe.config import ConfigError, Seed, convert, nearest
-from jaxsafe.interop.migrate import Line, Migrated, as_option
+from jaxsafe.interop.migrate.found import Line, Migrated, as_option
 from jaxsafe.run.settings import nested, settings_from_options
 
 AMBS_REPEAT = 2  # raw steps in a step, of its safetygym configs

@@ -1,0 +1,29 @@
+"""What the commands' argparse parsers share: numbers with bounds, and errors in one line."""
+
+import argparse
+import contextlib
+from collections.abc import Callable
+from typing import Any, NoReturn
+
+from jaxsafe.config import ConfigError, convert, kind_in_words
+
+
+def number(kind: Any) -> Callable[[str], Any]:
+    """What argparse calls for an option that is a number within the bounds of the annotated `kind`."""
+
+    def read(text: str) -> Any:
+        value: Any = text
+        with contextlib.suppress(ValueError):
+            value = float(text)
+            value = int(text)
+        try:
+            return convert(value, kind, "")
+        except ConfigError as error:
+            raise argparse.ArgumentTypeError(f"{text}: expected {kind_in_words(kind)}") from error
+
+    return read
+
+
+def fail(message: str) -> NoReturn:
+    """What an argparse parser does with an error here."""
+    raise ConfigError(message)
