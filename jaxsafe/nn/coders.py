@@ -68,7 +68,7 @@ def vector_loss(decoded: jax.Array, obs: jax.Array) -> jax.Array:
 # [2, SIDE, places]: 1 where tap d of a convolution, at pixel a of a pair, reads this place of a picture
 PIXEL, TAP = np.mgrid[:2, :SIDE]
 SHRINK = ((PIXEL + TAP)[..., None] == np.arange(SIDE + 1)).astype(np.float32)
-GROW = ((PIXEL + TAP)[..., None] // 2 == np.arange(SIDE // 2 + 1)).astype(np.float32)  # all doubled
+GROW = ((PIXEL + TAP)[..., None] // 2 == np.arange(SIDE // 2 + 1)).astype(np.float32)  # pixels doubled
 
 
 class Convolution(nn.Module):
