@@ -121,8 +121,9 @@ def test_pictures_are_those_of_opengl(display, monkeypatch, name):
         for shifted in (np.roll(ours, s, axis) for s in (1, -1) for axis in (0, 1)):
             assert np.abs(shifted - theirs).mean() > 1.2 * apart.mean()
     env.config = replace(env.config, vision_render=True, vision_render_size=(120, 80))
-    film = Renderer(env, *SIZE).frame(jax.tree.map(lambda x: x[0], states))
+    film = Renderer(env, *SIZE).frame(jax.tree.map(lambda x: x[0], states), overruled=True)
     assert film.shape == (80, 60 + GAP + 120, 3)
+    assert (film[6, 54] == [220, 30, 30]).all()  # the light of a shield, in the scene
     np.testing.assert_array_equal(film[::2, -120::2], states.obs["vision"][0])
 
 
