@@ -93,7 +93,10 @@ class AdamConfig:
 
 
 def adam(lr: jax.Array | float, cfg: Any, eps: float = 1e-8) -> optax.GradientTransformation:
-    return optax.chain(optax.clip_by_global_norm(cfg.max_grad_norm), optax.adam(lr, eps=eps))
+    """Adam on gradients no longer than `max_grad_norm`. A network's parameters are one array to it, so
+    that a step has a few kernels, not a few for the weights of each layer."""
+    steps = optax.chain(optax.clip_by_global_norm(cfg.max_grad_norm), optax.adam(lr, eps=eps))
+    return optax.flatten(steps)
 
 
 def remaining(iteration: Count, cfg: Any) -> jax.Array:
