@@ -12,6 +12,7 @@ devices. Each device then holds `cfg.num_envs` environments of its own, and the 
 """
 
 import dataclasses
+import math
 from typing import Any, Literal, NamedTuple
 
 import flax.struct
@@ -162,7 +163,7 @@ def off_policy(
         keys = jax.random.split(rounds_key, table.rounds)
         ts, rounds = jax.lax.scan(one_round, ts, (jnp.arange(table.rounds), keys))
         ts, refitted = refit(ts, shared, jax.random.fold_in(rounds_key, table.rounds))
-        steps = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rounds.steps)
+        steps = jax.tree.map(lambda x: x.reshape(math.prod(x.shape[:2]), *x.shape[2:]), rounds.steps)
         length, lost_time = expected_length(
             ts.lost_time, env.episode_length, steps, steps.real.sum(), axis_name
         )

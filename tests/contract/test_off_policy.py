@@ -99,6 +99,24 @@ def lowest(params):
 # ---- the contract ------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class Free(Corridor):
+    """Corridor without a cost, as Goal 0 has none."""
+
+    cost_names: tuple[str, ...] = ()
+
+    def _state(self, x):
+        return dataclasses.replace(super()._state(x), cost=jnp.zeros(()), costs=jnp.zeros(0))
+
+
+def test_an_environment_may_have_no_costs():
+    algo, cfg = ALGOS["sac_lag"].make(Free()), ALGOS["sac_lag"].config(**TINY)
+    before = jax.eval_shape(lambda: algo.init(jax.random.key(0), cfg, START))
+    assert before.replay.costs.shape == (18, 8, 0)
+    after, _ = jax.eval_shape(algo.update, before, START)
+    assert jax.tree.leaves(before) == jax.tree.leaves(after)
+
+
 @pytest.mark.parametrize("name", [*QUICK, *OTHERS])
 def test_an_update_keeps_the_structure_and_learns_once_the_warm_up_is_over(name):
     before, update = start(name), build(name)[1]
