@@ -1,4 +1,4 @@
-"""Soft actor-critic, and with each treatment of the constraint, for a thousand environments or one."""
+"""Soft actor-critic, alone and with each treatment of the constraint."""
 
 from functools import partial
 from typing import Annotated, Any
@@ -63,9 +63,9 @@ class SACLagConfig(MultiplierConfig, SACConfig):
         lam = (l + dual_damping (J_c - cost_limit))+
         minimise_l    -l (J_c - cost_limit),  l >= 0,  by Adam, once every `dual_every` steps
 
-    J_c is what an episode has cost since lam last moved. unit is the standard deviation of what it
-    divides over the batch, or 1 with `price_unit=reward`. With `cost_floor`
-    a Q_c or Q'_c below 0 counts as 0. The rest is as in SAC.
+    J_c is what an episode has cost since lam last moved. unit is the standard deviation, over the
+    batch, of what it divides, or 1 with `price_unit=reward`. With `cost_floor` a Q_c or Q'_c below 0
+    counts as 0. The rest is as in SAC.
 
     Source: Ray, Achiam and Amodei (2019), "Benchmarking Safe Exploration in Deep Reinforcement
     Learning", for the multiplier; Platt and Barr (1987), "Constrained Differential Optimization", for

@@ -1,7 +1,7 @@
 """Pendulums to be held upright, tilted, moved or swung without ever falling or leaving the rail.
 
 Upright and Tilt are of a pendulum with a motor, Move and Swing of a pendulum on a cart. An episode ends
-at the first unsafe step, so that its cost is 1 or 0, and the safe set is known: `barrier`.
+at the first unsafe step, so that its cost is 1 or 0. The safe set is known: see `barrier`.
 
 Source: Luo and Ma (2021), "Learning Barrier Certificates: Towards Safe Reinforcement Learning with Zero
 Training-time Violations", arXiv:2108.01846, and the authors' code, roosephu/crabs @823da6c.
@@ -34,7 +34,7 @@ class Pendulum(PlainEnv):
     Reward: -(angle - goal)^2, of the angle before the step. Cost: 1 where |angle| > `threshold`, which
     ends the episode.
 
-    The motor just holds the pendulum at an angle of 0.4115: 15 sin(0.4115) = 6. Tilt's goal is there.
+    The motor just holds the pendulum where |angle| = 0.4115: 15 sin(0.4115) = 6. Tilt's goal is there.
     """
 
     goal: Annotated[float, Bounds(-3.0, 3.0)] = 0.0  # rad

@@ -1,4 +1,4 @@
-"""What environments share that have no MuJoCo model: they are dataclasses of their own options."""
+"""What environments without a MuJoCo model share. Such an environment is a dataclass of its options."""
 
 from jaxsafe.config import check_values
 

@@ -24,7 +24,7 @@ class State:
     costs: float [K], one entry for each of `env.cost_names`. Safety Gym's `cost` is the indicator
         of their sum, so `cost` is not always `costs.sum()`.
     terminated: bool [], True if the episode has ended for good: its value from here on is 0.
-        Running out of time is not termination; `Rollout` adds it.
+        Running out of time is not termination; the rollout adds it.
     truncated: bool [], True if the episode ends here all the same, though its value goes on.
     info: dict of float [], whatever else is worth a mean over an episode (`goal_met`, ...).
     """

@@ -153,20 +153,19 @@ def work(study: Study, args: argparse.Namespace, train: Callable[[list[str], Pla
         return stop.is_set() or time.monotonic() >= end
 
     def one(run: str, gpu: str | None) -> None:
-        name, begun = study_files.name_of(run), time.monotonic()
+        name, start = study_files.name_of(run), time.monotonic()
         if late():
             unfinished.append(name)
             return
         folder = runs / name
         status = train(study.command(run), Place(folder, gpu, late))
-        minutes = f"{(time.monotonic() - begun) / 60:.1f} minutes"
+        minutes = f"{(time.monotonic() - start) / 60:.1f} minutes"
         if status in STOPPED:
             unfinished.append(name)
             print(f"{name}: stopped, {minutes}", flush=True)
             return
         with one_at_a_time:
-            began = files.there(folder / "metrics.csv")
-            trained = read_one(folder) if began else []
+            trained = read_one(folder) if files.there(folder / "metrics.csv") else []
             if len(trained) > 1:
                 raise ConfigError(f"{run}: expected one setting a run, not {len(trained)} side by side")
             failure = {0: "", DIVERGED: "diverged"}.get(status, "failed")

@@ -152,7 +152,7 @@ class Proposal(NamedTuple):
 
 
 class Actor(NamedTuple):
-    """What one method adds to another's actor and critics.
+    """What a method adds to the gradient step that all of them share.
 
     Its parameters are a dict, `{'actor': ..., ...}`: all that the loss of the policy trains.
 
@@ -195,7 +195,7 @@ def actor_critic(env: Env, actor: Actor, treatment: Treatment) -> Learner:
         parts = actor.init(actor_key, obs_size, action_size, cfg)
         sizes = obs_size, action_size
         critics = init_all_critics(critic_key, sizes, actor.critics, treatment, cfg)
-        valued = critics | encoder
+        valued = critics | encoder  # what the critics' loss trains
         optimisers = actor.optimisers(cfg, 1.0) | dict.fromkeys(valued, adam(cfg.critic_lr, cfg))
         trained = parts | valued
         opt_state = {name: optimisers[name].init(params) for name, params in trained.items()}
@@ -211,8 +211,8 @@ def actor_critic(env: Env, actor: Actor, treatment: Treatment) -> Learner:
         share = at.remaining if cfg.lr_decay else 1.0
         charged, nets = charged_in(nets, batch, cfg, axis_name)
         y = targets_at(nets.params, batch, charged, critic_key, cfg)
-        valued = [*critics_among(nets.params), *(["encoder"] if "encoder" in nets.params else [])]
-        adams = dict.fromkeys(valued, adam(cfg.critic_lr * share, cfg))
+        encoder = ["encoder"] if "encoder" in nets.params else []
+        adams = dict.fromkeys([*critics_among(nets.params), *encoder], adam(cfg.critic_lr * share, cfg))
 
         def errors(valued: dict[str, PyTree]) -> tuple[jax.Array, Metrics]:
             seen = batch._replace(obs=features(valued, batch.obs))

@@ -49,8 +49,10 @@ def by_policy(learned: Learned, obs: jax.Array, key: jax.Array | None) -> jax.Ar
 
 
 class Learner(NamedTuple):
-    """What a method adds to the loop. Observations are normalised before they come here, except those
-    of `policy`.
+    """What a method adds to the loop.
+
+    `step`, `act` and `explore` see normalised observations; `policy`, `record` and `refit` see them as
+    the environment gives them.
 
     init(key, obs_size, action_size, cfg) -> Trainable.
     step(nets, batch, at, cfg, axis_name) -> (Trainable, metrics), one gradient step on Transitions or
@@ -70,16 +72,19 @@ class Learner(NamedTuple):
     """
 
     init: Callable[[jax.Array, int, int, Any], Trainable]
-    step: Callable[[Trainable, Any, GradientStep, Any, str | None], tuple[Trainable, Metrics]]
+    step: Callable[[Trainable, PyTree, GradientStep, Any, str | None], tuple[Trainable, Metrics]]
     act: Callable[[Learned, jax.Array, jax.Array | None], jax.Array] = by_policy
     explore: Callable[[Learned, jax.Array, jax.Array], jax.Array] | None = None
     random_start: Callable[[Learned], jax.Array] = lambda learned: jnp.bool_(True)
     policy: Policy | None = None
     refit: (
-        Callable[[Trainable, Any, Shared, jax.Array, Any, str | None], tuple[Trainable, Metrics]] | None
+        Callable[[Trainable, PyTree, Shared, jax.Array, Any, str | None], tuple[Trainable, Metrics]]
+        | None
     ) = None
     record: Callable[[Any], Callable[[Stepping, jax.Array], Record]] = lambda cfg: arrival_record
-    replayed: Callable[[jax.Array, Source, Any, str | None], tuple[Any, jax.Array]] = drawn_transitions
+    replayed: Callable[[jax.Array, Source, Any, str | None], tuple[PyTree, jax.Array]] = (
+        drawn_transitions
+    )
 
 
 def policy_by(learner: Learner) -> Policy:

@@ -279,7 +279,10 @@ def normalises(cfg: Any) -> bool:
 
 
 def at_random_while(random: jax.Array, act: ActInAll, shape: tuple[int, int]) -> ActInAll:
-    """`act`, or actions [N, A] from everywhere while `random` [] holds, when `act` says only zeros."""
+    """`act`; while `random` [] holds, actions of this shape, [N, A], drawn uniformly from [-1, 1].
+
+    What `act` reports beside its actions is 0 then.
+    """
 
     def either(carry: PyTree, state: State, first: jax.Array, key: jax.Array) -> Acted:
         act_key, random_key = jax.random.split(key)
@@ -301,7 +304,7 @@ def at_random_while(random: jax.Array, act: ActInAll, shape: tuple[int, int]) ->
 
 
 def united(*parts: Metrics) -> Metrics:
-    """All metrics, in float32. What was not finite is added up."""
+    """All metrics, in float32. `train/nonfinite` is the sum of what the parts have under that name."""
     lost = sum(part.get("train/nonfinite", 0) for part in parts)
     metrics = {name: x for part in parts for name, x in part.items()} | {"train/nonfinite": lost}
     return jax.tree.map(jnp.float32, metrics)
@@ -310,7 +313,7 @@ def united(*parts: Metrics) -> Metrics:
 def means_of_gradient_steps(metrics: Metrics, learned: jax.Array) -> Metrics:
     """Means over the steps [rounds, steps] of the rounds that `learned`, NaN where there are none.
 
-    A metric that a step does not have is NaN there. What was not finite is added up.
+    A metric that a step does not have is NaN there. `train/nonfinite` is a sum, not a mean.
     """
 
     def mean(x: jax.Array) -> jax.Array:

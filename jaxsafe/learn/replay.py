@@ -66,7 +66,8 @@ class Index(NamedTuple):
 class Source(NamedTuple):
     """What a gradient step draws from: a ring, what it holds, and the normaliser of observations.
 
-    `rows` of the ring make a batch on this device. A transition takes up to `n_step` steps."""
+    rows: of the ring, as many as make a batch on this device. n_step: the most steps of a transition.
+    """
 
     ring: Record
     span: Span
@@ -234,10 +235,10 @@ def transitions(
 def sequences(ring: Record, span: Span, index: Index, length: int) -> Record:
     """Rows [length, B, ...] from `index` on, for models with a memory.
 
-    A sequence may contain ends: it goes on with the next episode, whose row is `first`. The one that
-    passes the newest row goes on with the oldest, which is marked `first` too. So the draw needs no
-    rows ahead, every row is in as many sequences as any other, and a memory that is begun anew at
-    `first` never sees two episodes.
+    A sequence may contain ends: it goes on with the next episode, whose row is `first`. A sequence that
+    passes the newest row goes on with the oldest, which is marked `first` too. So every row may begin
+    one, and is in as many sequences as any other. A memory that begins anew at `first` never sees two
+    episodes.
     """
     position = (index.position + jnp.arange(length)[:, None]) % span.count
     rows = take(ring, span, Index(position, jnp.broadcast_to(index.env, position.shape)))

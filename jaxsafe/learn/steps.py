@@ -1,8 +1,10 @@
-"""First-order steps: epochs of Adam on minibatches, for policies and for critics.
+"""First-order steps: of Adam, and epochs of them on minibatches, for policies and for critics.
 
-Policy and critics have loops of their own, so that stopping the policy early leaves the critics'
-passes alone. OmniSafe alternates them on each minibatch and stops all three together
-(`critics_stop`). On a shared trunk they are one network, and their loss is one.
+Learners with a replay or a data set take single steps (`descend_each`). Their targets `follow`.
+
+On-policy learners take epochs. Their policy and critics have loops of their own, so that stopping the
+policy early leaves the critics' passes alone. OmniSafe alternates them on each minibatch and stops all
+three together (`critics_stop`). On a shared trunk they are one network, and their loss is one.
 """
 
 from collections.abc import Callable
@@ -139,8 +141,8 @@ def mean_kl(old: Gaussian, new: Gaussian, axis_name: str | None) -> jax.Array:
 class Trainable(NamedTuple):
     """What gradient steps move, and their optimiser's state."""
 
-    params: Any
-    opt_state: Any
+    params: PyTree
+    opt_state: PyTree
 
 
 def descend_each(
@@ -149,7 +151,7 @@ def descend_each(
     optimisers: dict[str, optax.GradientTransformation],
     axis_name: str | None = None,
 ) -> tuple[Trainable, dict[str, Any]]:
-    """`nets` after one step down `loss` of the networks that have `optimisers`, each alone.
+    """`nets` after one step down `loss`. Each network that has an optimiser moves by that one.
 
     Args:
         loss: (those networks by name) -> this device's share of it, and metrics.

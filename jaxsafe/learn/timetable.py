@@ -35,7 +35,7 @@ from jaxsafe.learn.rollout import check_steps
 from jaxsafe.types import Shared
 
 BATCH = 1024  # transitions of a gradient step, where the user does not say
-BATCHES = range(64, 16 * BATCH + 1)  # and where BATCH does not fit
+BATCHES = range(64, 16 * BATCH + 1)  # where BATCH does not fit, the nearest of these that does
 
 
 @config
@@ -165,7 +165,7 @@ def check_rounds(cfg: RoundConfig) -> None:
     if cfg.horizon % cfg.learn_every:
         raise ConfigError(
             f"learn_every={cfg.learn_every}: expected a divisor of horizon={cfg.horizon}; "
-            f"the nearest is {nearest(divisors(cfg.horizon), cfg.learn_every)}"
+            f"the nearest is {closest(divisors(cfg.horizon), cfg.learn_every)}"
         )
 
 
@@ -205,15 +205,15 @@ def fitting(cfg: RoundConfig, num_envs: int, batch: int) -> list[str]:
     steps, replayed = num_envs * cfg.learn_every, num_envs * cfg.replay_ratio
     least = batch // math.gcd(batch, steps)  # ratios that fit are multiples of it
     ratio = least * max(1, round(cfg.replay_ratio / least))
-    size = nearest(divisors(cfg.replay_ratio * steps)[::-1], batch)  # of two as near, the larger one
+    size = closest(divisors(cfg.replay_ratio * steps)[::-1], batch)  # of two as near, the larger one
     every = [n for n in divisors(cfg.horizon) if replayed * n % batch == 0]
     found = [f"replay_ratio={ratio}", f"batch_size={size}"]
     if every:
-        found.append(f"learn_every={nearest(every, cfg.learn_every)}")
+        found.append(f"learn_every={closest(every, cfg.learn_every)}")
     return found
 
 
-def nearest(numbers: list[int], to: int) -> int:
+def closest(numbers: list[int], to: int) -> int:
     return min(numbers, key=lambda n: abs(n - to))
 
 

@@ -1,6 +1,7 @@
 """`key=value` arguments as plain values, in Hydra's grammar, without its composition.
 
-Arguments are checked before Hydra sees them, because its own errors are long.
+`jaxsafe.run.hydra_jobs` makes the same checks of the arguments of train before Hydra sees them, because
+Hydra's own errors are long.
 """
 
 import math

@@ -17,7 +17,8 @@ from jaxsafe import algos, envs
 from jaxsafe.config import flat
 from jaxsafe.envs.wrap import WrapConfig
 from jaxsafe.run.arguments import compose
-from jaxsafe.run.settings import Settings, TrainConfig, as_text
+from jaxsafe.run.plain import as_text
+from jaxsafe.run.settings import Settings, TrainConfig
 
 WIDTH = 100
 COLUMN = 36  # where the meaning of an option begins

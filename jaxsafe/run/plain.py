@@ -52,7 +52,7 @@ def merged(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any]:
 
 
 def replaced(options: dict[str, Any], new: dict[str, Any], where: str = "") -> dict[str, Any]:
-    """`options` with some values, by their names in `flat`, replaced."""
+    """`options` with some values replaced; `new` has them by name, as `config.flat` names them."""
     return {
         k: replaced(v, new, f"{where}{k}.") if isinstance(v, dict) else new.get(f"{where}{k}", v)
         for k, v in options.items()
@@ -82,7 +82,7 @@ def repeated(values: Iterable[Any]) -> Any:
 
 
 def together(settings: list[Any]) -> Any:
-    """The inverse of `settings_in`: a list stands where the settings differ."""
+    """Settings as one, with a list where they differ: the inverse of `settings.settings_in`."""
     first = settings[0]
     if isinstance(first, dict):
         return {name: together([each[name] for each in settings]) for name in first}

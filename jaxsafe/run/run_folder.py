@@ -45,10 +45,9 @@ PACKAGES = (
 )  # fmt: skip
 MOST_HEADER = 64 * files.KB  # letters of a table's first line
 INDEX = (*Progress._fields, "seed", "seconds")  # the first columns of metrics.csv
-
-
 # options about the machine and the network, which a file never sets
 COMMAND_ONLY = ("coordinator", "num_processes", "process_index", "logger")
+ALL_BUT_DOCS = ("--", ":/", ":(top,exclude)docs")  # of the source tree, as git names it
 
 
 def write_config(folder: Path, config: dict[str, Any]) -> None:
@@ -79,7 +78,7 @@ def append_versions(folder: Path, device: str, engine: str | None, dataset: str 
     """Add this start of the run to versions.json, with the SHA-256 of its data set."""
     now = {
         "time": datetime.datetime.now().astimezone().isoformat(timespec="seconds"),
-        # as it was typed: `arguments` adds the ++ that Hydra needs
+        # as it was typed: `hydra_jobs` adds the ++ that Hydra needs
         "command": shlex.join([Path(sys.executable).name, *(x.removeprefix("++") for x in sys.argv)]),
         "commit": commit(),
         "device": device,
@@ -124,9 +123,6 @@ def installed(package: str) -> str | None:
         return None
 
 
-CODE = ("--", ":/", ":(top,exclude)docs")  # as paths of git
-
-
 def commit() -> str | None:
     """The commit of the source tree, '-dirty' if it has changes; None outside a repository.
 
@@ -140,12 +136,9 @@ def commit() -> str | None:
         ).stdout.strip()
 
     try:
-        tracked = git("ls-files", "--error-unmatch", "__init__.py")  # not some other project's tree
-        return (
-            git("rev-parse", "HEAD") + ("-dirty" if git("status", "--porcelain", *CODE) else "")
-            if tracked
-            else None
-        )
+        git("ls-files", "--error-unmatch", "__init__.py")  # fails in another project's tree
+        changes = git("status", "--porcelain", *ALL_BUT_DOCS)
+        return git("rev-parse", "HEAD") + ("-dirty" if changes else "")
     except (OSError, subprocess.SubprocessError):
         return None
 

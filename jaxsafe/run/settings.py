@@ -2,7 +2,8 @@
 
 `settings_from_config` is the only way from plain values to `Settings`, whether they come from a
 config.yaml, from the command line or from Python. `settings_from_options` first fills in what its
-caller left out. Only this module looks up the names of environments and algorithms.
+caller left out. The names of a run's environment and algorithm are resolved here alone, by `find_env`
+and `find_algo`.
 """
 
 import dataclasses
@@ -49,12 +50,13 @@ ON_RESUME = (
     "eval_episodes",
     "video",
 )
+# options that do not tell two runs apart
 NOT_COMPARED = ("run_dir", "resume", "logger", *ON_RESUME)
 OFFLINE_UPDATES = 100_000  # total_updates with a data set, unless the user says otherwise
 READ_FROM = ("dataset", "init_from", "env.robot_base")  # options that name a file or folder to read
 MOST_MEMBERS = 2**16  # settings x seeds of one run
 MOST = 10_000  # settings of a sweep
-PATHS = ("run_dir", "resume", "dataset", "init_from")
+PATHS = ("run_dir", "resume", "dataset", "init_from")  # options that are paths, if they are strings
 COST_LIMITS = "cost_limits"  # an option of algorithms: floats by name, as {hazards: 10}
 
 

@@ -169,7 +169,8 @@ def members_at_once(settings: Settings, most: int | None) -> tuple[int, Program]
             count = -(-count // 2)
             continue
         held = count if count == 1 else memory.capacity(program)
-        return (held if held < len(program.members) else count), program
+        fits = held >= len(program.members)  # which are fewer than `count` where settings are whole
+        return (count if fits else held), program
 
 
 def first_program(settings: Settings, parallel: int) -> Program:

@@ -27,7 +27,8 @@ from jaxsafe.learn.treatments import penalty
 from jaxsafe.report.evaluation import evaluate
 from jaxsafe.run import checkpoint, programs, progress, run_folder
 from jaxsafe.run.arguments import compose
-from jaxsafe.run.settings import Settings, nested, settings_from_options, to_plain
+from jaxsafe.run.plain import to_plain
+from jaxsafe.run.settings import Settings, nested, settings_from_options
 from jaxsafe.run.sweep_plan import Sweep, plan
 
 TINY: dict[str, Any] = {

@@ -1,10 +1,13 @@
-"""Contacts for engine `jax`: as MuJoCo's in C, where MJX has others.
+"""Contacts for engine `jax` as MuJoCo finds them, for the pairs of shapes where MJX finds others.
 
-MJX has no collision of a cylinder with a box, misses most of a box with an upright capsule, and is
-centimetres off where a cylinder meets a sphere or a capsule. Of a plane with an upright capsule its
-contact frame is another, of a box with a plane or a box its points are. Our collisions are registered
-with MJX when this module is imported. Only engine `jax` imports it. From then on they hold for every
-user of MJX in the process.
+    cylinder and box               MJX has no collision
+    capsule and box                it misses most contacts of an upright capsule
+    cylinder and sphere, capsule   it is centimetres off
+    plane and capsule              it has another contact frame if the capsule is upright
+    box and plane, box             it has other points
+
+Our collisions are registered with MJX when this module is imported. Only engine `jax` imports it. From
+then on they hold for every user of MJX in the process.
 """
 
 from typing import Any
@@ -14,6 +17,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from mujoco.mjx._src import collision_driver, collision_primitive, math
+from mujoco.mjx._src.collision_types import GeomInfo
 from mujoco.mjx._src.types import GeomType
 
 from jaxsafe.envs.engines.jax import boxes, rods
@@ -27,7 +31,7 @@ CORNERS = np.array([[1.0, 1, 1], [-1, 1, 1], [-1, -1, 1], [1, -1, 1]])  # of a b
 
 
 @collider(ncon=2)
-def plane_capsule(plane: Any, capsule: Any) -> Collision:
+def plane_capsule(plane: GeomInfo, capsule: GeomInfo) -> Collision:
     """Contacts of a capsule's two ends, whose first tangent is the capsule's axis, as in C.
 
     MJX takes a fixed tangent once the axis is within 30 degrees of the normal; with pyramidal friction
@@ -44,31 +48,32 @@ def plane_capsule(plane: Any, capsule: Any) -> Collision:
 
 
 @collider(ncon=4)
-def plane_box(plane: Any, box: Any) -> Collision:
+def plane_box(plane: GeomInfo, box: GeomInfo) -> Collision:
     """Contacts of a box's four lower corners, as in C.
 
-    MJX has those only that are at most 1 mm higher than the lowest.
+    MJX only has the corners that are at most 1 mm higher than the lowest one.
     """
     normal = plane.mat[:, 2]
     corners = (CORNERS * box.size) @ box.mat.T
-    corners *= jnp.where(corners @ normal > 0, -1.0, 1.0)[:, None]
+    corners *= jnp.where(corners @ normal > 0, -1.0, 1.0)[:, None]  # the opposite one is lower
     dist = (box.pos - plane.pos + corners) @ normal
     pos = box.pos + corners - 0.5 * dist[:, None] * normal
     return dist, pos, jnp.tile(math.make_frame(normal), (4, 1, 1))
 
 
 @collider(ncon=1)
-def sphere_cylinder(sphere: Any, cylinder: Any) -> Collision:
+def sphere_cylinder(sphere: GeomInfo, cylinder: GeomInfo) -> Collision:
     """MJX's own, ten steps of a gradient descent, is up to 2 cm and 25 degrees off."""
     return ball_cylinder(sphere.pos, sphere.size[0], cylinder)
 
 
 @collider(ncon=1)
-def capsule_cylinder(capsule: Any, cylinder: Any) -> Collision:
-    """The contact of the ball around that point of the capsule's axis which is deepest in the cylinder.
+def capsule_cylinder(capsule: GeomInfo, cylinder: GeomInfo) -> Collision:
+    """The contact of the ball around the point of the capsule's axis that is deepest in the cylinder.
 
-    The depth is convex along the axis, so the point is where its slope changes sign, in the middle
-    where it is zero on a stretch. (MJX's own is a gradient descent, too.)
+    The distance from the cylinder is convex along the axis. So that point is where its slope changes
+    sign. Where the slope is 0 on a stretch, it is the middle of the stretch. (MJX's own is a gradient
+    descent, too.)
     """
     axis, half = capsule.mat[:, 2], capsule.size[1]
 
@@ -87,13 +92,13 @@ def capsule_cylinder(capsule: Any, cylinder: Any) -> Collision:
     return ball_cylinder(capsule.pos + deepest * axis, capsule.size[0], cylinder)
 
 
-def ball_cylinder(centre: jax.Array, radius: jax.Array, cylinder: Any) -> Collision:
+def ball_cylinder(centre: jax.Array, radius: jax.Array, cylinder: GeomInfo) -> Collision:
     outside, out = from_cylinder(centre, cylinder)
     dist = outside - radius
     return dist, centre - out * (radius + dist / 2), math.make_frame(-out)
 
 
-def from_cylinder(point: jax.Array, cylinder: Any) -> tuple[jax.Array, jax.Array]:
+def from_cylinder(point: jax.Array, cylinder: GeomInfo) -> tuple[jax.Array, jax.Array]:
     """How far `point` is outside a cylinder (m), and the direction away from it [3]."""
     axis, from_centre = cylinder.mat[:, 2], point - cylinder.pos
     height = from_centre.dot(axis)
@@ -108,17 +113,17 @@ def from_cylinder(point: jax.Array, cylinder: Any) -> tuple[jax.Array, jax.Array
 
 
 @collider(ncon=2)
-def cylinder_box(cylinder: Any, box: Any) -> Collision:
+def cylinder_box(cylinder: GeomInfo, box: GeomInfo) -> Collision:
     return rod_and_box(cylinder, box, round_ends=False)
 
 
 @collider(ncon=2)
-def capsule_box(capsule: Any, box: Any) -> Collision:
-    """MJX's own finds most contacts of a box with an upright capsule not at all."""
+def capsule_box(capsule: GeomInfo, box: GeomInfo) -> Collision:
+    """MJX's own misses most contacts of a box with an upright capsule."""
     return rod_and_box(capsule, box, round_ends=True)
 
 
-def rod_and_box(shape: Any, box: Any, round_ends: bool) -> Collision:
+def rod_and_box(shape: GeomInfo, box: GeomInfo, round_ends: bool) -> Collision:
     centre, axis = box.mat.T @ (shape.pos - box.pos), box.mat.T @ shape.mat[:, 2]
     rod = rods.Rod(centre, axis, shape.size[0], shape.size[1], round_ends)
     found = rods.touching(rod, box.size)
@@ -131,7 +136,7 @@ def rod_and_box(shape: Any, box: Any, round_ends: bool) -> Collision:
 
 
 @collider(ncon=boxes.MOST)
-def box_box(one: Any, two: Any) -> Collision:
+def box_box(one: GeomInfo, two: GeomInfo) -> Collision:
     """The contacts of two boxes that MuJoCo finds; MJX's own are other points."""
     turn, away = one.mat.T @ two.mat, one.mat.T @ (two.pos - one.pos)
     found = boxes.touching(boxes.Boxes(turn, away, one.size, two.size))

@@ -53,17 +53,17 @@ class Rod(NamedTuple):
 
 
 class Gap(NamedTuple):
-    """Closest points of a thinner rod and of the box, [3] each."""
+    """The closest points of a thinner rod and of the box, [3] each: one of each."""
 
     on_rod: jax.Array
     on_box: jax.Array
 
 
 class Normal(NamedTuple):
-    """n, and how it lies to the rod.
+    """n [3], and how it lies to the rod.
 
-    lean: cosine to the rod's axis. across: [3], what of n is square to it. flat: bool [], the rod's
-    side lies along the face of which n is the normal.
+    lean: its cosine to the rod's axis. across: [3], its part square to that axis. flat: bool [], the
+    rod's side lies along the face of which n is the normal.
     """
 
     n: jax.Array
@@ -104,12 +104,13 @@ def touching(rod: Rod, extent: jax.Array) -> Points:
     part = on_box(rod, normal, rod.centre + side, extent)
     twice = normal.flat & part.lies
 
+    # where on its axis the rod touches once: by the closest point, on an edge, or at an end
     once = jnp.clip((gaps[0].on_box - rod.centre).dot(rod.axis), -rod.half, rod.half)
     once = jnp.where(part.lies, part.high, once)
     once = jnp.where(jnp.abs(normal.lean) > FLAT, jnp.sign(normal.lean) * rod.half, once)
     ends = jnp.where(twice, jnp.stack([part.low, part.high]), once)
     beside = rod.centre + side
-    over = -beside @ n - ends * normal.lean - jnp.abs(n) @ extent  # of the ends, from the face
+    over = -beside @ n - ends * normal.lean - jnp.abs(n) @ extent  # how far each end is off the face
     ends = jnp.where(twice & (over > 0), ends[over.argmin()], ends)
     dists = jnp.where(twice, jnp.where(over > 0, over.min(), over), dist)
 

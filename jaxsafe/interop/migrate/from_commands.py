@@ -3,9 +3,9 @@
     jaxsafe migrate ambs "python train.py --task safetygym_Safexp-PointGoal1-v0 --run.steps 500000"
     jaxsafe migrate alf "python -m alf.bin.train --conf seditor_safety_gym_conf.py --conf_param=..."
 
-Of SEditor's configs the first has `algo=seditor` and the one without an editor `algo=sac_lag`, each on
-SEditor's own tasks. A command of AMBS has `algo=ambs` with the preset of its penalty, and pictures or
-vectors, as its configs say.
+SEditor's config becomes `algo=seditor`, and its config without an editor `algo=sac_lag`, each on
+SEditor's own tasks. A command of AMBS becomes `algo=ambs` with the preset of its penalty, and pictures
+or vectors, as its configs say.
 Source: the READMEs and configs of sacktock/AMBS @5184901 and hnyu/seditor @f78b720.
 """
 
@@ -28,7 +28,7 @@ PICTURES: dict[str, Any] = {  # its safetygym_vision, which sees nothing else
 }  # fmt: skip
 STEPS: dict[str, Any] = {"total_steps": 5_000_000}  # of its configs for Safety Gym
 EDITED = STEPS | {"algo": "seditor", "preset": "published"}
-ALONE = STEPS | {"algo": "sac_lag", "num_envs": 32, "algo.cost_limit": 0.5}  # 5e-4 in 1,000 steps
+ALONE = STEPS | {"algo": "sac_lag", "num_envs": 32, "algo.cost_limit": 0.5}  # 5e-4 a step, of 1,000
 
 
 def never(value: Any) -> bool:
@@ -41,7 +41,7 @@ class Flag(NamedTuple):
 
     turn: Callable[[Any], dict[str, Any]] = lambda value: {}
     note: str = ""
-    lost: Callable[[Any], Any] = lambda value: True
+    lost: Callable[[Any], bool] = lambda value: True
 
 
 def ambs_task(value: str) -> dict[str, Any]:
@@ -177,7 +177,7 @@ def turned(flags: dict[str, Any], rules: dict[str, Flag]) -> tuple[dict[str, Any
         options = rule.turn(value)
         found |= options
         text = " ".join(as_option(k, v) for k, v in options.items()) or rule.note
-        lines.append(Line(name, value, text, lost=not options and bool(rule.lost(value))))
+        lines.append(Line(name, value, text, lost=not options and rule.lost(value)))
     return found, lines
 
 

@@ -1,4 +1,4 @@
-"""Keys with which OmniSafe's model-based algorithms do otherwise than its on-policy ones."""
+"""Keys of OmniSafe's model-based algorithms that its on-policy ones lack or read otherwise."""
 
 import math
 from typing import Any
@@ -17,7 +17,7 @@ DECIDES = "the algorithm decides"
 
 
 def planner_steps(option: str) -> Translate:
-    """Of what OmniSafe counts in raw steps, and we in steps of the planner."""
+    """For what OmniSafe counts in raw steps, and we in steps of the planner."""
 
     def turn(value: Any, facts: Facts) -> dict[str, Any]:
         steps = round(convert(value, int, option) / facts.repeat)
@@ -50,8 +50,8 @@ def momentum(value: Any, facts: Facts) -> dict[str, Any]:
 
 
 def ensemble(value: Any, facts: Facts) -> dict[str, Any] | None:
-    """Of num_ensemble and num_particles. PETS and its kin share the particles among the models, in LOOP
-    each model has as many."""
+    """From num_ensemble and num_particles. PETS and its kin share the particles among the models. In
+    LOOP each model has as many."""
     models = facts.whole("dynamics_cfgs.num_ensemble", 5)
     each = facts.options["algo.particles"]
     if LOOPS in facts.options:
@@ -65,7 +65,8 @@ def ensemble(value: Any, facts: Facts) -> dict[str, Any] | None:
 
 
 def plan(value: Any, facts: Facts) -> dict[str, Any]:
-    """Of plan_horizon, H, and temperature, which weighs a return that is 1000 / H as large there."""
+    """From plan_horizon, which is H, and temperature. There it weighs 1000 / H times the return of a
+    plan, and here the return itself."""
     steps = facts.whole("planner_cfgs.plan_horizon", facts.options["algo.plan_steps"])
     found: dict[str, Any] = {"algo.plan_steps": steps}
     if LOOPS in facts.options:
@@ -83,7 +84,7 @@ def actor_plans(value: Any, facts: Facts) -> dict[str, Any]:
 
 
 def beside(value: Any, facts: Facts) -> dict[str, Any] | None:
-    """Of LOOP's update_policy_cycle, update_policy_iters and policy_batch_size."""
+    """From LOOP's update_policy_cycle, update_policy_iters and policy_batch_size."""
     every = max(1, facts.whole("algo_cfgs.update_policy_cycle", 250) // facts.repeat)
     batch = facts.whole("algo_cfgs.policy_batch_size", 256)
     replayed = facts.whole("algo_cfgs.update_policy_iters", 50) * batch
@@ -122,7 +123,7 @@ MODEL_BASED: dict[str, Rule] = ON_POLICY | {
     },
     "train_cfgs.vector_env_nums": Rule("num_envs"),
     "algo_cfgs.action_repeat": Rule(
-        "env.wrap.action_repeat", "a step of the planner; all settings of the algorithm count these"
+        REPEAT, "a step of the planner; all settings of the algorithm count these"
     ),
     "algo_cfgs.steps_per_epoch": computed(
         "algo.dual_every",

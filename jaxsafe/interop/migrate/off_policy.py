@@ -1,4 +1,4 @@
-"""Keys with which OmniSafe's off-policy algorithms do otherwise than its on-policy ones."""
+"""Keys of OmniSafe's off-policy algorithms that its on-policy ones lack or read otherwise."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ DUAL_EVERY = PriceClockConfig.dual_every
 
 
 def rounds(value: Any, facts: Facts) -> dict[str, Any] | None:
-    """Of vector_env_nums, update_cycle, update_iters, size and batch_size. OmniSafe's size and
+    """From vector_env_nums, update_cycle, update_iters, size and batch_size. OmniSafe's size and
     batch_size are those of each environment."""
     envs_there = facts.whole("train_cfgs.vector_env_nums", 1)
     cycle = facts.whole("algo_cfgs.update_cycle", 1)
@@ -65,7 +65,7 @@ def epochs(value: Any, facts: Facts) -> dict[str, Any]:
 
 
 def hottest(value: Any, facts: Facts) -> dict[str, Any] | None:
-    """Of a range whose two ends are one number here."""
+    """The higher or the lower end of a range, which is one number here."""
     ends = [facts.values.get(f"opt_s.temperature.{end}", value) for end in ("min", "max")]
     return {"algo.temperature": value} if ends[0] == ends[1] else None
 

@@ -1,4 +1,4 @@
-"""Keys with which OmniSafe's offline algorithms do otherwise than its on-policy ones."""
+"""Keys of OmniSafe's offline algorithms that its on-policy ones lack or read otherwise."""
 
 from typing import Any
 

@@ -5,13 +5,14 @@ from typing import Any
 
 from jaxsafe.config import convert
 from jaxsafe.interop.migrate.rules import Facts, Rule, always, computed, ignored, named, switch
+from jaxsafe.learn.timetable import divisors
 
 EPISODE = 1000  # steps
 NETWORK = "one option for policy and critics"
 
 
 def batch(value: Any, facts: Facts) -> dict[str, Any]:
-    """Of steps_per_epoch, batch_size and window_lens.
+    """From steps_per_epoch, batch_size and window_lens.
 
     steps_per_epoch becomes environments side by side, with whole episodes. batch_size becomes the
     number of minibatches that divides the batch and comes nearest. window_lens counts episodes;
@@ -22,8 +23,7 @@ def batch(value: Any, facts: Facts) -> dict[str, Any]:
     horizon = min(steps, EPISODE)
     num_envs = math.ceil(steps / horizon)
     total = num_envs * horizon
-    divisors = [m for m in range(1, total + 1) if total % m == 0]
-    minibatches = min(divisors, key=lambda m: abs(math.log(m * size / total)))
+    minibatches = min(divisors(total), key=lambda m: abs(math.log(m * size / total)))
     episodes = facts.whole("logger_cfgs.window_lens", 100)
     return {
         "num_envs": num_envs,
@@ -54,7 +54,8 @@ def budget(value: Any, facts: Facts) -> dict[str, Any]:
     return {"algo.budget_init": convert(value, float, "algo_cfgs.safety_budget") / upper}
 
 
-ON_POLICY: dict[str, Rule] = {  # later keys win
+# Where two keys of a file set one option, the key that is later here wins.
+ON_POLICY: dict[str, Rule] = {
     "algo": Rule("algo", "see the names"),
     "env_id": Rule("env env.rules", "see the names"),
     "exp_name": ignored("run_dir names a run's folder"),
