@@ -163,6 +163,7 @@ def off_policy(
         keys = jax.random.split(rounds_key, table.rounds)
         ts, rounds = jax.lax.scan(one_round, ts, (jnp.arange(table.rounds), keys))
         ts, refitted = refit(ts, shared, jax.random.fold_in(rounds_key, table.rounds))
+        # an environment without costs has leaves of size 0, whose first axis cannot be -1
         steps = jax.tree.map(lambda x: x.reshape(math.prod(x.shape[:2]), *x.shape[2:]), rounds.steps)
         length, lost_time = expected_length(
             ts.lost_time, env.episode_length, steps, steps.real.sum(), axis_name

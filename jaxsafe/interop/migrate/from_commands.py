@@ -19,14 +19,14 @@ from jaxsafe.config import ConfigError, Seed, convert, nearest
 from jaxsafe.interop.migrate.found import Line, Migrated, as_option
 from jaxsafe.run.settings import nested, settings_from_options
 
-AMBS_REPEAT = 2  # raw steps in a step, of its safetygym configs
-# its networks, and ours of about as many parameters
+AMBS_REPEAT = 2  # raw steps in a step, of AMBS's safetygym configs
+# the networks of AMBS, and ours of about as many parameters
 AMBS_SIZES = {"small": "12m", "medium": "50m", "large": "100m", "xlarge": "200m"}
-PICTURES: dict[str, Any] = {  # its safetygym_vision, which sees nothing else
+PICTURES: dict[str, Any] = {  # AMBS's safetygym_vision, which sees nothing else
     "env.observe_vision": True, "env.vision_size": [64, 64], "algo.encoder": "cnn",
     "algo.replay_ratio": 512,
 }  # fmt: skip
-STEPS: dict[str, Any] = {"total_steps": 5_000_000}  # of its configs for Safety Gym
+STEPS: dict[str, Any] = {"total_steps": 5_000_000}  # of SEditor's configs for Safety Gym
 EDITED = STEPS | {"algo": "seditor", "preset": "published"}
 ALONE = STEPS | {"algo": "sac_lag", "num_envs": 32, "algo.cost_limit": 0.5}  # 5e-4 a step, of 1,000
 
