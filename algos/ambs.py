@@ -44,7 +44,8 @@ class AMBSConfig(dreamer.DreamerConfig):
         p(s)  = share of m dreams of pi from s with  R > C discount^T,   R = sum of discounted costs
         act by pi_safe if  p(s) > delta - eps,   else by pi
         or, with rule=binomial, if  P(B <= m p(s)) > confidence,   B binomial: m draws at delta
-        c     = C where a step has a violation, else 0;   y says whether it has none
+        c     = C where a step has a violation, else 0;   y = 1 if it has none, else 0
+        k     = 1 if the episode goes on from a state, else 0
         R     = c_1 + discount k_1 (c_2 + .. c_H + discount k_H min_i V_i(s_H)),   H < T
         V_i   : returns of c under pi, cut at the first violation, discount k y
         pi_safe climbs -c,   pi climbs Dreamer's A, with  w A + penalty_coef A_pen
@@ -164,8 +165,8 @@ def penalised(found: Advantages, cfg: Any) -> jax.Array:
             change = -found.cost[1:] + found.value_safe[1:] - found.value_safe[:-1]
             weight = jnp.clip(jnp.exp(jnp.minimum(change, 0.0)), 1e-6, 1.0)
         case "copt":
-            unsafe = jax.nn.sigmoid(cfg.kappa * (found.returns_c - threshold(cfg)))
-            weight = 1.0 - fixed(unsafe)
+            violates = jax.nn.sigmoid(cfg.kappa * (found.returns_c - threshold(cfg)))
+            weight = 1.0 - fixed(violates)
     return weight * found.reward + cfg.penalty_coef * found.penalty
 
 
@@ -331,17 +332,17 @@ def true_risk(
 
 
 def overrules(p: jax.Array, cfg: Any) -> jax.Array:
-    """Whether the shield acts where a share `p` of the dreams is unsafe, bool []. A `delta` above 1
-    turns it off."""
+    """Whether the shield acts where a share `p` of the dreams is unsafe, bool []. An infinite
+    `delta` turns it off."""
     if cfg.rule == "hoeffding":
         return p > cfg.delta - cfg.eps
     m = cfg.shield_rollouts
-    unsafe = jnp.round(p * m)
-    # P(B <= unsafe), of a binomial with m draws at delta
+    count = jnp.round(p * m)
+    # P(B <= count), of a binomial with m draws at delta
     likely = jax.scipy.special.betainc(
-        jnp.maximum(m - unsafe, 1.0), unsafe + 1, 1 - jnp.minimum(cfg.delta, 1.0)
+        jnp.maximum(m - count, 1.0), count + 1, 1 - jnp.minimum(cfg.delta, 1.0)
     )
-    return (jnp.where(unsafe < m, likely, 1.0) > cfg.confidence) & (cfg.delta <= 1)
+    return (jnp.where(count < m, likely, 1.0) > cfg.confidence) & (cfg.delta <= 1)
 
 
 def shielded(env: Env, policy: Policy) -> Policy:
@@ -351,13 +352,20 @@ def shielded(env: Env, policy: Policy) -> Policy:
     def privileged(learned: Learned) -> bool:
         return learned.config.shield == "true_dynamics"
 
+    def keys_of(key: jax.Array | None) -> tuple[jax.Array | None, jax.Array | None, jax.Array]:
+        """Of both policies and of the dreams. The mean action has dreams, too."""
+        if key is None:
+            return None, None, jax.random.key(0)
+        act_key, shield_key = jax.random.split(key)
+        backup_key, dream_key = jax.random.split(shield_key)
+        return act_key, backup_key, dream_key
+
     def act(
         learned: Learned, carry: Memory, obs: Any, key: jax.Array | None
     ) -> tuple[jax.Array, Memory, dict[str, Any]]:
-        keys: Any = (None, None) if key is None else jax.random.split(key)
-        backup_key, dream_key = (None, jax.random.key(0)) if key is None else jax.random.split(keys[1])
+        act_key, backup_key, dream_key = keys_of(key)
         in_simulator = privileged(learned)
-        proposed, after, said = policy.act(learned, carry, obs.obs if in_simulator else obs, keys[0])
+        proposed, after, said = policy.act(learned, carry, obs.obs if in_simulator else obs, act_key)
         if in_simulator:
             p = true_risk(env, learned, after.latent, proposed, obs, dream_key)
         else:
