@@ -423,7 +423,7 @@ def render(
 
     Raises:
         ConfigError: no run folder, no checkpoint yet, no such policy, another kind of file, or an
-            environment that cannot be drawn: neither Safety Gym's nor a velocity task.
+            environment that cannot be drawn: neither Safety Gym's nor a velocity nor a racing task.
         jaxsafe.report.film.NoVideo: this machine can draw nothing: no EGL, OSMesa or display.
     """
     run = run if isinstance(run, Run) else Run(run)

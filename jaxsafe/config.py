@@ -54,6 +54,7 @@ FINITE = Bounds(-sys.float_info.max, sys.float_info.max)  # of a number without 
 Amount = Annotated[int, Bounds(1, 2**24)]  # of what exists side by side
 RunSteps = Annotated[int, Bounds(1, 10**15)]  # of a whole run
 Iterations = Annotated[int, Bounds(1, 10_000)]  # of a solver, of passes over a batch, of a window
+Pixels = tuple[Annotated[int, Bounds(1, 10_000)], Annotated[int, Bounds(1, 10_000)]]  # width, height
 Period = Annotated[int, Bounds(0, 10**15)]  # steps or iterations; 0 is never
 Devices = Annotated[int, Bounds(1, 2**16)]  # or processes
 EpisodeCount = Annotated[int, Bounds(1, 10**6)]

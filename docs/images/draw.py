@@ -14,6 +14,7 @@ import numpy as np
 from PIL import Image
 
 from jaxsafe import envs
+from jaxsafe.envs.racing.car import parked
 from jaxsafe.envs.safety_gym.suite import ROBOTS, TASKS
 from jaxsafe.envs.velocity import suite as velocities
 from jaxsafe.envs.view import render
@@ -81,6 +82,20 @@ def draw_velocity(name: str) -> None:
     imageio.imwrite(path, smooth.round().astype(np.uint8), quality=88)
 
 
+def draw_racing(name: str) -> None:
+    """Before an obstacle in a bend: a frame of a film, and the picture that a policy sees, enlarged."""
+    env = envs.make(name, observe_vision=True)
+    state = jax.jit(env.reset)(jax.random.split(jax.random.key(0), 6)[1])
+    world, tile = state.physics, 35
+    along = world.track.direction(tile)
+    car = parked(world.track.point(tile), jax.numpy.arctan2(along[1], along[0]))
+    world = world.replace(car=car)
+    seen = jax.jit(lambda world: env.observe(world, tile)["vision"])(world)
+    large = np.asarray(seen).repeat(3, 0).repeat(3, 1).repeat(3, 2)
+    frame = render.Aerial(432, 288).frame(state.replace(physics=world))
+    imageio.imwrite(HERE / "environments" / f"{name}.png", render.beside(frame, large))
+
+
 def draw_policy(run: Path, seed: int, begin: int) -> None:
     """A part of an episode of the policy in `run`, from step `begin` on, as a small GIF."""
     policy = open_run(run).one(0)
@@ -112,3 +127,4 @@ if __name__ == "__main__":
             draw_small(name)
         for name in velocities.suite():
             draw_velocity(name)
+        draw_racing("car_racing1")

@@ -7,9 +7,10 @@
 Source: `SafeCarRacing0-v0` and `SafeCarRacing1-v0` of Yu, Xu and Zhang (2022), "Towards Safe
 Reinforcement Learning with a Safety Editor Policy", in HorizonRobotics/alf @23aca49.
 Differs from it: this is a stand-in. There Box2D moves the car and Gymnasium's CarRacing makes the
-track; here car.py and track.py do. There the agent also sees a picture of 96 x 96 pixels; here it sees
-the road ahead as numbers. Wheels are points here. One tile in each stretch of ten has an obstacle, and
-the start is free; there the tiles of obstacles are drawn at random, at least five apart.
+track; here car.py and track.py do, and picture.py draws what OpenGL does there. There the agent always
+sees a picture; here that is an option, and by default it sees the road ahead as numbers. Wheels are
+points here. One tile in each stretch of ten has an obstacle, and the start is free; there the tiles of
+obstacles are drawn at random, at least five apart.
 """
 
 from dataclasses import dataclass
@@ -20,35 +21,17 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
-from jaxsafe.config import Amount, Bounds
+from jaxsafe.config import Amount, Bounds, Pixels
 from jaxsafe.envs.plain import PlainEnv
-from jaxsafe.envs.racing.car import OFF_ROAD, Car, drive, length, parked, rolling, rotated, wheels
-from jaxsafe.envs.racing.track import (
-    HALF_WIDTH,
-    MOST_TILES,
-    TILE,
-    Track,
-    locate,
-    on_road,
-    random_track,
-)
-from jaxsafe.types import State
+from jaxsafe.envs.racing.car import DT, OFF_ROAD, Car, drive, length, parked, rolling, rotated, wheels
+from jaxsafe.envs.racing.obstacles import Obstacles, centre, touching
+from jaxsafe.envs.racing.picture import picture
+from jaxsafe.envs.racing.track import HALF_WIDTH, MOST_TILES, Track, locate, on_road, random_track
+from jaxsafe.types import PyTree, State
 
+STATUS = 11  # numbers of the car itself
 AHEAD = 12  # centres of tiles that are seen, every second one from the car's own
 NEXT = 3  # obstacles that are seen
-
-
-@flax.struct.dataclass
-class Obstacles:
-    """Rectangles across the road, as long as a tile.
-
-    tile: int32 [M]. left: [M], m, how far their centres are to the left of the middle of the road.
-    half_width: [M], m; negative for those that are not there.
-    """
-
-    tile: jax.Array
-    left: jax.Array
-    half_width: jax.Array
 
 
 @flax.struct.dataclass
@@ -78,6 +61,8 @@ class CarRacing(PlainEnv):
         in the car's frame (m), x to the front and y to the left, the centres of the nearest tile and
         of the 2nd, 4th, ..., 22nd after it;
         of the next three obstacles, from the tile behind the car on: x, y and half the width (m).
+    With `observe_vision` a dict: 'vector', float [11], the first 11 of these, and 'vision', uint8
+        [height, width, 1], the road from above.
     Action [3] in [-1, 1]: steering, positive to the right; gas and brake, from -1 (none) to 1 (all).
 
     It terminates when all tiles are visited. `info` has `tiles`, the share of the tiles that is visited
@@ -86,12 +71,16 @@ class CarRacing(PlainEnv):
 
     obstacle_every: Annotated[int, Bounds(0, 20)] = 0  # tiles; 0: there are no obstacles
     num_steps: Amount = 1000  # time limit, of steps of 0.02 s
+    observe_vision: bool = False  # a dict: vision, a grey picture, and vector, the car's own 11 numbers
+    vision_size: Pixels = (96, 96)  # width and height of the picture
 
     action_size = 3
+    step_seconds = DT
 
     @property
     def obs_size(self) -> int:
-        return 11 + 2 * AHEAD + (3 * NEXT if self.obstacle_every else 0)
+        road = 2 * AHEAD + (3 * NEXT if self.obstacle_every else 0)
+        return STATUS + (0 if self.observe_vision else road)
 
     @property
     def cost_names(self) -> tuple[str, ...]:
@@ -166,13 +155,16 @@ class CarRacing(PlainEnv):
         there = stretch < track.count // every
         return Obstacles(stretch * every + within, side * HALF_WIDTH / 2, jnp.where(there, width, -1.0))
 
-    def observe(self, world: World, tile: jax.Array) -> jax.Array:
+    def observe(self, world: World, tile: jax.Array) -> PyTree:
         car, track, obstacles = world.car, world.track, world.obstacles
         angles = car.steer * jnp.array([1.0, 1.0, 0.0, 0.0])
         remaining = 1 - world.visited.sum() / track.count
         own = jnp.stack([length(car.velocity), car.spin, remaining])
-        road = track.point(tile + 2 * jnp.arange(AHEAD))
-        parts = [rolling(car), angles, own, seen(car, road)]
+        status = jnp.concatenate([rolling(car), angles, own])
+        if self.observe_vision:
+            vision = picture(car, track, obstacles, self.vision_size)
+            return {"vector": status, "vision": vision[..., None]}
+        parts = [status, seen(car, track.point(tile + 2 * jnp.arange(AHEAD)))]
         if self.obstacle_every:
             far = (obstacles.tile - tile + 1) % track.count  # tiles, from the one behind the car on
             far = jnp.where(obstacles.half_width > 0, far, MOST_TILES)
@@ -181,22 +173,6 @@ class CarRacing(PlainEnv):
             centres = seen(car, centre(track, obstacles)[near]).reshape(NEXT, 2)
             parts.append(jnp.concatenate([centres, half_width], 1).reshape(-1))
         return jnp.concatenate(parts)
-
-
-def centre(track: Track, obstacles: Obstacles) -> jax.Array:
-    """Of obstacles [M, 2], m."""
-    along = track.direction(obstacles.tile)
-    across = jnp.stack([-along[:, 1], along[:, 0]], 1)
-    return track.point(obstacles.tile) + obstacles.left[:, None] * across
-
-
-def touching(track: Track, obstacles: Obstacles, points: jax.Array) -> jax.Array:
-    """Whether one of `points` [n, 2] is on each obstacle: bool [M]."""
-    along = track.direction(obstacles.tile)
-    x, y = jnp.moveaxis(points[:, None] - centre(track, obstacles), -1, 0)  # [n, M]
-    forward = along[:, 0] * x + along[:, 1] * y
-    across = along[:, 0] * y - along[:, 1] * x
-    return ((jnp.abs(forward) <= TILE / 2) & (jnp.abs(across) <= obstacles.half_width)).any(0)
 
 
 def seen(car: Car, points: jax.Array) -> jax.Array:

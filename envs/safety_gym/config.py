@@ -13,6 +13,7 @@ from jaxsafe.config import (
     Amount,
     Bounds,
     ConfigError,
+    Pixels,
     Real,
     Share,
     Weight,
@@ -31,7 +32,6 @@ Point2 = tuple[Coordinate, Coordinate]
 Rectangle = tuple[Coordinate, Coordinate, Coordinate, Coordinate]  # xmin, ymin, xmax, ymax (m)
 Rectangles = tuple[Rectangle, ...]
 Points = tuple[Point2, ...]
-Pixels = tuple[Annotated[int, Bounds(1, 10_000)], Annotated[int, Bounds(1, 10_000)]]  # width, height
 
 TASKS = ("goal", "button", "push", "x", "z", "circle", "run", "none")
 # Observations that Safety-Gymnasium does not have.

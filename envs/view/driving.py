@@ -3,6 +3,7 @@
 import numpy as np
 
 from jaxsafe.config import ConfigError
+from jaxsafe.envs.racing.task import CarRacing
 from jaxsafe.envs.safety_gym import scene
 from jaxsafe.envs.safety_gym.task import SafetyGym
 from jaxsafe.envs.velocity.task import Velocity
@@ -34,12 +35,14 @@ TURN = {
 }
 
 
-def drivable(env: SafetyGym | Velocity) -> SafetyGym:
+def drivable(env: SafetyGym | Velocity | CarRacing) -> SafetyGym:
     """`env` itself.
 
     Raises:
         ConfigError: a robot that no keys are known for.
     """
+    if isinstance(env, CarRacing):
+        raise ConfigError(f"racing: keys drive {', '.join(FRONT)} alone; a film shows it")
     if isinstance(env, Velocity):
         raise ConfigError(
             f"env.robot={env.config.robot!r}: keys drive {', '.join(FRONT)} alone; a film shows it"

@@ -1,4 +1,4 @@
-"""Frames and films of an episode, drawn by MuJoCo off screen."""
+"""Frames and films of an episode. MuJoCo draws them off screen; those of racing tasks JAX draws."""
 
 import os
 from collections.abc import Sequence
@@ -13,20 +13,22 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from jaxsafe.config import ConfigError, nearest
+from jaxsafe.envs.racing.picture import COLOURS, picture
+from jaxsafe.envs.racing.task import CarRacing, World
 from jaxsafe.envs.safety_gym.task import SafetyGym
 from jaxsafe.envs.velocity.task import Velocity
 from jaxsafe.envs.view.backend import gl_context
 from jaxsafe.envs.view.stage import drawable, stage_of
 from jaxsafe.envs.wrap import raw_steps
 from jaxsafe.learn.acting import Player, Playing
-from jaxsafe.types import State
+from jaxsafe.types import Env, State
 
 FPS = 30
 CAPTION, GAP = 24, 4  # height of the line over a labelled frame, width between two panels, pixels
 
 
 class Renderer:
-    """Draws states of `env`: `frame(state)`.
+    """Draws states of one of Safety Gym's environments or a velocity task: `frame(state)`.
 
     Args:
         width, height: of a frame, pixels.
@@ -34,7 +36,7 @@ class Renderer:
             it), or an MjvCamera.
     Raises:
         NoDisplay: this machine has neither EGL nor OSMesa nor a display.
-        ConfigError: an unknown camera, or an environment that cannot be drawn.
+        ConfigError: an unknown camera.
     """
 
     def __init__(
@@ -75,6 +77,38 @@ class Renderer:
         return frame if seen is None else beside(frame, seen)
 
 
+class Aerial:
+    """Draws states of a racing task from above, in colours: `frame(state)`. It needs no display.
+
+    Args:
+        width, height: of a frame, pixels.
+    """
+
+    def __init__(self, width: int = 600, height: int = 400):
+        kinds = np.arange(len(COLOURS), dtype=np.uint8)
+
+        def draw(world: World) -> jax.Array:
+            return picture(world.car, world.track, world.obstacles, (width, height), kinds)
+
+        self._draw = jax.jit(draw)
+
+    def frame(self, state: State, overruled: bool = False) -> np.ndarray:
+        """The picture of one state, uint8 [height, width, 3], with the light of a shield."""
+        frame = COLOURS[np.asarray(self._draw(state.physics))]
+        return with_light(frame) if overruled else frame
+
+
+def renderer_of(env: Any, **options: Any) -> Renderer | Aerial:
+    """What draws states of `env`, by the options of its class.
+
+    Raises:
+        NoDisplay: as of `Renderer`.
+        ConfigError: an unknown camera, or an environment that cannot be drawn.
+    """
+    inside = drawable(env)
+    return Aerial(**options) if isinstance(inside, CarRacing) else Renderer(inside, **options)
+
+
 def named_camera(model: mujoco.MjModel, name: str) -> mujoco.MjvCamera:
     names = [model.camera(i).name for i in range(model.ncam)]
     if name not in names:
@@ -86,7 +120,7 @@ def named_camera(model: mujoco.MjModel, name: str) -> mujoco.MjvCamera:
 
 
 def render_episode(
-    env: SafetyGym | Velocity,
+    env: Env,
     player: Player,
     key: jax.Array,
     length: int | None = None,
@@ -102,11 +136,12 @@ def render_episode(
         every: steps from a frame to the next; None is as near to real time at 30 frames a second as
             whole steps allow, and never less than one step.
         label: written above each frame, with the return and the cost so far.
-        renderer: arguments of `Renderer`.
+        renderer: arguments of what draws it, `Renderer` or `Aerial`.
     Raises:
         NoDisplay: this machine has neither EGL nor OSMesa nor a display.
+        ConfigError: an environment that cannot be drawn.
     """
-    draw = Renderer(env, **renderer)  # first: an episode is not worth simulating if it cannot be drawn
+    draw = renderer_of(env, **renderer)  # first, to refuse what cannot be drawn
     states, said = run_episode(player, key, length or env.episode_length)
     steps = len(states.terminated)
     ends = np.flatnonzero(states.ended)

@@ -14,6 +14,7 @@ from PIL import Image
 
 from jaxsafe.config import ConfigError
 from jaxsafe.envs import engines
+from jaxsafe.envs.racing.task import CarRacing
 from jaxsafe.envs.safety_gym import scene as scenes
 from jaxsafe.envs.safety_gym.arena import World
 from jaxsafe.envs.safety_gym.config import SafetyGymConfig
@@ -144,7 +145,7 @@ class Runway:
 
 
 def stage_of(env: SafetyGym | Velocity) -> Stage | Runway:
-    env = drawable(env)
+    env = innermost(env)
     return Runway(env) if isinstance(env, Velocity) else Stage(env)
 
 
@@ -155,16 +156,16 @@ def add_geom(geoms: mujoco.MjvScene, shape: mujoco.mjtGeom, size: Any, place: An
     geoms.ngeom += 1
 
 
-def drawable(env: Any) -> SafetyGym | Velocity:
+def drawable(env: Any) -> SafetyGym | Velocity | CarRacing:
     """`env` without its wrappers.
 
     Raises:
-        ConfigError: it is neither Safety Gym's nor a velocity task.
+        ConfigError: it is neither Safety Gym's nor a velocity nor a racing task.
     """
     inside = innermost(env)
-    if not isinstance(inside, SafetyGym | Velocity):
+    if not isinstance(inside, SafetyGym | Velocity | CarRacing):
         raise ConfigError(
-            "only Safety Gym's environments and velocity tasks can be drawn, not a "
+            "only Safety Gym's environments, velocity and racing tasks can be drawn, not a "
             f"{type(inside).__name__}"
         )
     return inside

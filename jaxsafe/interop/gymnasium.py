@@ -24,7 +24,7 @@ import numpy as np
 from jaxsafe import envs
 from jaxsafe.config import ConfigError
 from jaxsafe.envs.registry import IMPLIED
-from jaxsafe.envs.view.render import FPS, Renderer
+from jaxsafe.envs.view.render import FPS, Aerial, Renderer, renderer_of
 from jaxsafe.learn.observations import observation_like
 from jaxsafe.learn.rollout import RolloutState, init_rollout, restart
 from jaxsafe.types import Env, PyTree, State
@@ -224,12 +224,12 @@ def arrays(obs: PyTree) -> Any:
     return jax.tree.map(np.array, obs)
 
 
-def drawer(env: Env, render_mode: str | None) -> Renderer | None:
+def drawer(env: Env, render_mode: str | None) -> Renderer | Aerial | None:
     if render_mode is None:
         return None
     if render_mode != "rgb_array":
         raise ConfigError(f"render_mode={render_mode!r}: expected 'rgb_array' or None")
-    return Renderer(env)  # type: ignore[arg-type]
+    return renderer_of(env)
 
 
 def draw_key(rng: np.random.Generator) -> jax.Array:

@@ -39,7 +39,7 @@ def film(policies: list[RunPolicy], path: Path, seed: int, labels: list[str] | N
     key = jax.random.fold_in(jax.random.key(seed), 0x66696C6D)
     try:
         films = [
-            render.render_episode(a.env, a.player, key, label=label)  # type: ignore[arg-type]
+            render.render_episode(a.env, a.player, key, label=label)
             for a, label in zip(policies, labels or [None] * len(policies), strict=True)
         ]
     except NoDisplay as error:

@@ -1,5 +1,5 @@
 """The racing tasks: the car against closed forms, the properties of many tracks, rewards and costs at
-known poses, and a lap of a driver written by hand."""
+known poses, pictures whose pixels are worked out by hand, and a lap of a driver written by hand."""
 
 import functools
 from collections.abc import Callable
@@ -11,14 +11,30 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compiling import FAST
+from toys import START, reflex
 
 from jaxsafe import envs
+from jaxsafe.algos import ALGOS
 from jaxsafe.config import ConfigError
 from jaxsafe.envs.check import check_env
 from jaxsafe.envs.racing import car as cars
+from jaxsafe.envs.racing import picture as pictures
 from jaxsafe.envs.racing.car import AXLE, DRAG, DT, GRIP, MASS, MAX_STEER, SIDE, Car, wheels
-from jaxsafe.envs.racing.task import Obstacles
-from jaxsafe.envs.racing.track import HALF_WIDTH, MAX_CURVATURE, MOST_TILES, TILE, paved, shape
+from jaxsafe.envs.racing.obstacles import Obstacles, centre, touching
+from jaxsafe.envs.racing.picture import GRASS, GREYS, HULL, MOWN, OBSTACLE, TYRE
+from jaxsafe.envs.racing.picture import ROAD as PAVED
+from jaxsafe.envs.racing.task import World
+from jaxsafe.envs.racing.track import (
+    HALF_WIDTH,
+    MAX_CURVATURE,
+    MOST_TILES,
+    TILE,
+    locate,
+    on_road,
+    paved,
+    shape,
+)
+from jaxsafe.envs.view.render import Aerial, render_episode
 from jaxsafe.types import State
 
 TRACKS = 256
@@ -182,8 +198,9 @@ def stadium(level: int) -> State:
     return replace(state, physics=replace(world, track=track, obstacles=obstacles, visited=none))
 
 
-def put(state: State, x: float, y: float, speed: float = 0.0) -> State:
-    car = replace(rolling_at(speed), position=jnp.array([x, y], jnp.float32))
+def put(state: State, x: float, y: float, speed: float = 0.0, heading: float = 0.0) -> State:
+    place = {"position": jnp.array([x, y], jnp.float32), "heading": jnp.float32(heading)}
+    car = replace(rolling_at(speed), **place)
     return replace(state, physics=replace(state.physics, car=car))
 
 
@@ -258,6 +275,180 @@ def test_the_observation_is_what_the_docstring_says():
     np.testing.assert_array_equal(seen[:, 2], [1.5, 1.5, -1.0])
 
 
+# ---- pictures ----------------------------------------------------------------------------------
+
+SIZE = (96, 96)
+KINDS = np.arange(len(GREYS), dtype=np.uint8)
+
+
+@functools.partial(jax.jit, compiler_options=FAST)
+def drawn(world: World) -> jax.Array:
+    """What is in each pixel."""
+    return pictures.picture(world.car, world.track, world.obstacles, SIZE, KINDS)
+
+
+def tile_length() -> float:
+    return float(jnp.linalg.norm(stadium(1).physics.track.points[1]))
+
+
+def places(state: State) -> jax.Array:
+    """Where in the world the middles of the pixels are [96 * 96, 2]."""
+    car, (x, y) = state.physics.car, pictures.pixels(SIZE)
+    ahead = jnp.stack([*np.broadcast_arrays(x, y)], -1).reshape(-1, 2)
+    return car.position + cars.rotated(ahead, car.heading)
+
+
+def block(mask: np.ndarray) -> tuple[list[int], list[int]]:
+    """The rows and the columns of a rectangle of pixels."""
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    assert mask.sum() == len(rows) * len(columns)
+    return rows.tolist(), columns.tolist()
+
+
+def test_a_straight_road_is_where_a_ruler_puts_it():
+    """A pixel is 64.81 m / 96 = 0.675 m wide and 43.21 m / 96 = 0.450 m high, of which the car is at
+    (47.5, 71.5)."""
+    x = 10 * tile_length() - 15  # 15 m before the first obstacle, whose middle is 3.33 m to the left
+    seen = np.asarray(drawn(put(stadium(1), x, 0.0).physics))
+    assert (seen[0] == PAVED).nonzero()[0].tolist() == [*range(38, 58)]  # |47.5 - j| <= 6.67 / 0.675
+    # 13.25 to 16.75 m ahead, and 1.83 to 4.83 m to the left
+    assert block(seen == OBSTACLE) == ([*range(35, 43)], [*range(41, 45)])
+    wheels = block(
+        seen == TYRE
+    )  # 1.08 to 2.16 m before and behind the middle, 0.96 to 1.24 m beside it
+    assert wheels == ([67, 68, 69, 74, 75, 76], [46, 49])
+    assert (seen[[66, 71, 76], 47] == HULL).all() and (seen[[65, 78], 47] == PAVED).all()
+    # the lawn's squares of 16.67 m are light where x and y are in even ones: here x is 40.0 m, in the
+    # third, and y is in the first to the left of the road, and in the second from it to the right
+    row = round((32.41 - (40.0 - x)) / 0.4501 - 0.5)
+    assert (seen[row] == MOWN).nonzero()[0].tolist() == [*range(23, 38), *range(73, 96)]
+    assert (seen[0] != MOWN).all() and set(seen[0]) == {GRASS, PAVED}  # 52.4 m, in the fourth
+    assert GREYS.tolist() == [162, 177, 102, 84, 61, 0]
+
+
+def test_the_world_turns_right_where_the_car_turns_left():
+    x = 10 * tile_length() - 15
+    seen = np.asarray(drawn(put(stadium(1), x, 0.0, heading=0.2).physics))
+    far = (seen[40] == PAVED).nonzero()[0]  # 14.2 m ahead, where the road is 2.9 m to the right
+    assert far.mean() == pytest.approx(47.5 + 14.2 * np.tan(0.2) / 0.675, abs=1)
+    seen = np.asarray(drawn(put(stadium(1), x, 0.0, heading=np.pi / 2).physics))
+    road = np.isin(seen, (GRASS, MOWN), invert=True)[:, 18:]  # farther to the left it bends
+    assert block(road) == ([*range(57, 87)], [*range(78)])  # across
+    rows, columns = (seen == OBSTACLE).nonzero()
+    assert rows.mean() == pytest.approx(71.5 - 3.33 / 0.45, abs=0.5)
+    assert columns.mean() == pytest.approx(47.5 + 15 / 0.675, abs=0.5)
+
+
+def test_a_bend_is_a_ring_around_its_centre():
+    """The road of the stadium is at 40 m around (100, 40) there, to 4 cm of a chord."""
+    state = put(stadium(0), 100.0, 0.0, heading=0.1)
+    x, y = np.asarray(places(state), float).T
+    off = abs(np.hypot(x - 100, y - 40) - 40) - HALF_WIDTH
+    seen = np.asarray(drawn(state.physics)).reshape(-1)
+    clear = (x > 102) & (abs(off) > 0.1)
+    assert clear.sum() > 4000 and 500 < (off[clear] < 0).sum() < 3000
+    np.testing.assert_array_equal(np.isin(seen[clear], (GRASS, MOWN), invert=True), off[clear] < 0)
+
+
+def test_each_pixel_shows_what_a_wheel_there_would_meet():
+    rng = np.random.default_rng(0)
+
+    @functools.partial(jax.jit, compiler_options=FAST)
+    def met(world: World, points: jax.Array) -> tuple[jax.Array, jax.Array]:
+        hit = jax.vmap(lambda p: touching(world.track, world.obstacles, p[None]).any())(points)
+        return hit, on_road(locate(world.track, points)[1])
+
+    shown = 0
+    for i in range(12):
+        state = one(begun(), i)
+        track = state.physics.track
+        tile = rng.integers(int(track.count))
+        along = track.direction(tile)
+        x, y = np.asarray(track.point(tile)) + rng.normal(0, 8, 2)
+        state = put(state, x, y, heading=float(jnp.arctan2(along[1], along[0])) + rng.normal(0, 1))
+        seen = np.asarray(drawn(state.physics)).reshape(-1)
+        hit, on = met(state.physics, places(state))
+        expected = np.where(hit, OBSTACLE, np.where(on, PAVED, GRASS))
+        ground = np.where(seen == MOWN, GRASS, seen)
+        beside = (ground != expected) & ~np.isin(seen, (HULL, TYRE))
+        assert beside.sum() <= 2, i  # on a border, to the rounding of float32
+        shown += (seen == OBSTACLE).sum()
+    assert shown > 200
+
+
+def test_no_picture_has_more_tiles_or_obstacles_than_are_drawn():
+    radius = np.hypot(pictures.WIDTH, pictures.HEIGHT) / 2 + pictures.REACH
+    world = begun().physics
+    middles = np.asarray(jax.vmap(centre)(world.track, world.obstacles))
+    kept = pictures.obstacles_drawn(middles.shape[1])
+    assert kept == 12
+    grid = np.stack(np.meshgrid(*[np.arange(-150.0, 151, 10)] * 2), -1)  # of pictures' middles
+    most = [0, 0]
+    for i in range(TRACKS):
+        tiles = world.track.points[i, : world.track.count[i]]
+        there = middles[i][world.obstacles.half_width[i] > 0]
+        for k, things in enumerate((tiles, there)):
+            squares = np.square(grid[..., None, :] - things).sum(-1)
+            most[k] = max(most[k], (squares < radius**2).sum(-1).max())
+    assert 40 < most[0] <= pictures.TILES and 5 < most[1] <= kept, most
+
+
+def test_a_picture_belongs_to_the_new_state_and_films_show_it_in_colours():
+    env = envs.make("car_racing1", observe_vision=True, vision_size=SIZE, num_steps=4)
+    assert check_env(env, "racing") is env and env.obs_size == 11
+    step = jax.jit(env.step, compiler_options=FAST)
+    state = put(stadium(1), 0.0, 0.0, 60.0)
+    blank = {"vector": jnp.zeros(11), "vision": jnp.zeros((96, 96, 1), jnp.uint8)}
+    before, after = state, step(replace(state, obs=blank), STILL)
+    vector = np.asarray(compiled(1)[2](state, STILL).obs)[:11]
+    np.testing.assert_allclose(after.obs["vector"], vector, rtol=1e-6)
+    assert after.physics.car.position[0] > 1
+    kinds = np.asarray(drawn(after.physics))
+    np.testing.assert_array_equal(after.obs["vision"], GREYS[kinds][..., None])
+    assert (np.asarray(drawn(before.physics)) != kinds).any()
+    aerial, shown = Aerial(*SIZE), pictures.COLOURS[kinds]
+    np.testing.assert_array_equal(aerial.frame(after), shown)
+    assert (aerial.frame(after, overruled=True) != shown).any(-1).sum() < 200  # a light in a corner
+
+
+@pytest.mark.slow
+def test_learners_take_the_picture_and_each_episode_begins_with_its_own():
+    env = envs.make("car_racing1", observe_vision=True, vision_size=(24, 16), num_steps=3)
+    algo = ALGOS["ppo_lag"].make(env)
+    tiny = {"num_envs": 4, "horizon": 4, "minibatches": 2, "epochs": 1, "hidden": (8,)}
+    cfg = ALGOS["ppo_lag"].config(**tiny, encoder="cnn", trunk="shared")
+    ts = jax.jit(lambda: algo.init(jax.random.key(0), cfg, START), compiler_options=FAST)()
+    after, metrics = jax.jit(algo.update)(ts, START)
+    assert metrics["train/nonfinite"] == 0
+    moved = jax.tree.map(lambda a, b: (a != b).any(), ts.params, after.params)
+    assert all(jax.tree.leaves(moved))
+    state = after.rollout.state
+    assert (after.rollout.steps < 4).all() and state.obs["vision"].shape == (4, 16, 24, 1)
+
+    def own(world: World) -> jax.Array:
+        return pictures.picture(world.car, world.track, world.obstacles, (24, 16))
+
+    expected = np.asarray(jax.jit(jax.vmap(own), compiler_options=FAST)(state.physics))
+    np.testing.assert_array_equal(state.obs["vision"][..., 0], expected)
+
+
+def test_a_replay_keeps_grey_bytes():
+    env = envs.make("car_racing0", observe_vision=True, vision_size=(24, 16))
+    algo, cfg = ALGOS["sac_lag"].make(env), ALGOS["sac_lag"].config(encoder="cnn")
+    kept = jax.eval_shape(lambda: algo.init(jax.random.key(0), cfg, START)).replay.obs["vision"]
+    assert kept.dtype == jnp.uint8 and kept.shape[2:] == (16, 24, 1)
+    with pytest.raises(ConfigError, match=r"env\.vision_size\[1\]=0: expected a whole number"):
+        envs.make("car_racing0", observe_vision=True, vision_size=(96, 0))
+
+
+@pytest.mark.slow
+def test_an_episode_is_filmed_from_above():
+    env = envs.make("car_racing0")
+    player = reflex(lambda obs: jnp.array([0.0, 1.0, -1.0]), env)
+    film = render_episode(env, player, jax.random.key(0), length=4, width=30, height=20)
+    assert len(film) == 3 and film[0].shape == (20, 30, 3)  # steps 0, 2, 4: 25 frames a second
+
+
 # ---- episodes ----------------------------------------------------------------------------------
 
 
@@ -315,4 +506,5 @@ def test_options_have_bounds():
         envs.make("car_racing1", obstacle_every=21)
     with pytest.raises(ConfigError, match="did you mean 'obstacle_every'"):
         envs.make("car_racing1", obstacles_every=2)
-    assert {f.name for f in fields(envs.CarRacing)} == {"obstacle_every", "num_steps"}
+    options = {"obstacle_every", "num_steps", "observe_vision", "vision_size"}
+    assert {f.name for f in fields(envs.CarRacing)} == options

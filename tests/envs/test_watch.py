@@ -81,7 +81,7 @@ def test_no_keys_drive_a_robot_of_ones_own(tmp_path):
         playback.Playback(env)
     with pytest.raises(
         ConfigError,
-        match="only Safety Gym's environments and velocity tasks can be drawn, not a Simple",
+        match="only Safety Gym's environments, velocity and racing tasks can be drawn, not a Simple",
     ):
         playback.Playback(SimpleNamespace())  # type: ignore[arg-type]
     assert robot_of(envs.make("car_goal0", engine="c", robot_base="xmls/car.xml")) == "car"

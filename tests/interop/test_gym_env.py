@@ -265,7 +265,7 @@ def test_bad_input_is_one_line():
     with pytest.raises(ConfigError, match="expected 'rgb_array'"):
         GymVectorEnv(Ticker(), render_mode="human")
     with pytest.raises(
-        ConfigError, match="only Safety Gym's environments and velocity tasks can be drawn"
+        ConfigError, match="only Safety Gym's environments, velocity and racing tasks can be drawn"
     ):
         GymEnv(Ticker(), render_mode="rgb_array")
 
