@@ -233,7 +233,8 @@ original do not carry over.
 
 ```sh
 python scripts/train.py env=car_racing1 algo=seditor
-python scripts/train.py env=car_racing1 env.observe_vision=true algo=ppo_lag algo.encoder=cnn
+python scripts/train.py env=car_racing1 env.observe_vision=true algo=ppo_lag algo.encoder=cnn \\
+    algo.trunk=shared algo.num_envs=64
 ```
 
 ![car_racing1 in a film and as a policy sees it](../images/environments/car_racing1.png)
@@ -263,19 +264,20 @@ To the left is a frame of a film. To the right is what a policy sees there with
 | 24 | centres of the nearest tile and of the 2nd, 4th, ..., 22nd after it: x and y, m |
 | 9 | with obstacles: x, y and half the width, m, of the next three |
 
-There wheels can also spin and lock. Places are in the car's frame, x to the front and y to the left.
+Places are in the car's frame, x to the front and y to the left. In the original wheels can also spin
+and lock.
 
 With `env.observe_vision=true` the observation is that of the original's agents, a dict: `vector` has
 the first 11 numbers, and `vision` is a grey picture, uint8 [96, 96, 1].
-[Which algorithms take it](../howto/pixels.md#learn). SEditor itself takes vectors here.
+[Which algorithms take it](../howto/pixels.md#learn): `seditor` is not among them, it takes vectors.
 
 ## Pictures
 
 {picture}
 
-The picture is drawn in JAX, in the program of the step. On two CPU cores, 64 environments of
-`car_racing1` make 17,500 steps a second with a picture of 96 x 96 each, and 100,000 without (AMD EPYC,
-JAX 0.10.2, random actions):
+JAX draws the picture in the program of the step. 64 environments of `car_racing1` make 11,000 steps a
+second with a picture of 96 x 96 each, and 60,000 without. This is of two cores of an AMD EPYC, one of
+which another program kept busy (JAX 0.10.2). It was measured so:
 
 ```python
 import time
@@ -289,8 +291,7 @@ env = envs.make("car_racing1", observe_vision=True)
 
 def step(state, key):
     action = jax.random.uniform(key, (64, env.action_size), minval=-1.0)
-    state = jax.vmap(env.step)(state, action)
-    return state, state.obs["vision"].mean()
+    return jax.vmap(env.step)(state, action), None
 
 
 run = jax.jit(lambda state, key: jax.lax.scan(step, state, jax.random.split(key, 200)))

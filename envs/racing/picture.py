@@ -1,6 +1,6 @@
 """The road from above: what is in the middle of each pixel.
 
-A picture shows 64.8 m x 43.2 m, whatever its size. The car is always at the same place of it, in the
+A picture shows 64.8 m x 43.2 m, whatever its size. The car is always at the same place, in the
 middle and a quarter of the height from the bottom, and its front is up. A pixel shows the road where a
 wheel in the pixel's middle would be on the road, and an obstacle where it would touch the obstacle.
 
@@ -58,7 +58,7 @@ def pixels(size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     width, height = size
     x = HEIGHT * (1 - (np.arange(height) + 0.5) / height) - BEHIND
     y = WIDTH * (0.5 - (np.arange(width) + 0.5) / width)
-    return np.float32(x)[:, None], np.float32(y)[None, :]
+    return x.astype(np.float32)[:, None], y.astype(np.float32)[None, :]
 
 
 def mown(car: Car, x: np.ndarray, y: np.ndarray) -> jax.Array:

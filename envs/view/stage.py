@@ -145,8 +145,8 @@ class Runway:
 
 
 def stage_of(env: SafetyGym | Velocity) -> Stage | Runway:
-    env = innermost(env)
-    return Runway(env) if isinstance(env, Velocity) else Stage(env)
+    inside: Any = innermost(env)
+    return Runway(inside) if isinstance(inside, Velocity) else Stage(inside)
 
 
 def add_geom(geoms: mujoco.MjvScene, shape: mujoco.mjtGeom, size: Any, place: Any, rgba: Any) -> None:
