@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxsafe.config import Amount, Bounds, Weight
-from jaxsafe.envs.plain import PlainEnv
+from jaxsafe.envs.without_model import WithoutModel
 from jaxsafe.learn.certificate import interval_barrier
 from jaxsafe.types import State
 
@@ -26,7 +26,7 @@ Angle = Annotated[float, Bounds(1e-3, 3.0)]  # rad
 
 
 @dataclass(frozen=True)
-class Pendulum(PlainEnv):
+class Pendulum(WithoutModel):
     """Hold a pendulum at `goal` with a motor that is too weak to lift it from everywhere.
 
     Observation [2]: angle from upright (rad), angular velocity (rad/s).
@@ -65,7 +65,7 @@ class Pendulum(PlainEnv):
 
 
 @dataclass(frozen=True)
-class CartPendulum(PlainEnv):
+class CartPendulum(WithoutModel):
     """Keep a pendulum on its cart, and the cart on its rail, while doing what `task` pays.
 
     Observation [4]: place of the cart (m), angle from upright (rad), and their velocities.

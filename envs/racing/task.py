@@ -22,11 +22,11 @@ import jax
 import jax.numpy as jnp
 
 from jaxsafe.config import Amount, Bounds, Pixels
-from jaxsafe.envs.plain import PlainEnv
 from jaxsafe.envs.racing.car import DT, OFF_ROAD, Car, drive, length, parked, rolling, rotated, wheels
 from jaxsafe.envs.racing.obstacles import Obstacles, centre, touching
 from jaxsafe.envs.racing.picture import picture
 from jaxsafe.envs.racing.track import HALF_WIDTH, MOST_TILES, Track, locate, on_road, random_track
+from jaxsafe.envs.without_model import WithoutModel
 from jaxsafe.types import PyTree, State
 
 STATUS = 11  # numbers of the car itself
@@ -52,7 +52,7 @@ class World:
 
 
 @dataclass(frozen=True)
-class CarRacing(PlainEnv):
+class CarRacing(WithoutModel):
     """A lap of a random track. Pure functions `reset(key)` and `step(state, action)`; callers `vmap`.
 
     Observation float [35], or [44] with obstacles:

@@ -3,7 +3,7 @@
 from jaxsafe.config import check_values
 
 
-class PlainEnv:
+class WithoutModel:
     """Options, one of which is the time limit. A subclass adds the sizes and names of an `Env`."""
 
     num_steps: int
