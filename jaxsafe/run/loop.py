@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from jaxsafe.learn.constraints import limits_by_name
-from jaxsafe.run import checkpoint, clock, distributed, divergence, files, programs
+from jaxsafe.run import checkpoint, clock, distributed, divergence, files, memory, programs
 from jaxsafe.run.divergence import Diverged
 from jaxsafe.run.evaluate import COLUMNS
 from jaxsafe.run.interrupts import Interrupts
@@ -74,6 +74,7 @@ def train(
     Raises:
         checkpoint.CheckpointError, OSError: the disk failed; the last good checkpoint stays.
         divergence.Diverged: no member learns any more; likewise.
+        memory.TooLarge: an update cannot fit the memory.
     """
     iterations, unit = clock.iterations(train_cfg, program.clocks), clock.unit(program.clocks)
     store = files.inside(folder, "checkpoints")
@@ -90,6 +91,7 @@ def train(
         names = sorted(jax.eval_shape(program.update, start.ts, program.shared())[1])
         names += COLUMNS if hooks.evaluate else ()
         update = programs.compiled(program, start.ts)
+        memory.check_work_memory(update)
         report.line(f"compiled in {time.perf_counter() - begun:.1f} s")
         stop.nothing_to_save = ""
 

@@ -87,6 +87,18 @@ def check_state_memory(program: Program, train_cfg: TrainConfig) -> None:
         )
 
 
+def check_work_memory(update: Any) -> None:
+    """Refuse a compiled update whose arrays between its operations cannot fit the device. The system
+    would end the process without a word."""
+    limit, what = device_memory()
+    need = update.memory_analysis().temp_size_in_bytes
+    if need > limit:
+        raise TooLarge(
+            f"an update works in {need / 2**30:,.1f} GiB a device, {what} has {limit / 2**30:,.1f}; "
+            "use fewer num_envs or num_seeds"
+        )
+
+
 def capacity(program: Program) -> int:
     """How many of its members fit the memory at once, by the compiled update's own account."""
     like = jax.tree.map(

@@ -101,3 +101,19 @@ def test_plans_that_do_not_fit_are_one_line(tmp_path, capsys, monkeypatch):
     said = capsys.readouterr()
     assert "planning in 18 environments at once needs at least 0.6 GiB" in said.out + said.err
     assert len((said.out + said.err).strip().splitlines()) == 1
+
+
+def test_an_update_that_does_not_fit_is_one_line(tmp_path, capsys, monkeypatch):
+    """Everything but the compiled update fits."""
+    large, few = (8e9, "this machine"), (1000.0, "this machine")
+    monkeypatch.setattr(memory, "device_memory", lambda: large)
+
+    def checked(update):
+        monkeypatch.setattr(memory, "device_memory", lambda: few)
+        check(update)
+
+    check = memory.check_work_memory
+    monkeypatch.setattr(memory, "check_work_memory", checked)
+    assert typed("train", *SAC, f"run_dir={tmp_path / 'run'}") == 2
+    (line,) = [x for x in capsys.readouterr().err.splitlines() if x.startswith("error: ")]
+    assert "an update works in" in line and "this machine has 0.0; use fewer num_envs" in line
