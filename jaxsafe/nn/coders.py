@@ -88,6 +88,7 @@ class Convolution(nn.Module):
         kernel = self.param("kernel", fan_in(1.0), (SIDE, SIDE, x.shape[-1], self.out))
         bias = self.param("bias", nn.initializers.zeros, (self.out,))
         reads, stride = (GROW, 1) if self.grows else (SHRINK, 2)
+        # row and column of the place that is read (s, t), of the tap (d, e), of the pixel (a, b)
         matrix = jnp.einsum("ads,bet,deco->stcabo", reads, reads, kernel, precision="highest")
         seen = patches(x, reads.shape[-1], stride)
         squares = seen @ matrix.reshape(seen.shape[-1], 4 * self.out)
