@@ -1,4 +1,4 @@
-"""Environments small enough to know the answers of, and updates outside a training loop."""
+"""Environments small enough to know the answers of, and updates and gradient steps without a loop."""
 
 import dataclasses
 from collections.abc import Callable
@@ -8,11 +8,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
+from jax.flatten_util import ravel_pytree
 
 from jaxsafe.learn.acting import Player
 from jaxsafe.learn.certificate import interval_barrier
-from jaxsafe.learn.steps import Context
-from jaxsafe.types import Algorithm, Env, Policy, Shared, State
+from jaxsafe.learn.steps import Context, Trainable
+from jaxsafe.types import Algorithm, Env, Policy, PyTree, Shared, State
 
 START = Shared(np.int32(0))
 
@@ -20,6 +22,12 @@ START = Shared(np.int32(0))
 def updated(algo: Algorithm) -> Callable:
     """ts -> (ts, metrics), for what does not depend on the iteration."""
     return lambda ts: algo.update(ts, START)
+
+
+def momentum(nets: Trainable, name: str) -> PyTree:
+    """Adam's first moment of a network, as a tree like its parameters."""
+    as_tree = ravel_pytree(nets.params[name])[1]
+    return as_tree(optax.tree_utils.tree_get(nets.opt_state[name], "mu"))
 
 
 def context(
