@@ -212,9 +212,9 @@ def off_policy(
     def learn(ts: TrainState, at: Round, key: jax.Array) -> tuple[TrainState, Metrics]:
         """The gradient steps of a round if it is ready, each on a batch of its own.
 
-        If they lead to anything that is not finite, none of them takes effect. A GPU spends as long on
-        launching a gradient step as on computing it, so what all of them need is done once: all batches
-        are drawn before the first, and the outcome is checked after the last.
+        If they lead to anything that is not finite, none of them takes effect. On a GPU many small
+        kernels take much of a gradient step's time. So what all steps need is done once: batches are
+        drawn before the first step, and the outcome is checked after the last.
         """
         cfg, table = ts.config, timetable_of(ts.config, axis_name)
         if not table.gradient_steps:

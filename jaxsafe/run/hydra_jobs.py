@@ -90,7 +90,8 @@ def each_job(argv: list[str], job: Job) -> None:
     if request.typed.printed and not request.typed.multirun:
         with hydra.initialize(version_base="1.3", config_path=None):
             config: Any = hydra.compose("train", request.texts)
-        settings_from_config(OmegaConf.to_container(config, resolve=True))  # type: ignore[arg-type]
+        plain: Any = OmegaConf.to_container(config, resolve=True)
+        settings_from_config(plain)
     sys.argv[1:] = request.argv
     os.environ["HYDRA_FULL_ERROR"] = "1"  # raise, do not print
     try:
@@ -130,7 +131,7 @@ def read_arguments(argv: list[str]) -> Typed:
     """Hydra's flags apart from `key=value`, with environments and algorithms that are the user's code
     imported."""
     parser = get_args_parser()
-    parser.error = fail  # type: ignore[method-assign]
+    parser.error = fail  # type: ignore[method-assign] (the parser is Hydra's own)
     args, unknown = parser.parse_known_args(argv)
     if unknown:
         raise ConfigError(f"unknown flag {unknown[0]}; options are written key=value, see --help")
