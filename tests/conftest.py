@@ -10,8 +10,10 @@ from jaxsafe import algos, envs
 from jaxsafe.envs.view import backend
 from jaxsafe.run.devices import use_compilation_cache
 
-use_compilation_cache()  # what a first run of the tests compiles, the next one reads
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+# What a first run of the tests compiles, the next one reads: small programs too, of which there are
+# thousands.
+use_compilation_cache()
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
 MAPS = Path("/proc/self/maps")
