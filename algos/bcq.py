@@ -15,10 +15,10 @@ from jaxsafe.learn.critics import (
     Values,
     critic_loss,
     critics_among,
-    expected_cost,
     init_all_critics,
     targets_of,
     while_it_lasts,
+    with_reduced_cost,
 )
 from jaxsafe.learn.learner import GradientStep, Learner
 from jaxsafe.learn.offline import (
@@ -33,7 +33,6 @@ from jaxsafe.learn.replay import Transitions
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.steps import Trainable, adam, descend_each, follow
 from jaxsafe.learn.treatments import Treatment, lagrangian, no_treatment
-from jaxsafe.nn.critics import q_values
 from jaxsafe.nn.networks import coarse_mlp
 from jaxsafe.nn.vae import decode, draw_latent, init_vae
 from jaxsafe.types import Algorithm, Env, Metrics, PyTree
@@ -155,9 +154,8 @@ def learner(env: Env, treatment: Treatment = no_treatment) -> Learner:
         params, cfg = learned.params, learned.config
         key = jax.random.key(0) if key is None else key  # the same latents at every step
         choice = candidates(params, obs, key, cfg.act_candidates, cfg)
-        q_r = q_values(params["critic_r"], *choice, cfg)[0]
-        q_c = expected_cost(params, *choice, names(cfg), cfg)
-        best = jnp.argmax(treatment.advantage(learned.dual, q_r, q_c), -1)
+        q_r, q_c = with_reduced_cost(params, *choice, names(cfg), cfg)
+        best = jnp.argmax(treatment.advantage(learned.dual, q_r[0], q_c), -1)
         return jnp.take_along_axis(choice.action, best[..., None, None], -2)[..., 0, :]
 
     def next_values(
@@ -166,8 +164,8 @@ def learner(env: Env, treatment: Treatment = no_treatment) -> Learner:
         """S' and Q'_c as the targets take them, and Q'_c of the chosen action."""
         targets = params["targets"]
         choice = candidates(targets | {"vae": params["vae"]}, batch.next_obs, key, cfg.candidates, cfg)
-        s = soft(q_values(targets["critic_r"], *choice, cfg), cfg)  # [B, candidates]
-        q_c = expected_cost(targets, *choice, names(cfg), cfg)
+        q_r, q_c = with_reduced_cost(targets, *choice, names(cfg), cfg)
+        s = soft(q_r, cfg)  # [B, candidates]
         best = jnp.argmax(treatment.advantage(dual, s, q_c), -1)[:, None]
 
         def chosen(x: jax.Array) -> jax.Array:
@@ -206,9 +204,8 @@ def learner(env: Env, treatment: Treatment = no_treatment) -> Learner:
 
         def loss(net: dict[str, PyTree]) -> tuple[jax.Array, Metrics]:
             action = xi(net["actor"], batch.obs, unperturbed, cfg)
-            q_1 = q_values(params["critic_r"], batch.obs, action, cfg)[0]
-            q_c = expected_cost(params, batch.obs, action, names(cfg), cfg)
-            gain = treatment.advantage(at.dual, q_1, q_c).mean()
+            q_r, q_c = with_reduced_cost(params, batch.obs, action, names(cfg), cfg)
+            gain = treatment.advantage(at.dual, q_r[0], q_c).mean()
             return -gain, {"train/actor_loss": -gain}
 
         nets, found = descend_each(loss, nets, {"actor": policy_adam})

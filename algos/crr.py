@@ -13,10 +13,10 @@ from jaxsafe.learn.critics import (
     Values,
     critic_loss,
     critics_among,
-    expected_cost,
     init_all_critics,
     targets_of,
     while_it_lasts,
+    with_reduced_cost,
 )
 from jaxsafe.learn.learner import GradientStep, Learner
 from jaxsafe.learn.offline import (
@@ -32,7 +32,6 @@ from jaxsafe.learn.row import Row
 from jaxsafe.learn.steps import Trainable, adam, descend_each, follow
 from jaxsafe.learn.treatments import Treatment, lagrangian, no_treatment
 from jaxsafe.nn.bounded import bounded_action, bounded_policy, init_bounded
-from jaxsafe.nn.critics import q_values
 from jaxsafe.nn.gaussian import log_prob
 from jaxsafe.types import Algorithm, Env, Metrics, PyTree
 
@@ -100,8 +99,12 @@ def learner(env: Env, treatment: Treatment = no_treatment) -> Learner:
     def next_values(targets: PyTree, batch: Transitions, key: jax.Array, cfg: Any) -> Values:
         """Q'(s', a') and Q'_c(s', a')."""
         action = bounded_action(bounded_policy(targets["actor"], batch.next_obs, cfg), key)
-        q_r = q_values(targets["critic_r"], batch.next_obs, action, cfg).min(0)
-        return Values(q_r, expected_cost(targets, batch.next_obs, action, names(cfg), cfg))
+        return lowest(targets, batch.next_obs, action, cfg)
+
+    def lowest(params: PyTree, obs: jax.Array, action: jax.Array, cfg: Any) -> Values:
+        """The lowest Q_r, and Q_c."""
+        q_r, q_c = with_reduced_cost(params, obs, action, names(cfg), cfg)
+        return Values(q_r.min(0), q_c)
 
     def advantages(params: PyTree, batch: Transitions, key: jax.Array, cfg: Any) -> Values:
         """By how much the data's actions are better than the policy's, A_r and A_c."""
@@ -110,8 +113,7 @@ def learner(env: Env, treatment: Treatment = no_treatment) -> Learner:
         drawn = jax.vmap(lambda key: bounded_action(dist, key))(keys)  # [actions, B, A]
 
         def of_actions(action: jax.Array) -> Values:
-            q_r = q_values(params["critic_r"], batch.obs, action, cfg).min(0)
-            return Values(q_r, expected_cost(params, batch.obs, action, names(cfg), cfg))
+            return lowest(params, batch.obs, action, cfg)
 
         here, there = of_actions(batch.action), jax.vmap(of_actions)(drawn)
         return jax.tree.map(lambda x, y: x - y.mean(0), here, there)

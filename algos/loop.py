@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxsafe.algos import pets, sac
-from jaxsafe.config import Amount, Bounds, Iterations, Share, Weight, config
+from jaxsafe.config import Amount, Bounds, Iterations, Rate, Share, Weight, config
 from jaxsafe.learn.acting import Learned
 from jaxsafe.learn.actor_critic import actor_critic
 from jaxsafe.learn.model_based import ModelBasedConfig, model_based
@@ -66,6 +66,10 @@ class LOOPConfig(ModelBasedConfig, sac.SACConfig):
     # updates. OmniSafe has 10,000 raw steps.
     learning_starts: Annotated[int, Bounds(0, 2**31 - 1)] = 2_000
     batch_size: Amount = 1024  # Transitions of a gradient step. OmniSafe has 256.
+    lr: Rate = 3e-4  # The policy's learning rate, by Adam, as in OmniSafe.
+    critic_lr: Rate = 3e-4  # The critics' learning rate, by Adam, as in OmniSafe.
+    # The share of the critics that their targets take on at each step. OmniSafe has 0.005.
+    tau: Share = 0.01
     replay_ratio: Amount = 64  # Transitions replayed for each environment step. OmniSafe has 256.
     # Transitions of a step of each model, of all devices together, drawn with replacement. OmniSafe has
     # 256.

@@ -154,6 +154,8 @@ OMNISAFE: dict[str, Any] = {
     "replay_ratio": 256,
     "batch_size": 256,
     "tau": 0.005,
+    "lr": 3e-4,
+    "critic_lr": 3e-4,
     "layer_norm": False,
     "obs_normalize": False,
     "alpha_init": 0.2,
@@ -162,7 +164,10 @@ OMNISAFE: dict[str, Any] = {
 }
 NAVIGATION: dict[str, Any] = OMNISAFE | {"alpha_init": 1e-5, "lr": 5e-6, "critic_lr": 1e-3}
 # the published replay ratio with 64 environments: 4 gradient steps for each of their steps
-PARALLEL: dict[str, Any] = {"num_envs": 64, "replay_ratio": 256, "batch_size": 4096, "tau": 0.005}
+PARALLEL: dict[str, Any] = {
+    "num_envs": 64, "replay_ratio": 256, "batch_size": 4096, "tau": 0.005, "lr": 3e-4,
+    "critic_lr": 3e-4,
+}  # fmt: skip
 # A price that OmniSafe moves at every step by 1e-5 moves by 0.2 in 20,000 steps; likewise the others.
 LAG: dict[str, Any] = {
     "dual_starts": 200_000, "dual_lr": 0.2, "dual_damping": 0.0, "dual_eps": 1e-8,
@@ -182,7 +187,7 @@ PID_NAVIGATION: dict[str, Any] = PID | {
 LEVER: dict[str, Any] = {
     "num_envs": 32, "horizon": 8, "learn_every": 2, "batch_size": 256, "replay_size": 20_000,
     "learning_starts": 256, "hidden": (32,), "discount": 0.9, "lr": 3e-3, "critic_lr": 3e-3,
-    "alpha_init": 0.1, "alpha_lr": 3e-3, "target_entropy": -2.0,
+    "tau": 0.01, "alpha_init": 0.1, "alpha_lr": 3e-3, "target_entropy": -2.0,
 }  # fmt: skip
 # Its states are all worth the same, so that Q_r has no deviation to measure prices in.
 LEVER_LAG: dict[str, Any] = {

@@ -24,7 +24,7 @@ from jaxsafe.learn.acting import Learned
 from jaxsafe.learn.batch import device_count, pmean
 from jaxsafe.learn.bill import PriceClockConfig
 from jaxsafe.learn.constraints import constrained_costs, each, limit, metrics_by_constraint, signal
-from jaxsafe.learn.critics import cost_values, init_cost_critics, reduced_costs
+from jaxsafe.learn.critics import init_cost_critics, values_of_each, with_reduced_cost
 from jaxsafe.learn.learner import GradientStep, Learner
 from jaxsafe.learn.normalise import averaged, no_moments, standard
 from jaxsafe.learn.off_policy import OffPolicyConfig, off_policy
@@ -246,7 +246,8 @@ def editor_gain(
 ) -> tuple[jax.Array, Edited, jax.Array]:
     """What the editor climbs at `obs` [..., O], float [...]; the draws; the reward that edits lose."""
     found = edited(params["proposer"], editor, obs, key, cfg)
-    q_r = reward_value(params, obs, found.action, cfg)
+    q_r, q_c = with_reduced_cost(params, obs, found.action, constrained_costs(cfg), cfg)
+    q_r = smallest(q_r)
     lost = jax.nn.relu(reward_value(params, obs, found.proposal, cfg) - q_r)
     match cfg.distance:
         case "hinge":
@@ -255,7 +256,6 @@ def editor_gain(
             worth = -jnp.square(found.action - found.proposal).mean(-1)
         case "reward":
             worth = q_r
-    q_c = reduced_costs(params["critic_c"], obs, found.action, constrained_costs(cfg), cfg)
     worth = soft_lagrangian.advantage(dual, worth, q_c)
     return worth - jnp.exp(params["log_alpha_editor"]) * found.log_prob_change, found, lost
 
@@ -319,19 +319,17 @@ def seditor_learner(env: Env) -> Learner:
 
         # targets
         found = edited(params["proposer"], params["editor"], rows.obs, target_key, cfg)
-        next_q = reward_value(targets, rows.obs, found.action, cfg)
-        next_c = reduced_costs(targets["critic_c"], rows.obs, found.action, names, cfg)
+        next_q, next_c = with_reduced_cost(targets, rows.obs, found.action, names, cfg)
 
         def returns(earned: jax.Array, value: jax.Array, discount: jax.Array) -> jax.Array:
             return lambda_returns(batch, earned, value, discount=discount, decay=cfg.td_lambda)
 
-        y_r = returns(reward, next_q, cfg.discount)
+        y_r = returns(reward, smallest(next_q), cfg.discount)
         y_c = each(partial(returns, discount=cfg.cost_discount), names)(cost, next_c)
 
         def loss(trained: dict[str, PyTree]) -> tuple[jax.Array, Metrics]:
             obs, action = rows.obs[:-1], rows.action[:-1]
-            q = q_values(trained["critic_r"], obs, action, cfg)
-            q_c = cost_values(trained["critic_c"], obs, action, names, cfg)
+            q, q_c = values_of_each(trained, obs, action, names, cfg)
             loss_r = mean_step(((q - y_r) ** 2).sum(0))
             loss_c = each(mean_step, names)(((q_c - y_c) ** 2).sum(0))
 

@@ -21,7 +21,7 @@ from jaxsafe.types import Metrics, PyTree
 
 
 class Values(NamedTuple):
-    """Of B states or actions: in reward, float [B], and in cost."""
+    """Of B states or actions: in reward, float [B], and in cost; [critics, B] of several critics."""
 
     reward: jax.Array
     cost: jax.Array
@@ -58,32 +58,36 @@ def critics_among(params: dict[str, PyTree]) -> dict[str, PyTree]:
     return {name: params[name] for name in ("critic_r", "critic_c") if name in params}
 
 
-def cost_values(
-    critics: PyTree, obs: jax.Array, action: jax.Array, names: Names, cfg: Any
-) -> jax.Array:
-    """Q_c of each critic, float [J, B]; of several constraints [J, B, K]."""
+def values_of_each(
+    critics: dict[str, PyTree], obs: jax.Array, action: jax.Array, names: Names, cfg: Any
+) -> Values:
+    """What each critic says: of reward, float [I, B], and of cost, [J, B] or [J, B, K].
 
-    def of_one(critics: PyTree) -> jax.Array:
-        return q_values(critics, obs, action, cfg)
+    They are evaluated together, as one stack of networks. Without critics of cost it is 0, [1, B].
+    """
+    of_reward = critics["critic_r"]
+    if "critic_c" not in critics:
+        q = q_values(of_reward, obs, action, cfg)
+        return Values(q, jnp.zeros_like(q[:1]))
 
-    return jax.vmap(of_one, out_axes=-1)(critics) if names else of_one(critics)
+    def stacked(of_reward: jax.Array, of_cost: jax.Array) -> jax.Array:
+        return jnp.concatenate([of_reward, of_cost.reshape(-1, *of_reward.shape[1:])])
+
+    q = q_values(jax.tree.map(stacked, of_reward, critics["critic_c"]), obs, action, cfg)
+    count = len(jax.tree.leaves(of_reward)[0])
+    q_r, q_c = q[:count], q[count:]
+    if names:
+        q_c = jnp.moveaxis(q_c.reshape(len(names), -1, *q_c.shape[1:]), 0, -1)
+    return Values(q_r, q_c)
 
 
-def reduced_costs(
-    critics: PyTree, obs: jax.Array, action: jax.Array, names: Names, cfg: Any
-) -> jax.Array:
-    """Q_c, float [B] or [B, K]."""
-    q_c = cost_values(critics, obs, action, names, cfg)
-    return largest(q_c) if cfg.cost_reduce == "max" else q_c.mean(0)
-
-
-def expected_cost(
-    params: dict[str, PyTree], obs: jax.Array, action: jax.Array, names: Names, cfg: Any
-) -> jax.Array:
-    """Q_c, float [B] or [B, K]; 0 for a learner without critics of cost."""
-    if "critic_c" not in params:
-        return jnp.zeros(action.shape[:-1])
-    return reduced_costs(params["critic_c"], obs, action, names, cfg)
+def with_reduced_cost(
+    critics: dict[str, PyTree], obs: jax.Array, action: jax.Array, names: Names, cfg: Any
+) -> Values:
+    """As `values_of_each`, with one Q_c, [B] or [B, K], made of those of cost."""
+    q_r, q_c = values_of_each(critics, obs, action, names, cfg)
+    most = "critic_c" in critics and cfg.cost_reduce == "max"
+    return Values(q_r, largest(q_c) if most else q_c.mean(0))
 
 
 def while_it_lasts(batch: Transitions, values: jax.Array) -> jax.Array:
@@ -111,11 +115,10 @@ def critic_loss(
     critics: dict[str, PyTree], batch: Transitions, targets: Values, names: Names, cfg: Any
 ) -> tuple[jax.Array, Metrics]:
     """This device's share of the loss, and metrics."""
-    q = q_values(critics["critic_r"], batch.obs, batch.action, cfg)
+    q, q_c = values_of_each(critics, batch.obs, batch.action, names, cfg)
     loss = batch.mean(((q - targets.reward) ** 2).sum(0))
     metrics = {"train/critic_loss": loss, "train/q": batch.mean(q.mean(0))}
     if "critic_c" in critics:
-        q_c = cost_values(critics["critic_c"], batch.obs, batch.action, names, cfg)
         loss_c = batch.mean(((q_c - targets.cost) ** 2).sum(0))
         metrics |= {"train/critic_loss_c": loss_c, "train/q_c": batch.mean(q_c.mean(0))}
         loss += loss_c.sum()

@@ -34,8 +34,8 @@ from jaxsafe.learn.replay import Span, held, ring_rows
 from jaxsafe.learn.rollout import check_steps
 from jaxsafe.types import Shared
 
-BATCH = 1024  # transitions of a gradient step, where the user does not say
-BATCHES = range(64, 16 * BATCH + 1)  # where BATCH does not fit, the nearest of these that does
+BATCH = 4096  # transitions of a gradient step, where the user does not say
+BATCHES = range(64, 4 * BATCH + 1)  # where BATCH does not fit, the nearest of these that does
 
 
 @config
@@ -65,7 +65,7 @@ class RoundConfig(ReplayConfig):
     # Steps of each environment between two rounds of gradient steps.
     learn_every: Amount = 1
     replay_ratio: Amount = 16  # Transitions replayed for each environment step. OmniSafe has 256.
-    # Transitions of a gradient step, of all devices together. null: 1024 or, where that makes no whole
+    # Transitions of a gradient step, of all devices together. null: 4096 or, where that makes no whole
     # number of gradient steps, the nearest size that does. OmniSafe has 256.
     batch_size: Amount | None = None
     n_step: Iterations = 1  # Rewards summed before the critics' value. OmniSafe has 1.

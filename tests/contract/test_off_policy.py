@@ -251,7 +251,7 @@ def test_sizes_that_do_not_fit_are_refused_with_the_nearest_that_do(settings, me
 
 @pytest.mark.parametrize(
     "num_envs, batch, gradient_steps",
-    [(4, 64, 1), (16, 256, 1), (100, 800, 2), (1000, 1000, 16), (1024, 1024, 16), (4096, 1024, 64)],
+    [(4, 64, 1), (16, 256, 1), (100, 1600, 1), (1000, 4000, 4), (1024, 4096, 4), (4096, 4096, 16)],
 )
 def test_a_batch_follows_the_number_of_environments_so_that_the_replay_ratio_stays(
     num_envs, batch, gradient_steps
@@ -260,7 +260,7 @@ def test_a_batch_follows_the_number_of_environments_so_that_the_replay_ratio_sta
     table = timetable_of(cfg, None)
     assert (table.batch, table.gradient_steps) == (batch, gradient_steps)
     assert batch * gradient_steps == cfg.replay_ratio * num_envs * table.rows
-    with pytest.raises(ConfigError, match=r"batches of 1024; .* replay_ratio=1024 or batch_size=16"):
+    with pytest.raises(ConfigError, match=r"batches of 4096; .* replay_ratio=4096 or batch_size=16"):
         timetable_of(dataclasses.replace(cfg, num_envs=1), None)  # 16 are too few to learn from
 
 
@@ -268,7 +268,7 @@ def test_the_clocks_count_environment_steps_and_gradient_steps():
     cfg = ALGOS["sac"].config(**TINY)
     assert ALGOS["sac"].make(Corridor()).clocks(cfg) == (8 * 6, 3 * (4 * 8 * 2 // 32))
     fast = ALGOS["sac"].config()
-    assert ALGOS["sac"].make(Corridor()).clocks(fast) == (1024 * 16, 16 * 16)
+    assert ALGOS["sac"].make(Corridor()).clocks(fast) == (2048 * 16, 16 * 8)
 
 
 @dataclass(frozen=True)

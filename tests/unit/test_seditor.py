@@ -17,6 +17,7 @@ from toys import START, Lever, momentum
 
 from jaxsafe.algos import ALGOS, seditor
 from jaxsafe.config import ConfigError
+from jaxsafe.learn.critics import Values
 from jaxsafe.learn.learner import GradientStep
 from jaxsafe.learn.normalise import averaged, no_moments, standard
 from jaxsafe.learn.replay import Record
@@ -169,9 +170,10 @@ def test_the_proposer_feels_its_own_action_and_what_the_editor_makes_of_it(quick
 
 def test_the_editor_brings_unsafe_proposals_to_the_bound_as_the_price_grows(monkeypatch, quick_draws):
     """Q_r = -(a - 1/2)^2, and Q_c = a+ costs from 0 on. The proposals stay where reward is."""
-    monkeypatch.setattr(seditor, "reward_value", lambda p, s, a, cfg: -((a[..., 0] - 0.5) ** 2))
-    costs = lambda critics, s, a, names, cfg: jax.nn.relu(a[..., 0])  # noqa: E731
-    monkeypatch.setattr(seditor, "reduced_costs", costs)
+    worth = lambda p, s, a, cfg: -((a[..., 0] - 0.5) ** 2)  # noqa: E731
+    both = lambda p, s, a, names, cfg: Values(worth(p, s, a, cfg)[None], jax.nn.relu(a[..., 0]))  # noqa: E731
+    monkeypatch.setattr(seditor, "reward_value", worth)
+    monkeypatch.setattr(seditor, "with_reduced_cost", both)
     params, obs, rule = nets(), jnp.zeros((64, 1)), optax.adam(0.1)  # without entropy
 
     def train(lam):
