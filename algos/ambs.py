@@ -29,9 +29,9 @@ from jaxsafe.learn.dreaming import (
 from jaxsafe.learn.off_policy import off_policy
 from jaxsafe.learn.replay import Record
 from jaxsafe.learn.row import Row
-from jaxsafe.learn.world_model import CHANCE, critic_of, dream_returns, read, world_of
+from jaxsafe.learn.world_model import CHANCE, dream_returns, read, value_of, world_of
 from jaxsafe.nn.rssm import Latent
-from jaxsafe.nn.two_hot import BINS, two_hot_mean
+from jaxsafe.nn.two_hot import BINS
 from jaxsafe.types import Algorithm, Env, Metrics, Policy, PyTree, State
 
 ROUNDING = 1e-5  # a sum of costs that is above a bound by less is at the bound
@@ -236,12 +236,8 @@ shielded_behaviour = Behaviour(
 
 def safety_value(params: dict[str, PyTree], features: jax.Array, cfg: Any) -> jax.Array:
     """min_i V_i within [0, C], float [...]: the discounted cost until the first violation."""
-
-    def value(name: str) -> jax.Array:
-        logits: Any = critic_of(cfg).apply(params[name], features)
-        return two_hot_mean(logits)
-
-    return clipped(jnp.minimum(*map(value, PAIR)), cfg)
+    first, second = (value_of(params[name], features, cfg) for name in PAIR)
+    return clipped(jnp.minimum(first, second), cfg)
 
 
 # ---- the shield --------------------------------------------------------------------------------

@@ -17,17 +17,15 @@ from jaxsafe.learn.dreaming import (
     Scene,
     dreaming_learner,
     dreaming_policy,
-    no_range,
     seen,
 )
 from jaxsafe.learn.off_policy import off_policy
-from jaxsafe.learn.planning import PlanConfig, cem, elites
+from jaxsafe.learn.planning import PlanConfig, cem, elites, particles_of
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.treatments import Treatment, no_treatment
-from jaxsafe.learn.world_model import critic_of, dream_returns, read, world_of
+from jaxsafe.learn.world_model import dream_returns, read, value_of, world_of
 from jaxsafe.nn.rssm import Latent
-from jaxsafe.nn.two_hot import BINS, two_hot_mean
-from jaxsafe.types import Algorithm, Count, Env, Policy, PyTree
+from jaxsafe.types import Algorithm, Count, Env, Metrics, Policy, PyTree
 
 
 @config
@@ -40,13 +38,15 @@ class OSRPConfig(PlanConfig, dreamer.DreamerConfig):
                 if there are fewer of these than elites, the smallest C of all plans
         acts with the first action of the mean that CEM finds
 
-    in dreams of Dreamer's model, which has a head of cost, c. V is the critic of Dreamer's actor, which
-    learns in dreams as in Dreamer, blind to cost. It does not act.
+    in dreams of Dreamer's model, which has a head of cost, c. V is the critic of Dreamer's actor. That
+    actor learns in dreams, blind to cost, and serves the critic alone: the planner acts.
 
     Source: Huang et al. (2024), "SafeDreamer: Safe Reinforcement Learning with World Models",
     arXiv:2307.07176; the settings are from the authors' code.
-    Differs from it: Dreamer is the later one. The head of cost has no weight of its own. Plans are
-    drawn once for each environment, and are none of the actor's.
+    Differs from it: the model and the actor are those of Dreamer's later version. The authors weigh the
+    loss of cost's head by 10 on steps that cost; here its weight is 1. They scale C by 1000 / H even
+    where actions are repeated; here T counts the policy's steps. C = cost_limit is allowed here, not
+    there. The actor proposes no plans, as in the authors' settings; the paper mixes some in.
     """
 
     # The undiscounted cost that an episode may have, as in the authors' code.
@@ -67,15 +67,17 @@ class OSRPLagConfig(PriceClockConfig, OSRPConfig):
     """OSRP-Lag: OSRP whose plans also pay for cost, at the price of a PID controller.
 
         elites: the largest R - lam R_c, among the same plans as in OSRP
-        lam  = clip(pid_kp e + I + pid_kd max(0, J_c - J_c'), 0, price_max),   e = J_c - cost_limit
-        I   <- clip(I + pid_ki e, 0, price_max),   every `dual_every` steps
+        I   <- clip(I + pid_ki e, 0, price_max),   e = J_c - cost_limit,   every `dual_every` steps
+        lam  = clip(pid_kp e + I + pid_kd max(0, J_c - J_c'), 0, price_max)
 
     R_c is the return of cost, with a critic of its own. J_c is the smoothed cost of an episode, and
     J_c' what it was before. The rest is as in OSRP.
 
     Source: Huang et al. (2024), "SafeDreamer: Safe Reinforcement Learning with World Models",
     arXiv:2307.07176; the settings are from the authors' code.
-    Differs from it: as OSRP, and there the price moves with each episode.
+    Differs from it: as OSRP does. There the price moves after each episode. The error and the cost are
+    smoothed once more, by 0.95, the rise is over 10 moves, I starts at 0.001 and has no upper bound.
+    J_c is smoothed before `dual_starts`, too.
     """
 
     # Environment steps between two moves of the price. The authors' moves with each episode.
@@ -94,25 +96,26 @@ class OSRPLagConfig(PriceClockConfig, OSRPConfig):
 # ---- learning ----------------------------------------------------------------------------------
 
 
-def learn_beside(trained: dict[str, PyTree], memory: PyTree, scene: Scene, key: jax.Array) -> Outcome:
-    """Dreamer's actor, and a critic of what it would cost."""
+def learn_with_cost_critic(
+    trained: dict[str, PyTree], memory: PyTree, scene: Scene, key: jax.Array
+) -> Outcome:
+    """As Dreamer, and a critic of what its actor's dreams cost, which the actor does not see."""
     found = dreamer.learn_reward(trained, memory["range"], scene, key)
     _, loss, metrics = dreamer.learn_cost(trained, found.dreams, scene)
     return Outcome(found.loss + loss, {"range": found.range}, found.metrics | metrics)
 
 
-planned = Behaviour(
-    learn=dreamer.learn,
-    memory=lambda cfg: {"range": no_range()},
-    heads=(("cost", BINS),),
-    targets=lambda env, rows, cfg: {"cost": rows.cost},
-)
-planned_at_a_price = planned._replace(learn=learn_beside, critics=("critic_r", "critic_c"))
+planned = dreamer.blind._replace(heads=dreamer.priced.heads, targets=dreamer.priced.targets)
+planned_at_a_price = planned._replace(learn=learn_with_cost_critic, critics=("critic_r", "critic_c"))
 
 
 class Price(NamedTuple):
-    """The price lam; what it remembers: the sum of violations, as a price, and the smoothed cost of an
-    episode, float []."""
+    """What the controller remembers, float [] each.
+
+    lam: the price.
+    integral: `pid_ki` times the sum of violations, within [0, price_max].
+    cost: the smoothed cost of an episode, 0 at first.
+    """
 
     lam: jax.Array
     integral: jax.Array
@@ -139,7 +142,7 @@ controller = Treatment(
 # ---- planning ----------------------------------------------------------------------------------
 
 
-class Planning(NamedTuple):
+class PlanMemory(NamedTuple):
     """What the policy remembers: where it was, what it did there, and the mean of its plan, [H, A]."""
 
     latent: Latent
@@ -150,21 +153,24 @@ class Planning(NamedTuple):
 def scores(
     env: Env,
     behaviour: Behaviour,
+    treatment: Treatment,
     learned: Learned,
     latent: Latent,
     plans: jax.Array,
     key: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
-    """What `plans` [S, H, A] earn in dreams from `latent`, and what they cost in an episode: [S] each.
-    If there is a critic of cost, the first is less the price of the returns of cost."""
+    """What each of `plans` [S, H, A] earns in dreams from `latent`, and C: float [S] each.
+
+    With a critic of cost it earns R - lam R_c.
+    """
     cfg, params = learned.config, learned.params
     world = world_of(env, behaviour.all_heads, cfg)
-    dreams = (cfg.particles, len(plans))
-    start = jax.tree.map(lambda x: jnp.broadcast_to(x, (*dreams, *x.shape)), latent)
+    shape = (cfg.particles, len(plans))
+    start = particles_of(latent, shape)
 
     def step(now: Latent, x: tuple[jax.Array, jax.Array]) -> tuple[Latent, jax.Array]:
         action, key = x
-        action = jnp.broadcast_to(action, (*dreams, action.shape[-1]))
+        action = jnp.broadcast_to(action, (*shape, action.shape[-1]))
         after: Any = world.apply(params["model"], now, action, key, method="imagine")
         return after, after.features
 
@@ -174,35 +180,33 @@ def scores(
     says = read(world, params["model"], features)
 
     def returns(of: str, critic: str, discount: jax.Array | float) -> jax.Array:
-        logits: Any = critic_of(cfg).apply(params[critic], features)
-        args = says[of], two_hot_mean(logits), says["cont"]
+        args = says[of], value_of(params[critic], features, cfg), says["cont"]
         return dream_returns(*args, discount=discount, decay=cfg.td_lambda)[0].mean(0)
 
     ret = returns("reward", "critic_r", cfg.discount)
     if "critic_c" in behaviour.critics:
-        ret = controller.advantage(learned.dual, ret, returns("cost", "critic_c", cfg.cost_discount))
+        ret = treatment.advantage(learned.dual, ret, returns("cost", "critic_c", cfg.cost_discount))
     cost = says["cost"][1:].mean(1).sum(0)
     return ret, env.episode_length / plans.shape[1] * cost
 
 
-def planning(env: Env, behaviour: Behaviour) -> Policy:
+def dream_planning_policy(env: Env, behaviour: Behaviour, treatment: Treatment) -> Policy:
     """The policy that plans anew at each step, in dreams."""
-    dreamers = dreaming_policy(env, behaviour)
+    acting = dreaming_policy(env, behaviour)
 
-    def init(learned: Learned) -> Planning:
-        start: Any = dreamers.init(learned)
-        mean = jnp.zeros((learned.config.plan_steps, env.action_size))
-        return Planning(start.latent, start.action, mean)
+    def init(learned: Learned) -> PlanMemory:
+        latent, action = acting.init(learned)
+        return PlanMemory(latent, action, jnp.zeros((learned.config.plan_steps, env.action_size)))
 
     def act(
-        learned: Learned, carry: Planning, obs: Any, key: jax.Array | None
-    ) -> tuple[jax.Array, Planning, dict[str, Any]]:
+        learned: Learned, carry: PlanMemory, obs: PyTree, key: jax.Array | None
+    ) -> tuple[jax.Array, PlanMemory, Metrics]:
         latent_key, plan_key = (None, jax.random.key(0)) if key is None else jax.random.split(key)
         memory = Memory(carry.latent, carry.action)
         latent = seen(env, behaviour, learned, memory, obs, latent_key)
-        score = partial(scores, env, behaviour, learned, latent)
+        score = partial(scores, env, behaviour, treatment, learned, latent)
         mean = cem(score, elites, carry.mean, (), plan_key, learned.config)
-        return mean[0], Planning(latent, mean[0], jnp.concatenate([mean[1:], mean[-1:]])), {}
+        return mean[0], PlanMemory(latent, mean[0], jnp.concatenate([mean[1:], mean[-1:]])), {}
 
     return Policy(init=init, act=act)
 
@@ -216,7 +220,7 @@ def make(
     behaviour: Behaviour = planned,
     treatment: Treatment = no_treatment,
 ) -> Algorithm:
-    learner = dreaming_learner(env, behaviour, planning(env, behaviour))
+    learner = dreaming_learner(env, behaviour, dream_planning_policy(env, behaviour, treatment))
     return off_policy(env, learner, treatment, axis_name)
 
 

@@ -32,11 +32,12 @@ from jaxsafe.learn.world_model import (
     laprop,
     model_loss,
     policy_of,
+    value_of,
     world_of,
 )
 from jaxsafe.nn.gaussian import Gaussian, sample
 from jaxsafe.nn.rssm import SIZES, Latent, WorldModel
-from jaxsafe.nn.two_hot import BINS, two_hot_loss, two_hot_mean
+from jaxsafe.nn.two_hot import BINS, two_hot_loss
 from jaxsafe.types import Env, Metrics, Policy, PyTree
 
 fixed = jax.lax.stop_gradient
@@ -119,7 +120,7 @@ class Scene(NamedTuple):
         return (self.batch.weight * jnp.where(self.batch.follows, x, 0.0).mean(0)).sum()
 
     def value(self, critic: PyTree, features: jax.Array) -> jax.Array:
-        return two_hot_mean(self.logits(critic, features))
+        return value_of(critic, features, self.cfg)
 
     def logits(self, critic: PyTree, features: jax.Array) -> jax.Array:
         found: Any = critic_of(self.cfg).apply(critic, features)

@@ -107,6 +107,12 @@ def critic_of(cfg: Any) -> Head:
     return Head(size.layers, size.units, BINS, scale=0.0)
 
 
+def value_of(critic: PyTree, features: jax.Array, cfg: Any) -> jax.Array:
+    """What a critic says of `features` [..., F], float [...]."""
+    logits: Any = critic_of(cfg).apply(critic, features)
+    return two_hot_mean(logits)
+
+
 def policy_of(outputs: jax.Array) -> Gaussian:
     """The action distribution [..., A] of an actor's outputs [..., 2 A]. Environments clip actions."""
     mean, std = jnp.split(outputs, 2, axis=-1)

@@ -4,14 +4,14 @@
     picture    each layer halves it: a convolution, the largest of each 2 x 2, norm, SiLU
                back: each layer doubles it: every pixel becomes 2 x 2, a convolution, norm, SiLU
 
-Convolutions are 5 x 5. What surrounds a picture is 0.
+Convolutions are 5 x 5. A picture is surrounded by zeros, which are mid-grey to the first layer: it sees
+pixels less 0.5.
 
 Source: Hafner et al. (2025), "Mastering Diverse Control Tasks through World Models", Nature 640;
     the layers of pictures are from the authors' code.
 """
 
 import math
-from typing import Any
 
 import flax.linen as nn
 import jax
@@ -20,7 +20,7 @@ import numpy as np
 
 from jaxsafe.config import ConfigError
 from jaxsafe.nn.cnn import patches
-from jaxsafe.nn.rssm import BlockDense, Head, Hidden, Latent, Size, fan_in
+from jaxsafe.nn.rssm import BlockDense, Head, Hidden, Latent, Size, fan_in, normed
 from jaxsafe.nn.two_hot import symlog
 
 SIDE = 5  # of a convolution
@@ -65,19 +65,20 @@ def vector_loss(decoded: jax.Array, obs: jax.Array) -> jax.Array:
 # ---- pictures ----------------------------------------------------------------------------------
 
 
-# [2, SIDE, places]: 1 where tap d of a convolution, at pixel a of a pair, reads this place of a picture
+# Of one axis. A square has two pixels. READS[a, d, s] is 1 where tap d of the kernel, for pixel a of
+# the square, falls on place s of the patch. In REPEATED_READS two neighbouring pixels are one place.
 PIXEL, TAP = np.mgrid[:2, :SIDE]
-SHRINK = ((PIXEL + TAP)[..., None] == np.arange(SIDE + 1)).astype(np.float32)
-GROW = ((PIXEL + TAP)[..., None] // 2 == np.arange(SIDE // 2 + 1)).astype(np.float32)  # pixels doubled
+READS = ((PIXEL + TAP)[..., None] == np.arange(SIDE + 1)).astype(np.float32)
+REPEATED_READS = ((PIXEL + TAP)[..., None] // 2 == np.arange(SIDE // 2 + 1)).astype(np.float32)
 
 
 class Convolution(nn.Module):
-    """A convolution whose results come in squares of 2 x 2 pixels, float [..., h, w, 2, 2, out].
+    """A 5 x 5 convolution whose results lie in squares of 2 x 2 pixels, float [..., h, w, 2, 2, out].
 
-    The squares are those of the picture [..., 2 h, 2 w, C]. If it `grows`, the picture is
-    [..., h, w, C] and each of its pixels becomes a square. The results of a square are one product of a
-    matrix and of all pixels that they read. So few of these are copied, and on a CPU it is far faster
-    than XLA's own convolution: see `patches`.
+    Its input is [..., 2 h, 2 w, C]. If it `grows` the input is [..., h, w, C], and each pixel is first
+    repeated as 2 x 2. One matrix product gives the four results of a square from all pixels that they
+    read: 6 x 6, or 3 x 3 if it grows. This copies fewer pixels than a patch for each result does. On a
+    CPU it is far faster than XLA's convolution: see `patches`.
     """
 
     out: int
@@ -87,7 +88,7 @@ class Convolution(nn.Module):
     def __call__(self, x: jax.Array) -> jax.Array:
         kernel = self.param("kernel", fan_in(1.0), (SIDE, SIDE, x.shape[-1], self.out))
         bias = self.param("bias", nn.initializers.zeros, (self.out,))
-        reads, stride = (GROW, 1) if self.grows else (SHRINK, 2)
+        reads, stride = (REPEATED_READS, 1) if self.grows else (READS, 2)
         # row and column of the place that is read (s, t), of the tap (d, e), of the pixel (a, b)
         matrix = jnp.einsum("ads,bet,deco->stcabo", reads, reads, kernel, precision="highest")
         seen = patches(x, reads.shape[-1], stride)
@@ -95,13 +96,8 @@ class Convolution(nn.Module):
         return squares.reshape(*squares.shape[:-1], 2, 2, self.out) + bias
 
 
-def normed(x: jax.Array) -> jax.Array:
-    """Each pixel normalised by its root mean square, then SiLU. Only in a module's `__call__`."""
-    return nn.silu(nn.RMSNorm(1e-4)(x))
-
-
-def doubled(squares: jax.Array) -> jax.Array:
-    """The picture of squares: [..., h, w, 2, 2, C] -> [..., 2 h, 2 w, C]."""
+def picture_of(squares: jax.Array) -> jax.Array:
+    """Squares side by side: [..., h, w, 2, 2, C] -> [..., 2 h, 2 w, C]."""
     *front, height, width, _, _, channels = squares.shape
     return jnp.moveaxis(squares, -4, -3).reshape(*front, 2 * height, 2 * width, channels)
 
@@ -113,14 +109,17 @@ class PictureEncoder(nn.Module):
 
     @nn.compact
     def __call__(self, picture: jax.Array) -> jax.Array:
-        x: Any = picture.astype(jnp.float32) / 255 - 0.5
+        x = picture.astype(jnp.float32) / 255 - 0.5
         for channels in self.size.channels:
             x = normed(Convolution(channels)(x).max((-3, -2)))
         return x.reshape(*x.shape[:-3], math.prod(x.shape[-3:]))
 
 
 class PictureDecoder(nn.Module):
-    """Latents -> pictures in [0, 1], float [..., H, W, C]."""
+    """Latents -> pictures in [0, 1], float [..., H, W, C].
+
+    shape: [H, W, C].
+    """
 
     size: Size
     shape: tuple[int, int, int]
@@ -131,15 +130,15 @@ class PictureDecoder(nn.Module):
         height, width = (side // 2 ** len(channels) for side in self.shape[:2])
         front = latent.deter.shape[:-1]
         h = latent.deter.reshape(*front, blocks, self.size.deter // blocks)
-        of_h = BlockDense(height * width * channels[-1] // blocks)(h)  # a block has its own channels
+        of_h = BlockDense(height * width * channels[-1] // blocks)(h)  # its own channels
         of_h = jnp.moveaxis(of_h.reshape(*front, blocks, height, width, -1), -4, -2)
         z = Hidden(2 * self.size.units)(latent.stoch)
         of_z = nn.Dense(height * width * channels[-1], kernel_init=fan_in(1.0))(z)
         shape = (*front, height, width, channels[-1])
         x = normed(of_h.reshape(shape) + of_z.reshape(shape))
         for out in channels[-2::-1]:
-            x = normed(doubled(Convolution(out, grows=True)(x)))
-        return nn.sigmoid(doubled(Convolution(self.shape[-1], grows=True)(x)))
+            x = normed(picture_of(Convolution(out, grows=True)(x)))
+        return nn.sigmoid(picture_of(Convolution(self.shape[-1], grows=True)(x)))
 
 
 def picture_loss(decoded: jax.Array, picture: jax.Array) -> jax.Array:
@@ -147,18 +146,20 @@ def picture_loss(decoded: jax.Array, picture: jax.Array) -> jax.Array:
 
 
 def check_picture(shape: tuple[int, ...], size: Size, name: str) -> None:
-    """Refuse a picture [H, W, C] that cannot be halved as often as the layers of this size do.
+    """Refuse a picture [H, W, C] whose sides are no multiples of 2^layers, or outside their range.
 
+    Args:
+        name: of the size, for the message.
     Raises:
         ConfigError: with the nearest sides.
     """
     unit = 2 ** len(size.channels)
     nearest = [unit * min(max(round(side / unit), LEAST), MOST) for side in shape[:2]]
     if nearest != [*shape[:2]]:
-        (height, width), (high, wide) = shape[:2], nearest
         raise ConfigError(
-            f"pictures of {width} x {height}: size={name} expects sides that {unit} divides, from "
-            f"{unit * LEAST} to {unit * MOST}; the nearest is env.vision_size=[{wide},{high}]"
+            f"pictures of {shape[1]} x {shape[0]}: size={name} expects sides that are multiples of "
+            f"{unit}, from {unit * LEAST} to {unit * MOST}; the nearest is "
+            f"env.vision_size=[{nearest[1]},{nearest[0]}]"
         )
 
 
@@ -166,8 +167,8 @@ def check_picture(shape: tuple[int, ...], size: Size, name: str) -> None:
 
 
 class Encoder(nn.Module):
-    """{'vision', 'vector'} -> what the posterior sees of them, float [..., E]. The vector may be
-    empty."""
+    """{'vision': uint8 [..., H, W, C], 'vector': float [..., O]} -> what the posterior sees of them,
+    float [..., E]. The vector may be empty."""
 
     size: Size
 
@@ -180,25 +181,24 @@ class Encoder(nn.Module):
 
 
 class Decoder(nn.Module):
-    """Latents -> {'vision': pictures in [0, 1], 'vector': symlog of the vector}, if that is not empty.
+    """Latents -> {'vision': pictures in [0, 1], [..., H, W, C], 'vector': symlog of it, [..., O]}.
 
-    shape: of a picture.
+    shape: [H, W, C].
+    obs_size: O, which may be 0.
     """
 
     size: Size
     shape: tuple[int, int, int]
     obs_size: int
 
-    def setup(self) -> None:
-        parts: dict[str, Any] = {"vision": PictureDecoder(self.size, self.shape)}
-        if self.obs_size:
-            parts["vector"] = VectorDecoder(self.size, self.obs_size)
-        self.parts = parts
-
+    @nn.compact
     def __call__(self, latent: Latent) -> dict[str, jax.Array]:
-        return {name: part(latent) for name, part in self.parts.items()}
+        vector = jnp.zeros((*latent.deter.shape[:-1], 0))
+        if self.obs_size:
+            vector = VectorDecoder(self.size, self.obs_size)(latent)
+        return {"vision": PictureDecoder(self.size, self.shape)(latent), "vector": vector}
 
     def loss(self, decoded: dict[str, jax.Array], obs: dict[str, jax.Array]) -> jax.Array:
-        """As of `VectorDecoder`, of both together."""
-        loss = picture_loss(decoded["vision"], obs["vision"])
-        return loss + vector_loss(decoded["vector"], obs["vector"]) if self.obs_size else loss
+        """The squared errors of picture and vector, as symlog, summed over both: float [...]."""
+        picture = picture_loss(decoded["vision"], obs["vision"])
+        return picture + vector_loss(decoded["vector"], obs["vector"])

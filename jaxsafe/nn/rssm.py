@@ -82,6 +82,12 @@ def fan_in(scale: float) -> Callable[..., jax.Array]:
     return nn.initializers.variance_scaling(scale, "fan_in", "truncated_normal")
 
 
+def normed(x: jax.Array) -> jax.Array:
+    """Divided by the root mean square over the last axis, then SiLU. Call it in a compact `__call__`,
+    whose module then has the scale of the norm."""
+    return nn.silu(nn.RMSNorm(1e-4)(x))
+
+
 class Hidden(nn.Module):
     """A linear layer, normalised by its root mean square, then SiLU: float [..., I] -> [..., units]."""
 
@@ -89,7 +95,7 @@ class Hidden(nn.Module):
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        return nn.silu(nn.RMSNorm(1e-4)(nn.Dense(self.units, kernel_init=fan_in(1.0))(x)))
+        return normed(nn.Dense(self.units, kernel_init=fan_in(1.0))(x))
 
 
 class Head(nn.Module):
@@ -150,8 +156,7 @@ class Memory(nn.Module):
         def join(x: jax.Array) -> jax.Array:
             return x.reshape(*x.shape[:-2], blocks * width)
 
-        y = join(BlockDense(width)(split(latent.deter), u))
-        y = nn.silu(nn.RMSNorm(1e-4)(y))
+        y = normed(join(BlockDense(width)(split(latent.deter), u)))
         reset, candidate, gate = jnp.split(BlockDense(3 * width)(split(y)), 3, axis=-1)
         keep = 1 - nn.sigmoid(join(gate) - 1)
         return (1 - keep) * jnp.tanh(nn.sigmoid(join(reset)) * join(candidate)) + keep * latent.deter

@@ -13,13 +13,14 @@ from jaxsafe.nn.two_hot import symexp
 from jaxsafe.types import PyTree, State
 
 
-class Lived(NamedTuple):
-    """T steps of an episode as its policy lived them, [T, ...].
+class Episode(NamedTuple):
+    """T steps of an episode.
 
-    state: what it met. Reward and cost are of the step that led there.
-    latent, action: where it thought that it was, and what it did there.
-    said: what it reported beside its action, as `risk` and `overruled`, by name.
-    alive: bool, whether the episode still ran.
+    state: State [T, ...], in which the policy acted. Reward and cost are of the step that led there.
+    latent: [T, ...], the model's, after it saw that state's observation.
+    action: float [T, A], taken there.
+    said: [T] by name, what the policy reports beside its action, such as `risk` and `overruled`.
+    alive: bool [T], whether the episode had not ended before. What comes later means nothing.
     """
 
     state: State
@@ -29,36 +30,53 @@ class Lived(NamedTuple):
     alive: jax.Array
 
 
-def lived(player: Player, key: jax.Array, steps: int | None = None) -> Lived:
-    """An episode of sampled actions, up to its time limit or for so many `steps`."""
+def play(player: Player, key: jax.Array, steps: int | None = None) -> Episode:
+    """An episode of sampled actions, up to its time limit or for so many `steps`.
+
+    Raises:
+        AttributeError: the policy has no world model.
+    """
     reset_key, act_key = jax.random.split(key)
 
-    def step(now: Playing, key: jax.Array) -> tuple[Playing, Lived]:
+    def step(now: Playing, key: jax.Array) -> tuple[Playing, Episode]:
         action, carry, said = player.decide(now.carry, now.state, key)
         state = player.task.step(now.state, action)
-        found = Lived(now.state, carry.latent, carry.action, said, now.alive)
+        found = Episode(now.state, carry.latent, carry.action, said, now.alive)
         return Playing(state, carry, now.alive & ~state.ended), found
 
-    def episode() -> Lived:
+    def episode() -> Episode:
         keys = jax.random.split(act_key, steps or player.task.episode_length)
         return jax.lax.scan(step, player.start(reset_key), keys)[1]
 
     return jax.jit(episode)()
 
 
-def painted(player: Player, latents: Latent) -> PyTree:
-    """What the model thinks that is observed in `latents` [...]: vectors, and pictures in [0, 1]."""
+def decoded(player: Player, latents: Latent) -> PyTree:
+    """What the model expects to observe in `latents` [...].
 
-    def decoded() -> PyTree:
+    A vector, float [..., O], in the units of observations; with pictures a dict of it and of `vision`,
+    float [..., H, W, C] in [0, 1].
+    """
+
+    def observations() -> PyTree:
         found = applied(player, latents, method="decode")
         return with_vector(found, symexp(vector_of(found)))
 
-    return jax.jit(decoded)()
+    return jax.jit(observations)()
 
 
-def foreseen(player: Player, episode: Lived, step: int, steps: int, key: jax.Array) -> Latent:
-    """The latents of the `steps` steps after `step`, as the model foresees them: it is told what was
-    done, but no longer sees what came of it."""
+def foreseen(player: Player, episode: Episode, step: int, steps: int, key: jax.Array) -> Latent:
+    """The model's latents of steps `step` + 1 to `step` + `steps`, [steps, ...]. It is told the actions
+    of the episode, but sees no observation after `step`.
+
+    Raises:
+        ValueError: the episode has fewer actions from `step` on.
+    """
+    left = len(episode.action) - step
+    if steps > left:
+        raise ValueError(
+            f"steps={steps}: expected at most {left}, which the episode has from {step} on"
+        )
 
     def ahead(latent: Latent, x: tuple[jax.Array, jax.Array]) -> tuple[Latent, Latent]:
         latent = applied(player, latent, *x, method="imagine")
@@ -72,13 +90,18 @@ def foreseen(player: Player, episode: Lived, step: int, steps: int, key: jax.Arr
     return jax.jit(dreamed)()
 
 
-def shield_dreams(player: Player, episode: Lived, step: int, key: jax.Array) -> ambs.Dreamt:
-    """What a shield dreams at a `step` of `episode`."""
+def shield_dreams(player: Player, episode: Episode, step: int, key: jax.Array) -> ambs.Dreamt:
+    """Dreams such as a shield has at a `step` of `episode`, drawn anew by `key`.
+
+    With `verify_action` they begin with the action that was taken. Where the shield overruled, that is
+    not the one that it looked at. With `shield=true_dynamics` the shield looked ahead in the simulator;
+    these are the model's dreams.
+    """
     latent, action = jax.tree.map(lambda x: x[step], (episode.latent, episode.action))
     return jax.jit(lambda: ambs.dreamt(player.task, player.learned, latent, action, key))()
 
 
 def applied(player: Player, *args: Any, method: str) -> Any:
-    """A method of the policy's world model, whose heads are not read."""
+    """A method of the policy's world model that reads none of its heads."""
     world = world_of(player.task, {}, player.learned.config)
     return world.apply(player.learned.params["model"], *args, method=method)

@@ -14,7 +14,6 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from jaxsafe.config import ConfigError, convert
-from jaxsafe.run.plain import repeated
 from jaxsafe.run.settings import DEFAULT, MOST, Settings, load, nested, settings_from_options
 
 ERRORS = (HydraException, OmegaConfBaseException)  # of arguments that only Hydra can judge
@@ -86,10 +85,7 @@ def check_kind(override: Override) -> None:
 def choices(override: Override) -> list[Any]:
     """The values of an option that has several."""
     key = override.key_or_group
-    found = [parse(f"{key}={text}").value() for text in override.sweep_string_iterator()]
-    if (value := repeated(found)) is not None:
-        raise ConfigError(f"{key}={value} occurs twice")
-    return found
+    return [parse(f"{key}={text}").value() for text in override.sweep_string_iterator()]
 
 
 def check_grid(overrides: list[Override]) -> None:

@@ -155,7 +155,7 @@ def test_a_dreamers_update_keeps_the_structure_and_the_replay_keeps_bytes(name):
     chex.assert_trees_all_equal_shapes_and_dtypes(before, after)
     assert before.replay.obs["vision"].dtype == jnp.uint8
     large = dataclasses.replace(cfg, size="1m")
-    with pytest.raises(ConfigError, match="pictures of 8 x 8: size=1m expects sides that 16 divides"):
+    with pytest.raises(ConfigError, match="8 x 8: size=1m expects sides that are multiples of 16"):
         jax.eval_shape(lambda: algo.init(jax.random.key(0), large, START))
 
 

@@ -1,7 +1,6 @@
 """SafeDreamer's planner by hand: what a plan earns and costs in dreams, and which one it takes."""
 
 import dataclasses
-from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -13,6 +12,7 @@ from toys import Corridor
 
 from jaxsafe.algos import safe_dreamer
 from jaxsafe.learn.acting import Learned
+from jaxsafe.learn.treatments import no_treatment
 from jaxsafe.nn.rssm import Latent
 
 CFG = safe_dreamer.OSRPLagConfig(
@@ -38,12 +38,9 @@ def learned(monkeypatch) -> Learned:
         x = features[..., 0]
         return {"reward": x, "cost": 1.0 * (x > 1), "cont": jnp.ones_like(x)}
 
-    def nothing(params, features):
-        return jnp.zeros((*features.shape[:-1], 255))  # a value of 0
-
     monkeypatch.setattr(safe_dreamer, "world_of", lambda *_: Line())
     monkeypatch.setattr(safe_dreamer, "read", says)
-    monkeypatch.setattr(safe_dreamer, "critic_of", lambda cfg: SimpleNamespace(apply=nothing))
+    monkeypatch.setattr(safe_dreamer, "value_of", lambda critic, features, cfg: 0 * features[..., 0])
     monkeypatch.setattr(safe_dreamer, "seen", lambda *_: NOWHERE)
     return Learned(CFG, {"model": (), "critic_r": (), "critic_c": ()}, PRICE, ())
 
@@ -53,17 +50,18 @@ def test_a_plan_earns_its_discounted_rewards_and_costs_as_much_as_an_episode_of_
     cost of 1 in 2 steps, 10 in an episode of 20. The price of .1 takes .1 * .5 off."""
     plans = jnp.array([[[0.5], [0.5]], [[1.0], [1.0]]])
     args = (learned, NOWHERE, plans, jax.random.key(0))
-    ret, cost = safe_dreamer.scores(Corridor(), safe_dreamer.planned, *args)
+    ret, cost = safe_dreamer.scores(Corridor(), safe_dreamer.planned, no_treatment, *args)
     np.testing.assert_allclose(ret, [1.0, 2.0], rtol=1e-6)
     np.testing.assert_allclose(cost, [0.0, 10.0], rtol=1e-6)
-    ret, _ = safe_dreamer.scores(Corridor(), safe_dreamer.planned_at_a_price, *args)
+    at_a_price = safe_dreamer.planned_at_a_price, safe_dreamer.controller
+    ret, _ = safe_dreamer.scores(Corridor(), *at_a_price, *args)
     np.testing.assert_allclose(ret, [1.0, 1.95], rtol=1e-6)
 
 
 def test_it_takes_what_earns_most_without_a_cost_and_all_where_none_is_minded(learned):
     """a_1 + a_2 <= 1 is free: 1 and 0 earn most of that, and 1 and 1 most of all."""
     env: Any = Corridor(action_size=1)
-    policy = safe_dreamer.planning(env, safe_dreamer.planned)
+    policy = safe_dreamer.dream_planning_policy(env, safe_dreamer.planned, no_treatment)
 
     @jax.jit
     def acted(limit):
