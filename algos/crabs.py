@@ -129,6 +129,10 @@ class CRABSConfig(EnsembleConfig, CertificateConfig, sac.SACConfig):
     tau: Share = 0.005  # The share of the critics that their targets take on, as in the paper.
     lr: Rate = 1e-3  # The policy's learning rate, by Adam. The paper has 3e-4.
     critic_lr: Rate = 1e-3  # The critics' learning rate, by Adam. The paper has 3e-4.
+    lr_decay: bool = False  # Whether both fall linearly to 0 at `total_iterations`.
+    # The entropy that SAC's temperature aims at, in nats for each dimension of the action, as in the
+    # paper.
+    target_entropy: Annotated[float, Bounds(-100, 100)] = -1.0
     # The temperature at first. The paper's code has 1, where rewards are larger.
     alpha_init: Annotated[float, Bounds(1e-10, 1e6)] = 0.1
     # What a unit of cost costs in reward, so that it pays to live on. 10, as on the paper's cart.

@@ -3,8 +3,9 @@
     python scripts/brax_sac.py halfcheetah                       # 3e6 steps
     python scripts/brax_sac.py ant preset=parallel total_steps=1e6 num_seeds=4
 
-Options are those of scripts/train.py, without lists. The run folder, its curves and its evaluation are
-those of every run. Backends differ in their physics: figures are comparable within one alone.
+The preset is `frequent`. Options are those of scripts/train.py, without lists. The run folder, its
+curves and its evaluation are those of every run. Backends differ in their physics: figures are
+comparable within one alone.
 """
 
 import argparse
@@ -24,7 +25,8 @@ def main() -> None:
     parser.add_argument("options", nargs="*", metavar="key=value")
     parser.add_argument("--backend", default="generalized", help="of Brax (generalized)")
     args = parser.parse_args()
-    options = {"total_steps": 3_000_000, "video": False, **read_values(args.options).options}
+    given = read_values(args.options).options
+    options = {"preset": "frequent", "total_steps": 3_000_000, "video": False, **given}
     env = from_brax(brax.envs.get_environment(args.task, backend=args.backend), costs=())
     jaxsafe.train(env, options.pop("algo", "sac"), **options)
 

@@ -184,7 +184,8 @@ def test_two_gradient_steps_are_those_of_the_paper_or_of_omnisafe(
     settings: dict[str, Any] = {"hidden": (), "layer_norm": False, "lr": 0.01, "critic_lr": 0.02,
                                 "tau": 0.1, "discount": 0.9, "cost_discount": 0.8,
                                 "policy_delay": 1}  # fmt: skip
-    settings |= {"alpha_init": 0.3, "alpha_lr": 0.03} if method == "sac" else {}
+    if method == "sac":
+        settings |= {"alpha_init": 0.3, "alpha_lr": 0.03, "target_entropy": -1.0, "lr_decay": False}
     settings |= {"cost_reduce": reduce, "price_unit": price_unit} if reduce else {}
     if omnisafe:
         conventions = compat.overrides("omnisafe", ALGOS[row].config)
