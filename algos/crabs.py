@@ -129,7 +129,8 @@ class CRABSConfig(EnsembleConfig, CertificateConfig, sac.SACConfig):
     tau: Share = 0.005  # The share of the critics that their targets take on, as in the paper.
     lr: Rate = 1e-3  # The policy's learning rate, by Adam. The paper has 3e-4.
     critic_lr: Rate = 1e-3  # The critics' learning rate, by Adam. The paper has 3e-4.
-    lr_decay: bool = False  # Whether both fall linearly to 0 at `total_iterations`.
+    # Whether both learning rates fall linearly to 0 at `total_iterations`.
+    lr_decay: bool = False
     # The entropy that SAC's temperature aims at, in nats for each dimension of the action, as in the
     # paper.
     target_entropy: Annotated[float, Bounds(-100, 100)] = -1.0

@@ -31,7 +31,7 @@ class DDPGConfig(td3.DeterministicConfig):
     Source: Lillicrap et al. (2016), "Continuous control with deep reinforcement learning",
     arXiv:1509.02971, algorithm 1.
     Differs from it: the noise is Gaussian and has no memory, as in OmniSafe, and each environment has
-    its own, as in Li et al. (2023), "Parallel Q-Learning", arXiv:2307.12983. The defaults are for a
+    its own, as in Li et al. (2023), "Parallel Q-Learning", arXiv:2307.12983. The defaults are for two
     thousand environments, as in TD3. OmniSafe's y has mu for mu' (`target_policy`).
     """
 

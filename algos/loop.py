@@ -68,7 +68,8 @@ class LOOPConfig(ModelBasedConfig, sac.SACConfig):
     batch_size: Amount = 1024  # Transitions of a gradient step. OmniSafe has 256.
     lr: Rate = 3e-4  # The policy's learning rate, by Adam, as in OmniSafe.
     critic_lr: Rate = 3e-4  # The critics' learning rate, by Adam, as in OmniSafe.
-    lr_decay: bool = False  # Whether both fall linearly to 0 at `total_iterations`, as in OmniSafe.
+    # Whether both learning rates fall linearly to 0 at `total_iterations`. OmniSafe keeps them.
+    lr_decay: bool = False
     # The share of the critics that their targets take on at each step. OmniSafe has 0.005.
     tau: Share = 0.01
     # The entropy that SAC's temperature aims at, in nats for each dimension of the action, as in its

@@ -40,8 +40,9 @@ class SACConfig(ActorCriticConfig):
 
     Source: Haarnoja et al. (2018), "Soft Actor-Critic Algorithms and Applications", arXiv:1812.05905,
     algorithm 1; the loss of the temperature is that of the authors' code.
-    Differs from it: the defaults are for a thousand environments. Gradient steps are few and large, the
-    targets follow faster, the critics have layer norm, and observations are normalised.
+    Differs from it: the defaults are for two thousand environments. Gradient steps are few and large,
+    the targets follow faster, learning rates decay, alpha aims at a lower entropy, the critics have
+    layer norm, and observations are normalised.
     """
 
     # The temperature at first, low because rewards of Safety Gym are some hundredths. The authors' code
@@ -165,6 +166,7 @@ OMNISAFE: dict[str, Any] = {
     "obs_normalize": False,
     "alpha_init": 0.2,
     "alpha_lr": 0.0,
+    "target_entropy": -1.0,
     "policy_delay": 2,
 }
 NAVIGATION: dict[str, Any] = OMNISAFE | {"alpha_init": 1e-5, "lr": 5e-6, "critic_lr": 1e-3}

@@ -58,8 +58,8 @@ class TD3Config(DeterministicConfig):
 
     Source: Fujimoto, van Hoof and Meger (2018), "Addressing Function Approximation Error in
     Actor-Critic Methods", arXiv:1802.09477, algorithm 1.
-    Differs from it: the defaults are for a thousand environments, each with noise of its own, as in Li
-    et al. (2023), "Parallel Q-Learning", arXiv:2307.12983. Gradient steps are few and large, the
+    Differs from it: the defaults are for two thousand environments, each with noise of its own, as in
+    Li et al. (2023), "Parallel Q-Learning", arXiv:2307.12983. Gradient steps are few and large, the
     targets follow faster, the critics have layer norm, and observations are normalised.
     """
 
@@ -194,7 +194,7 @@ ONE_NOISE: dict[str, Any] = {"noise_min": 0.1, "noise_max": 0.1, "learning_start
 
 def published(base: dict[str, Any], navigation: dict[str, Any] | None = None) -> dict[str, Any]:
     """The settings of a row: OmniSafe's for velocity, for navigation, and ours for 64 environments."""
-    of_sac = {"alpha_init", "alpha_lr", "policy_delay"}
+    of_sac = {"alpha_init", "alpha_lr", "target_entropy", "policy_delay"}
     omnisafe = {k: v for k, v in sac.OMNISAFE.items() if k not in of_sac} | ONE_NOISE
     rates = {"lr": 5e-6, "critic_lr": 1e-3}
     return {

@@ -3,8 +3,8 @@
     python scripts/brax_sac.py halfcheetah                       # 3e6 steps
     python scripts/brax_sac.py ant preset=parallel total_steps=1e6 num_seeds=4
 
-The preset is `frequent`. Options are those of scripts/train.py, without lists. The run folder, its
-curves and its evaluation are those of every run. Backends differ in their physics: figures are
+The preset of `sac` is `frequent`. Options are those of scripts/train.py, without lists. The run folder,
+its curves and its evaluation are those of every run. Backends differ in their physics: figures are
 comparable within one alone.
 """
 
@@ -25,10 +25,12 @@ def main() -> None:
     parser.add_argument("options", nargs="*", metavar="key=value")
     parser.add_argument("--backend", default="generalized", help="of Brax (generalized)")
     args = parser.parse_args()
-    given = read_values(args.options).options
-    options = {"preset": "frequent", "total_steps": 3_000_000, "video": False, **given}
+    options = {"total_steps": 3_000_000, "video": False, **read_values(args.options).options}
+    algo = options.pop("algo", "sac")
+    if algo == "sac":
+        options.setdefault("preset", "frequent")
     env = from_brax(brax.envs.get_environment(args.task, backend=args.backend), costs=())
-    jaxsafe.train(env, options.pop("algo", "sac"), **options)
+    jaxsafe.train(env, algo, **options)
 
 
 if __name__ == "__main__":

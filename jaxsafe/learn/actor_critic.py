@@ -53,7 +53,8 @@ from jaxsafe.types import Env, Metrics, PyTree
 class ActorCriticConfig(EncoderConfig, OffPolicyConfig):
     """What the actor-critic methods share.
 
-    Against batches of 256 the learning rates grow less than the batch, and the targets follow faster.
+    The learning rates and `tau` are for batches of 4,096. Against OmniSafe's batches of 256 the rates
+    grow less than the batch, and the targets follow faster.
     """
 
     # Environments side by side, of all devices together. OmniSafe has 1.
@@ -257,7 +258,7 @@ def actor_critic(env: Env, actor: Actor, treatment: Treatment) -> Learner:
         targets, obs = params["targets"], features(params, batch.next_obs)
         action, bonus = actor.next_action(params, targets, obs, key, cfg)
         q_r, q_c = judged(targets, obs, action, cfg)
-        if treatment is not no_treatment and cfg.cost_action == "mean":
+        if treatment is not no_treatment and cfg.cost_action == "mean":  # all critics once more
             q_c = judged(targets, obs, actor.act(params, obs, None, cfg), cfg).cost
         return targets_of(batch, charged, Values(q_r.min(0) + bonus, q_c), names(cfg), cfg)
 
