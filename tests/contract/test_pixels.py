@@ -137,7 +137,7 @@ def test_an_actor_critic_learns_where_the_patch_is_and_only_the_critics_teach_it
     moved = jax.tree.map(lambda a, b: (a != b).any(), ts.params["actor"], first.params["actor"])
     assert any(jax.tree.leaves(moved))
     ts = first
-    for iteration in range(8):
+    for iteration in range(12):
         ts, metrics = update(ts, Shared(np.int32(iteration)))
     assert metrics["train/return"] > 3 and metrics["train/nonfinite"] == 0
 
