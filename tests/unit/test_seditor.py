@@ -170,8 +170,13 @@ def test_the_proposer_feels_its_own_action_and_what_the_editor_makes_of_it(quick
 
 def test_the_editor_brings_unsafe_proposals_to_the_bound_as_the_price_grows(monkeypatch, quick_draws):
     """Q_r = -(a - 1/2)^2, and Q_c = a+ costs from 0 on. The proposals stay where reward is."""
-    worth = lambda p, s, a, cfg: -((a[..., 0] - 0.5) ** 2)  # noqa: E731
-    both = lambda p, s, a, names, cfg: Values(worth(p, s, a, cfg)[None], jax.nn.relu(a[..., 0]))  # noqa: E731
+
+    def worth(params, obs, action, cfg):
+        return -((action[..., 0] - 0.5) ** 2)
+
+    def both(params, obs, action, names, cfg):
+        return Values(worth(params, obs, action, cfg)[None], jax.nn.relu(action[..., 0]))
+
     monkeypatch.setattr(seditor, "reward_value", worth)
     monkeypatch.setattr(seditor, "with_reduced_cost", both)
     params, obs, rule = nets(), jnp.zeros((64, 1)), optax.adam(0.1)  # without entropy
