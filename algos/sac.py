@@ -170,12 +170,14 @@ OMNISAFE: dict[str, Any] = {
     "policy_delay": 2,
 }
 NAVIGATION: dict[str, Any] = OMNISAFE | {"alpha_init": 1e-5, "lr": 5e-6, "critic_lr": 1e-3}
-# the published replay ratio with 64 environments: 4 gradient steps for each of their steps
+# The published replay ratio with 64 environments: 4 gradient steps for each of their steps. These are
+# 16 times fewer than OmniSafe's, on batches 16 times as large, so networks and targets move faster. Its
+# critics have no layer norm either.
 PARALLEL: dict[str, Any] = {
-    "num_envs": 64, "replay_ratio": 256, "batch_size": 4096, "tau": 0.005, "lr": 3e-4,
-    "critic_lr": 3e-4, "lr_decay": False,
+    "num_envs": 64, "replay_ratio": 256, "batch_size": 4096, "tau": 0.02, "lr": 1e-3,
+    "critic_lr": 1e-3, "lr_decay": True, "layer_norm": False,
 }  # fmt: skip
-SAC_PARALLEL: dict[str, Any] = PARALLEL | {"target_entropy": -1.0}
+SAC_PARALLEL: dict[str, Any] = PARALLEL | {"policy_delay": 2}
 # 16 gradient steps for each step of 1,024 environments: it learns from fewer steps, and takes more time
 FREQUENT: dict[str, Any] = {
     "num_envs": 1024, "batch_size": 1024, "tau": 0.01, "lr": 3e-4, "critic_lr": 3e-4, "lr_decay": False,

@@ -3,11 +3,13 @@
 Each row is one program. Compiling is timed apart. The rate is the median of --repeats runs, after
 --warmup steps of each environment: fresh layouts, where nothing touches yet, are faster. With --algo a
 run is an update of the algorithm, else steps with random actions, resets included. An algorithm with a
-replay is measured once it learns. A physics step is one substep. The forward pass at the end of a step
-is not counted.
+replay is measured once it learns. Its settings are options of train, as in
+`--algo sac_lag preset=parallel algo.hidden_dtype=bfloat16`. A physics step is one substep. The forward
+pass at the end of a step is not counted.
 """
 
 import argparse
+import dataclasses
 import json
 import os
 import platform
@@ -31,6 +33,7 @@ from jaxsafe.learn.observations import EncoderConfig
 from jaxsafe.learn.rollout import collect, init_rollout, memoryless
 from jaxsafe.learn.timetable import ReplayConfig
 from jaxsafe.run import run_folder
+from jaxsafe.run.arguments import compose
 from jaxsafe.run.devices import check_devices, device_name, use_compilation_cache
 from jaxsafe.run.flags import fail, number
 from jaxsafe.run.programs import build
@@ -101,14 +104,29 @@ def options_of(args: argparse.Namespace) -> dict[str, Any]:
     return {"engine": args.engine, **awake, **vision}
 
 
+def config_of(algo: str, options: list[str], **sizes: Any) -> Any:
+    """The config of an algorithm.
+
+    Args:
+        options: those of train, as 'preset=parallel' and 'algo.lr=1e-3'.
+        sizes: fields of the config; those that are None are left as they are.
+    Raises:
+        ConfigError: an option that is neither of these, or a wrong value.
+    """
+    for option in options:
+        if not option.startswith(("preset=", "compat=", "algo.")):
+            raise ConfigError(f"{option}: expected preset=, compat= or algo.OPTION=")
+    given = {name: size for name, size in sizes.items() if size is not None}
+    return dataclasses.replace(compose([f"algo={algo}", *options]).algo, **given)
+
+
 def measure(name: str, wanted: int | None, args: argparse.Namespace) -> dict:
     """A row, of so many environments as are `wanted`, or as the algorithm has, or 256."""
     env, warmup = envs.make(name, **options_of(args)), args.warmup
     if args.algo:
-        config: Any = algos.ALGOS[args.algo].config
         sees = args.vision and issubclass(algos.ALGOS[args.algo].config, EncoderConfig)
-        given = {"num_envs": wanted, "horizon": args.horizon, "encoder": "cnn" if sees else None}
-        cfg = config(**{k: v for k, v in given.items() if v})
+        encoder = {"encoder": "cnn"} if sees else {}
+        cfg = config_of(args.algo, args.options, num_envs=wanted, horizon=args.horizon, **encoder)
         num_envs, horizon = cfg.num_envs, cfg.horizon
         if isinstance(cfg, ReplayConfig):  # until then it only fills its replay
             warmup = max(warmup, -(-cfg.learning_starts // num_envs) + horizon)
@@ -126,6 +144,7 @@ def measure(name: str, wanted: int | None, args: argparse.Namespace) -> dict:
         "awake": args.awake,
         "vision": args.vision,
         "algo": args.algo,
+        "options": " ".join(args.options),
         "num_envs": num_envs,
         "num_seeds": args.seeds,
         "devices": args.devices if args.algo else 1,
@@ -191,7 +210,9 @@ def main() -> int:
 def command() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.error = fail  # type: ignore[method-assign]
-    parser.add_argument("envs", nargs="*", metavar="ENV", help="tasks to measure")
+    parser.add_argument(
+        "envs", nargs="*", metavar="ENV|key=value", help="tasks to measure, and settings of --algo"
+    )
     parser.add_argument(
         "--num-envs",
         type=number(Amount),
@@ -236,9 +257,14 @@ def command() -> int:
         help="also measure another library, as crax=PYTHON (see peers.py)",
     )
     parser.add_argument("--json", type=Path, help="append the rows to this file, a line each")
-    args = parser.parse_args()
+    args = parser.parse_intermixed_args()
+    args.options = [text for text in args.envs if "=" in text]
+    args.envs = [text for text in args.envs if "=" not in text]
     if args.algo:
         find_algo(args.algo)
+        config_of(args.algo, args.options)
+    elif args.options:
+        raise ConfigError(f"{args.options[0]}: settings are of an algorithm; give --algo")
     for name in args.envs:
         envs.check_options(name, **options_of(args))
     use_compilation_cache()

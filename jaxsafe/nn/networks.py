@@ -36,6 +36,8 @@ class MLP(nn.Module):
         their gain and bias: the gradients of these are sums over the batch, slow on a GPU.
     precision: of the products. On a GPU JAX's default rounds them to 10 bits, too few for KLs of
         1e-2.
+    hidden_dtype: of the hidden layers' products and outputs. Weights, sums within a layer norm and the
+        last layer are float32 all the same.
     """
 
     hidden: tuple[int, ...]
@@ -45,20 +47,22 @@ class MLP(nn.Module):
     gain: float = 1.0
     layer_norm: bool = False
     precision: jax.lax.Precision = jax.lax.Precision.HIGHEST
+    hidden_dtype: str = "float32"
 
     @nn.compact
     def __call__(self, x: PyTree) -> jax.Array:
         if isinstance(x, dict):
             x = CNN(self.precision, name="encoder")(x)
         for size in self.hidden:
-            x = self._dense(size, math.sqrt(2.0), x.shape[-1])(x)
-            x = nn.LayerNorm(use_scale=False, use_bias=False)(x) if self.layer_norm else x
+            x = self._dense(size, math.sqrt(2.0), x.shape[-1], self.hidden_dtype)(x)
+            if self.layer_norm:
+                x = nn.LayerNorm(use_scale=False, use_bias=False, dtype=self.hidden_dtype)(x)
             x = ACTIVATIONS[self.activation](x)
-        return self._dense(self.out, self.gain, x.shape[-1])(x)
+        return self._dense(self.out, self.gain, x.shape[-1], "float32")(x)
 
-    def _dense(self, size: int, gain: float, fan_in: int) -> nn.Dense:
+    def _dense(self, size: int, gain: float, fan_in: int, dtype: str) -> nn.Dense:
         kernel, bias = INITS[self.weights](gain, fan_in)
-        return nn.Dense(size, precision=self.precision, kernel_init=kernel, bias_init=bias)
+        return nn.Dense(size, precision=self.precision, dtype=dtype, kernel_init=kernel, bias_init=bias)
 
 
 def torch_uniform(fan_in: int) -> Callable[..., jax.Array]:
@@ -82,10 +86,17 @@ def mlp(cfg: Any, out: int, gain: float = 1.0) -> MLP:
 
 
 def coarse_mlp(cfg: Any, out: int, layer_norm: bool = False) -> MLP:
-    """With products in the device's own precision (TensorFloat-32 on a GPU): enough for Q-learning and
-    imitation, which bound no KL."""
-    precision = jax.lax.Precision.DEFAULT
-    return MLP(cfg.hidden, out, cfg.init, cfg.activation, layer_norm=layer_norm, precision=precision)
+    """With products in the device's own precision (TensorFloat-32 on a GPU), or in that of
+    `hidden_dtype`: enough for Q-learning and imitation, which bound no KL."""
+    return MLP(
+        cfg.hidden,
+        out,
+        cfg.init,
+        cfg.activation,
+        layer_norm=layer_norm,
+        precision=jax.lax.Precision.DEFAULT,
+        hidden_dtype=cfg.hidden_dtype,
+    )
 
 
 def policy_outputs(action_size: int, cfg: Any) -> int:

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from jaxsafe.algos.ppo import PPOConfig
+from jaxsafe.algos.sac import SACConfig
 from jaxsafe.nn.cnn import patches
-from jaxsafe.nn.critics import largest, smallest
+from jaxsafe.nn.critics import init_critics, largest, q_values, smallest
 from jaxsafe.nn.gaussian import log_prob
 from jaxsafe.nn.networks import LOG_STD, action_dist, init_params, value
 
@@ -75,6 +76,27 @@ def test_gradients_reach_every_parameter_and_are_finite(settings):
 
     for x in jax.tree.leaves(jax.grad(total)(tree)):
         assert jnp.isfinite(x).all() and (x != 0).any()
+
+
+@pytest.mark.parametrize("layer_norm", [False, True])
+def test_hidden_layers_in_bfloat16_round_to_8_bits_and_all_else_stays_float32(layer_norm):
+    """Rounding errors of 2^-9 each, some ten of them, one upon the other."""
+    coarse, fine = (
+        SACConfig(hidden_dtype=dtype, layer_norm=layer_norm, hidden=(64, 64))
+        for dtype in ("bfloat16", "float32")
+    )
+    obs, action = jax.random.normal(jax.random.key(1), (500, 7)), jnp.zeros((500, 2))
+    critics = init_critics(jax.random.key(0), 7, 2, 2, coarse)
+
+    def loss(critics, cfg):
+        return (q_values(critics, obs, action, cfg) ** 2).mean()
+
+    q = [q_values(critics, obs, action, cfg) for cfg in (coarse, fine)]
+    grads = [jax.grad(loss)(critics, cfg) for cfg in (coarse, fine)]
+    for rounded, exact in zip(*map(jax.tree.leaves, ([q[0], grads[0]], [q[1], grads[1]])), strict=True):
+        assert rounded.dtype == jnp.float32
+        error = jnp.linalg.norm(rounded - exact) / jnp.linalg.norm(exact)
+        assert 1e-4 < error < 2e-2
 
 
 def test_the_gradient_of_the_smallest_value_is_that_of_one():
