@@ -178,6 +178,9 @@ PARALLEL: dict[str, Any] = {
     "critic_lr": 1e-3, "lr_decay": True, "layer_norm": False,
 }  # fmt: skip
 SAC_PARALLEL: dict[str, Any] = PARALLEL | {"policy_delay": 2}
+# Between two moves of the price there are about as many gradient steps as with the defaults, of which
+# each environment step has 16 times fewer. Where a policy answers at once, a price that waits swings.
+PRICED_PARALLEL: dict[str, Any] = {"dual_every": 2000}
 # 16 gradient steps for each step of 1,024 environments: it learns from fewer steps, and takes more time
 FREQUENT: dict[str, Any] = {
     "num_envs": 1024, "batch_size": 1024, "tau": 0.01, "lr": 3e-4, "critic_lr": 3e-4, "lr_decay": False,
@@ -236,7 +239,7 @@ ROWS = {
         {
             "omnisafe": OMNISAFE | LAG,
             "omnisafe_navigation": NAVIGATION | LAG_NAVIGATION,
-            "parallel": SAC_PARALLEL,
+            "parallel": SAC_PARALLEL | PRICED_PARALLEL,
         },
         omnisafe="SACLag",
         lever=LEVER | LEVER_LAG,
@@ -248,7 +251,7 @@ ROWS = {
         {
             "omnisafe": OMNISAFE | PID,
             "omnisafe_navigation": NAVIGATION | PID_NAVIGATION,
-            "parallel": SAC_PARALLEL,
+            "parallel": SAC_PARALLEL | PRICED_PARALLEL,
         },
         omnisafe="SACPID",
         lever=LEVER | LEVER_PID,

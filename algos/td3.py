@@ -200,7 +200,7 @@ def published(base: dict[str, Any], navigation: dict[str, Any] | None = None) ->
     return {
         "omnisafe": omnisafe | base,
         "omnisafe_navigation": omnisafe | rates | (base if navigation is None else navigation),
-        "parallel": sac.PARALLEL,
+        "parallel": sac.PARALLEL | (sac.PRICED_PARALLEL if base else {}),
     }
 
 
