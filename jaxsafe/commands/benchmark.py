@@ -5,11 +5,13 @@ Each row is one program. Compiling is timed apart. The rate is the median of --r
 run is an update of the algorithm, else steps with random actions, resets included. An algorithm with a
 replay is measured once it learns. Its settings are options of train, as in
 `--algo sac_lag preset=parallel algo.hidden_dtype=bfloat16`. A physics step is one substep. The forward
-pass at the end of a step is not counted.
+pass at the end of a step is not counted. A task of your own is 'module:name', as in train. Only Safety
+Gym's and the velocity tasks tell their physics steps. A --peer has the sizes of --num-envs and --algo.
 """
 
 import argparse
 import dataclasses
+import itertools
 import json
 import os
 import platform
@@ -29,15 +31,17 @@ import numpy as np
 from jaxsafe import algos, envs
 from jaxsafe.commands.guard import guarded
 from jaxsafe.config import Amount, ConfigError, Devices, Iterations, Period
+from jaxsafe.envs import SafetyGym, Velocity
 from jaxsafe.learn.observations import EncoderConfig
 from jaxsafe.learn.rollout import collect, init_rollout, memoryless
-from jaxsafe.learn.timetable import ReplayConfig
+from jaxsafe.learn.timetable import ReplayConfig, RoundConfig, timetable_of
 from jaxsafe.run import run_folder
 from jaxsafe.run.arguments import compose
 from jaxsafe.run.devices import check_devices, device_name, use_compilation_cache
 from jaxsafe.run.flags import fail, number
 from jaxsafe.run.programs import build
-from jaxsafe.run.settings import TrainConfig, find_algo
+from jaxsafe.run.session import engine_of
+from jaxsafe.run.settings import TrainConfig, find_algo, load
 from jaxsafe.types import Shared
 
 
@@ -101,7 +105,8 @@ def options_of(args: argparse.Namespace) -> dict[str, Any]:
     """What environments are made with."""
     awake = {} if args.awake is None else {"awake": args.awake}
     vision = {"observe_vision": True, "vision_size": args.vision} if args.vision else {}
-    return {"engine": args.engine, **awake, **vision}
+    engine = {} if args.engine == "auto" else {"engine": args.engine}  # others have no such option
+    return {**engine, **awake, **vision}
 
 
 def config_of(algo: str, options: list[str], **sizes: Any) -> Any:
@@ -138,9 +143,10 @@ def measure(name: str, wanted: int | None, args: argparse.Namespace) -> dict:
     compile_time, runs = timed(fn, state, before=before, repeats=args.repeats)
     seconds = statistics.median(runs)
     rate = num_envs * horizon * args.seeds / seconds
+    physics = isinstance(env, SafetyGym | Velocity)  # others do not tell it
     return {
         "env": name,
-        "engine": env.engine,
+        "engine": engine_of(env),
         "awake": args.awake,
         "vision": args.vision,
         "algo": args.algo,
@@ -151,8 +157,8 @@ def measure(name: str, wanted: int | None, args: argparse.Namespace) -> dict:
         "horizon": horizon,
         "warmup": before * horizon,
         "env_steps_per_s": rate,
-        "physics_steps_per_s": rate * env.substeps,
-        "simulated_s_per_s": rate * env.step_seconds,
+        "physics_steps_per_s": rate * env.substeps if physics else None,
+        "simulated_s_per_s": rate * env.step_seconds if physics else None,
         "fastest": num_envs * horizon * args.seeds / min(runs),
         "slowest": num_envs * horizon * args.seeds / max(runs),
         "compile_s": compile_time,
@@ -160,14 +166,36 @@ def measure(name: str, wanted: int | None, args: argparse.Namespace) -> dict:
     }
 
 
-def measure_peer(spec: str) -> list[dict]:
+def peer_sizes(wanted: int | None, args: argparse.Namespace) -> dict[str, int]:
+    """The options of peers.py with which a peer has our environments, batches and gradient steps.
+
+    Raises:
+        ConfigError: peers cannot learn as --algo does.
+    """
+    sizes = {"num_envs": wanted, "horizon": args.horizon}
+    cfg = config_of(args.algo, args.options, **sizes) if args.algo else None
+    if not isinstance(cfg, RoundConfig):
+        return {} if wanted is None else {"num-envs": wanted}
+    timetable = timetable_of(cfg, None)
+    if timetable.gradient_steps % timetable.rows:
+        raise ConfigError(
+            f"algo.learn_every={cfg.learn_every}: expected whole gradient steps for each step of all "
+            f"environments, as peers take them; here {timetable.gradient_steps} follow {timetable.rows}"
+        )
+    return {
+        "num-envs": cfg.num_envs,
+        "batch-size": timetable.batch,
+        "gradient-steps": timetable.gradient_steps // timetable.rows,
+    }
+
+
+def measure_peer(spec: str, sizes: dict[str, int]) -> list[dict]:
     """The rows of peers.py, by the Python that has the peer installed."""
     name, _, python = spec.partition("=")
-    script = Path(__file__).with_name("peers.py")
+    options = [f"--{option}={size}" for option, size in sizes.items()]
+    command = [python or sys.executable, Path(__file__).with_name("peers.py"), name, *options]
     try:
-        done = subprocess.run(
-            [python or sys.executable, script, name], stdout=subprocess.PIPE, text=True
-        )
+        done = subprocess.run(command, stdout=subprocess.PIPE, text=True)
     except OSError as error:
         raise ConfigError(f"--peer {spec}: {error.strerror}: {python}") from None
     if done.returncode:
@@ -189,11 +217,14 @@ def versions() -> dict[str, str]:
 def show(row: dict) -> str:
     what = row["algo"] or "steps"
     what += " {}x{}".format(*row["vision"]) if row["vision"] else ""
+    physics, simulated = (
+        "" if row[rate] is None else f"{row[rate]:,.0f}"
+        for rate in ("physics_steps_per_s", "simulated_s_per_s")
+    )
     return (
-        f"{row['env']:<16} {row['engine']:<5} {what:<13} {row['num_seeds']:>3} x {row['num_envs']:<6} "
-        f"{row['env_steps_per_s']:>11,.0f} {row['physics_steps_per_s']:>12,.0f} "
-        f"{row['simulated_s_per_s']:>10,.0f} {row['compile_s']:>8.1f} "
-        f"{row['memory_bytes'] / 2**30:>7.2f}"
+        f"{row['env']:<16} {row['engine'] or '':<5} {what:<13} {row['num_seeds']:>3} x "
+        f"{row['num_envs']:<6} {row['env_steps_per_s']:>11,.0f} {physics:>12} {simulated:>10} "
+        f"{row['compile_s']:>8.1f} {row['memory_bytes'] / 2**30:>7.2f}"
     )
 
 
@@ -265,7 +296,10 @@ def command() -> int:
         config_of(args.algo, args.options)
     elif args.options:
         raise ConfigError(f"{args.options[0]}: settings are of an algorithm; give --algo")
+    for num_envs in args.num_envs if args.peer else ():
+        peer_sizes(num_envs, args)
     for name in args.envs:
+        load("env", name)
         envs.check_options(name, **options_of(args))
     use_compilation_cache()
     about = versions()
@@ -287,8 +321,8 @@ def command() -> int:
             row = measure(name, num_envs, args)
             print(show(row), flush=True)
             keep(row)
-    for spec in args.peer:
-        for row in measure_peer(spec):
+    for spec, num_envs in itertools.product(args.peer, args.num_envs):
+        for row in measure_peer(spec, peer_sizes(num_envs, args)):
             print(show_peer(row), flush=True)
             keep(row)
     return 0

@@ -141,6 +141,8 @@ class FromBrax:
     """See `from_brax`. Their `done` terminates; their scalar `metrics` are our `info`; actions are
     clipped to [-1, 1], which is what their policies give."""
 
+    engine: str | None = None  # what computes the physics, where the caller names it
+
     def __init__(self, env: Any, costs: Costs, episode_length: int, obs: str):
         self.env, self.episode_length, self._part = env, episode_length, obs
         name = type(env.unwrapped).__name__

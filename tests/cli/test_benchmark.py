@@ -1,13 +1,15 @@
 """jaxsafe benchmark."""
 
+import argparse
 import json
 import sys
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import pytest
 
-from jaxsafe.commands import benchmark
+from jaxsafe.commands import benchmark, peers
 from jaxsafe.config import ConfigError
 
 
@@ -55,3 +57,77 @@ def test_settings_without_an_algorithm_are_refused(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["benchmark", "point_goal1", "algo.tau=0.5"])
     assert benchmark.main() == 2
     assert "give --algo" in capsys.readouterr().err
+
+
+def test_a_task_of_the_user_s_own_is_measured_without_physics_steps(tmp_path, monkeypatch, capsys):
+    rows = tmp_path / "rows.jsonl"
+    sizes = "--num-envs 3 --horizon 2 --warmup 2 --repeats 2"
+    monkeypatch.setattr(
+        sys, "argv", ["benchmark", "toys:Corridor", *sizes.split(), "--json", str(rows)]
+    )
+    assert benchmark.main() == 0
+    assert "toys:Corridor          steps           1 x 3" in capsys.readouterr().out
+    row = json.loads(rows.read_text())
+    assert row["env_steps_per_s"] > 0
+    assert (row["engine"], row["physics_steps_per_s"], row["simulated_s_per_s"]) == (None, None, None)
+
+
+def asked(algo: str | None, *options: str) -> argparse.Namespace:
+    return argparse.Namespace(algo=algo, options=list(options), horizon=None)
+
+
+@pytest.mark.parametrize("algo", ["sac", "sac_lag"])
+@pytest.mark.parametrize("options", [[], ["preset=parallel"], ["algo.learn_every=4", "algo.n_step=2"]])
+def test_a_peer_s_sac_has_our_environments_replay_and_networks(algo, options):
+    cfg = benchmark.config_of(algo, options)
+    sizes = benchmark.peer_sizes(None, asked(algo, *options))
+    theirs = peers.sac_settings(peers.Sizes(*sizes.values()))
+    assert list(sizes) == [name.replace("_", "-") for name in peers.Sizes._fields]
+    replayed = theirs["batch_size"] * theirs["grad_updates_per_step"]
+    assert replayed / theirs["num_envs"] == cfg.replay_ratio
+    assert theirs["num_envs"] == cfg.num_envs
+    assert theirs["batch_size"] == (cfg.batch_size or peers.Sizes().batch_size)
+    assert (theirs["min_replay_size"], theirs["max_replay_size"]) == (
+        cfg.learning_starts,
+        cfg.replay_size,
+    )
+    assert (theirs["normalize_observations"], theirs["discounting"]) == (
+        cfg.obs_normalize,
+        cfg.discount,
+    )
+    assert cfg.hidden == (256, 256)  # what theirs have by default
+
+
+def test_a_peer_of_another_algorithm_has_only_the_number_of_environments():
+    assert benchmark.peer_sizes(16, asked("ppo_lag")) == benchmark.peer_sizes(16, asked(None))
+    assert benchmark.peer_sizes(16, asked(None)) == {"num-envs": 16}
+    assert benchmark.peer_sizes(None, asked(None)) == {}
+
+
+def test_a_peer_s_sac_cannot_take_half_a_gradient_step():
+    batches = asked("sac", "algo.learn_every=2", "algo.batch_size=65536")
+    with pytest.raises(ConfigError, match=r"algo\.learn_every=2"):
+        benchmark.peer_sizes(2048, batches)
+
+
+def test_a_peer_s_rate_is_that_of_its_settled_epochs():
+    """A stand-in for Brax's trainer: 10,000 steps fill the replay, then come epochs of 100 steps."""
+
+    class Evaluator:
+        def run_evaluation(self, params, training_metrics):
+            raise AssertionError("it is left out")
+
+    def train(*, num_envs, num_timesteps, num_evals, min_replay_size, progress_fn, **_):
+        evaluator: Any = Evaluator()
+        progress_fn(0, evaluator.run_evaluation(None, training_metrics={}))
+        length = (num_timesteps - min_replay_size) / (num_evals - 1)
+        assert length == 100 * num_envs
+        for epoch in range(num_evals - 1):
+            end = min_replay_size + (epoch + 1) * length
+            progress_fn(end - 1, {"training/sps": 1e9})  # a log within the epoch
+            metrics = {"training/sps": 10.0 + epoch, "training/walltime": 1.0}
+            progress_fn(end, evaluator.run_evaluation(None, training_metrics=metrics))
+
+    row = peers.sac_training(train, Evaluator, None, peers.Sizes(100, 50, 4))
+    assert (row["slowest"], row["env_steps_per_s"], row["fastest"]) == (12.0, 14.0, 16.0)
+    assert (row["num_envs"], row["replay_ratio"]) == (100, 2.0)
