@@ -221,21 +221,21 @@ def record_by(cfg: Any) -> Callable[[Stepping, jax.Array], ModelRecord]:
 def learnable(ring: ModelRecord, span: Span) -> jax.Array:
     """Where the ring holds a transition that the model can learn from, bool [R, N]: it leads to the
     next row, within an episode, without a jump and to something finite."""
-    rows = ring.reward.shape[0]
+    rows = ring.reward.shape[1]
     position = (jnp.arange(rows) - span.oldest) % rows
-    has_next = (position < span.count - 1)[:, None]
+    has_next = position < span.count - 1
     arrives = ~ring.jump & jnp.isfinite(ring.reward) & jnp.isfinite(ring.cost)
-    return has_next & ~ring.last & jnp.roll(arrives, -1, axis=0)
+    return (has_next & ~ring.last & jnp.roll(arrives, -1, axis=1)).T
 
 
 def transitions_at(ring: ModelRecord, flat: jax.Array, cfg: Any) -> tuple[jax.Array, jax.Array]:
     """Inputs [..., I] and targets [..., K] of the transitions that begin at entries `flat` [...] of a
-    ring [R, N], counted row by row."""
-    rows, num_envs = ring.reward.shape
+    ring, counted row by row: first row 0 of every environment."""
+    num_envs, rows = ring.reward.shape
     row, env = flat // num_envs, flat % num_envs
-    now = jax.tree.map(lambda x: x[row, env], (ring.obs, ring.action))
+    now = jax.tree.map(lambda x: x[env, row], (ring.obs, ring.action))
     kept = (ring.obs, *(getattr(ring, name) for name in cfg.told))
-    obs, *told = jax.tree.map(lambda x: x[(row + 1) % rows, env], kept)
+    obs, *told = jax.tree.map(lambda x: x[env, (row + 1) % rows], kept)
     inputs = jnp.concatenate([now[0], jnp.clip(now[1], -1.0, 1.0)], -1)
     return inputs, jnp.concatenate([*(x[..., None] for x in told), obs - now[0]], -1)
 
@@ -243,9 +243,10 @@ def transitions_at(ring: ModelRecord, flat: jax.Array, cfg: Any) -> tuple[jax.Ar
 def scale_of(ring: ModelRecord, mask: jax.Array, axis_name: str | None) -> Scale:
     """Mean and standard deviation of the inputs where `mask` [R, N] holds, over all devices."""
     count = jnp.maximum(psum(mask.sum(), axis_name), 1)
+    mask = mask.T[..., None]  # as in the ring
 
     def mean(x: jax.Array) -> jax.Array:
-        return psum(jnp.where(mask[..., None], x, 0.0).sum((0, 1)), axis_name) / count
+        return psum(jnp.where(mask, x, 0.0).sum((0, 1)), axis_name) / count
 
     def mean_and_std(x: jax.Array) -> tuple[jax.Array, jax.Array]:
         centre = mean(x)
@@ -402,7 +403,7 @@ def when_due(
     warm_up, period = max(1, -(-cfg.learning_starts // steps)), max(1, round(cfg.refit_every / steps))
     filled = jnp.asarray(shared.iteration) - shared.since + 1  # updates
     due = (filled >= warm_up) & ((filled - warm_up) % period == 0)
-    rows = replay.reward.shape[0]
+    rows = replay.reward.shape[1]
     span = held(rows, cfg.horizon, cfg.horizon, jnp.asarray(shared.iteration), shared.since)
     like = jax.eval_shape(learn, span)[1]
 

@@ -73,7 +73,7 @@ class TrainState:
     bill: Bill, or () without a treatment.
     normaliser: Normaliser, or () without `obs_normalize`.
     stepping: this device's environments.
-    replay: their ring, [R, N, ...].
+    replay: their ring, [N, R, ...].
     lost_time: LostTime, from which the mean length of an episode follows.
     """
 

@@ -8,9 +8,10 @@ Environments reset on the next step. The last observation of an episode has a ro
 action is ignored, and the row after it is the first of the next episode. So row t + 1 is always what
 follows row t, one observation a row is enough, and each episode takes one row more than it has steps.
 
-The ring has R rows of N environments, leaves [R, N, ...]. Which rows are written next and which ones
+The ring has R rows of N environments, leaves [N, R, ...]. Which rows are written next and which ones
 the ring holds are functions of the loop's clock. They are the same for all members of a `vmap`, so
-that writing is one `dynamic_update_slice` into a donated ring and never a scatter.
+that writing is one `dynamic_update_slice` into a donated ring and never a scatter. The environments
+come first because on a CPU XLA copies an array [R, 1, ...] on its way into a loop and out of it.
 
 Positions count from the oldest row that the ring holds: 0 is the oldest, `count - 1` the newest.
 """
@@ -111,7 +112,7 @@ def ring_rows(transitions: int, num_envs: int, block: int) -> int:
 
 def empty_ring(row: Record, rows: int) -> Record:
     """A ring for rows like `row` [N, ...], arrays or their shapes."""
-    return jax.tree.map(lambda x: jnp.zeros((rows, *x.shape), x.dtype), row)
+    return jax.tree.map(lambda x: jnp.zeros((x.shape[0], rows, *x.shape[1:]), x.dtype), row)
 
 
 def held(rows: int, block: int, written: Count, iteration: Count, since: Count) -> Span:
@@ -131,20 +132,20 @@ def held(rows: int, block: int, written: Count, iteration: Count, since: Count) 
 
 def write(ring: Record, new: Record, span: Span) -> Record:
     """`ring` with the rows `new` [T, N, ...] after those of `span`; T divides the rows of the ring."""
-    end = (span.oldest + span.count) % ring.reward.shape[0]
+    end = (span.oldest + span.count) % ring.reward.shape[1]
 
     def put(ring: jax.Array, new: jax.Array) -> jax.Array:
-        return jax.lax.dynamic_update_slice_in_dim(ring, new, end, axis=0)
+        return jax.lax.dynamic_update_slice_in_dim(ring, jnp.swapaxes(new, 0, 1), end, axis=1)
 
     return jax.tree.map(put, ring, new)
 
 
 def take(leaves: PyTree, span: Span, index: Index) -> PyTree:
-    """The entries of `leaves` [R, N, ...] at `index`, a pytree of [B, ...]."""
+    """The entries of `leaves` [N, R, ...] at `index`, a pytree of [B, ...]."""
 
     def entries(x: jax.Array) -> jax.Array:
-        rows = jax.lax.rem(span.oldest + index.position, jnp.int32(x.shape[0]))
-        return x.at[rows, index.env].get(mode="promise_in_bounds")
+        rows = jax.lax.rem(span.oldest + index.position, jnp.int32(x.shape[1]))
+        return x.at[index.env, rows].get(mode="promise_in_bounds")
 
     return jax.tree.map(entries, leaves)
 
@@ -155,7 +156,7 @@ def draw(key: jax.Array, ring: Record, span: Span, batch: int, ahead: int = 1) -
     choices = jnp.maximum(span.count - ahead, 1)
     return Index(
         jax.random.randint(position_key, (batch,), 0, choices),
-        jax.random.randint(env_key, (batch,), 0, ring.reward.shape[1]),
+        jax.random.randint(env_key, (batch,), 0, ring.reward.shape[0]),
     )
 
 

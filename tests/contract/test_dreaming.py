@@ -63,7 +63,7 @@ def test_an_update_keeps_the_structure(name, actor_grad):
     assert all(x.dtype == jnp.float32 and x.shape == () for x in metrics.values())
     assert {"train/return", "train/cost_estimate", "train/model_kl", "train/nonfinite"} <= {*metrics}
     assert algo.clocks(cfg) == (32, 2)
-    assert before.normaliser == () and before.replay.obs.shape == (24, 4, 4)
+    assert before.normaliser == () and before.replay.obs.shape == (4, 24, 4)
 
 
 def test_a_shield_in_the_simulator_keeps_the_structure_and_sees_the_state():
@@ -279,7 +279,7 @@ for name in sys.argv[2:]:
         for x in jax.tree.leaves((ts.params, ts.opt_state, ts.lost_time, metrics)):
             np.testing.assert_array_equal(x[0], x[1])  # the devices agree
     rings = np.asarray(ts.replay.obs)
-    assert rings.shape[2] == 4 and (rings[0] != rings[1]).any()  # each with a ring of its own
+    assert rings.shape[1] == 4 and (rings[0] != rings[1]).any()  # each with a ring of its own
     print(name, "ok")
 """
 

@@ -257,7 +257,7 @@ for name in sys.argv[2:]:
         for x in jax.tree.leaves((ts.params, ts.opt_state, ts.dual, ts.lost_time, metrics)):
             np.testing.assert_array_equal(x[0], x[1])  # the devices agree
     rings = np.asarray(ts.replay.obs)
-    assert rings.shape[2] == 4 and (rings[0] != rings[1]).any()  # each with a ring of its own
+    assert rings.shape[1] == 4 and (rings[0] != rings[1]).any()  # each with a ring of its own
     print(name, "ok")
 """
 

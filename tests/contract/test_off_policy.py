@@ -112,7 +112,7 @@ class Free(Corridor):
 def test_an_environment_may_have_no_costs():
     algo, cfg = ALGOS["sac_lag"].make(Free()), ALGOS["sac_lag"].config(**TINY)
     before = jax.eval_shape(lambda: algo.init(jax.random.key(0), cfg, START))
-    assert before.replay.costs.shape == (18, 8, 0)
+    assert before.replay.costs.shape == (8, 18, 0)
     after, _ = jax.eval_shape(algo.update, before, START)
     assert jax.tree.leaves(before) == jax.tree.leaves(after)
 
@@ -144,7 +144,7 @@ def test_the_first_actions_are_uniform_and_a_resumed_run_acts_by_its_policy_whil
     ts = dataclasses.replace(ts, params=fixed)
     fresh, _ = update(copy(ts), at(0))
     again, metrics = update(copy(ts), at(40, since=40))
-    random, chosen = np.asarray(fresh.replay.action)[:6], np.asarray(again.replay.action)[6:12]
+    random, chosen = np.asarray(fresh.replay.action)[:, :6], np.asarray(again.replay.action)[:, 6:12]
     assert abs(np.mean(random > 0.5) - 0.25) < 0.15 and abs(np.mean(random < -0.5) - 0.25) < 0.15
     assert (chosen < -0.99).all()
     assert not any(differ(fixed, again.params)) and jnp.isnan(metrics["train/critic_loss"])
@@ -198,7 +198,7 @@ def test_a_world_that_is_not_finite_costs_the_others_nothing_and_is_counted(name
     for iteration in range(2):
         ts, metrics = update(ts, at(iteration))
         assert metrics["train/bad_worlds"] == (iteration == 0)  # it is reset
-    assert metrics["train/nonfinite"] > 0 and jnp.isnan(ts.replay.reward[:, 0]).any()
+    assert metrics["train/nonfinite"] > 0 and jnp.isnan(ts.replay.reward[0]).any()
     assert jnp.isfinite(metrics["train/critic_loss"])
     learned = (ts.params, ts.opt_state, ts.normaliser, ts.lost_time)
     assert all(jnp.isfinite(x).all() for x in jax.tree.leaves(learned))
@@ -325,8 +325,8 @@ def test_an_episode_that_the_environment_ends_is_truncated_and_has_lost_no_time(
     env = Arriving(episode_length=9, lives=(3, 3))
     sizes = {"horizon": 16, "learn_every": 16, "stagger": False, "replay_size": 8 * 32}
     ts, m = build("sac", env, **sizes)[1](start("sac", env=env, **sizes), START)
-    clock = np.asarray(ts.replay.obs)[:16, :, 1]
-    np.testing.assert_array_equal(ts.replay.truncated[:16], clock == 3)
+    clock = np.asarray(ts.replay.obs)[:, :16, 1]
+    np.testing.assert_array_equal(ts.replay.truncated[:, :16], clock == 3)
     assert not ts.replay.terminated.any() and (clock <= 3).all()
     assert m["train/episode_length"] == 3 and m["train/cost"] == 6
     np.testing.assert_allclose(m["train/cost_estimate"], 18, rtol=1e-6)
@@ -419,7 +419,7 @@ for name in sys.argv[2:]:
     for x in jax.tree.leaves((ts.params, ts.opt_state, ts.normaliser, ts.lost_time, metrics)):
         np.testing.assert_array_equal(x[0], x[1])  # the devices agree
     rings = np.asarray(ts.replay.obs)
-    assert rings.shape[2] == 16 and (rings[0] != rings[1]).any()  # each with a ring of its own
+    assert rings.shape[1] == 16 and (rings[0] != rings[1]).any()  # each with a ring of its own
     alone = split(training(name, None, 32, UPDATES), devices=1)
     late = [np.asarray(m["train/return"])[..., -10:].mean() for m in (metrics, alone(keys[:1])[1])]
     assert min(late) > 17 and abs(late[0] - late[1]) < 1, late

@@ -53,15 +53,16 @@ LINE: Any = Line()  # as much of an environment as a model needs
 
 
 def ring_of(x, reward, **marks):
-    """A ring of [R, N] whose step from x pays `reward`, which stands in the row that follows."""
+    """A ring whose step from x [R, N] pays `reward`, which stands in the row that follows."""
     no = jnp.zeros(x.shape, bool)
     fields = dict.fromkeys(("first", "terminated", "truncated", "jump"), no) | marks
     number = jnp.zeros(x.shape)
     arrived = jnp.roll(reward, 1, axis=0)
-    return ModelRecord(
+    rows = ModelRecord(
         obs=x[..., None], action=number[..., None], reward=arrived, cost=number,
         costs=number[..., None], **fields,
     )  # fmt: skip
+    return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), rows)
 
 
 def noise_at(x):
