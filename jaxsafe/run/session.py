@@ -161,7 +161,7 @@ def about_replay(program: Program, train: TrainConfig) -> str:
     if not size:
         return ""
     rows = next(x for name, x in checkpoint.as_data(like).items() if checkpoint.in_replay(name))
-    each = math.prod(rows.shape[:3]) // len(program.members)  # [members or devices, R, N, ...]
+    each = math.prod(rows.shape[:3]) // len(program.members)  # [members or devices, N, R, ...]
     line = f"replay of {each:,} transitions a seed, {size / 1e9:.2f} GB in all"
     if checkpoint.keeps_replay(like, train.checkpoint_replay):
         return line
