@@ -187,7 +187,8 @@ def recorded(env: Any, steps: int) -> Record:
 def test_a_reward_meets_the_latent_of_the_observation_that_it_came_with():
     """And a reward a step late, an observation a step late or a forgotten start is noticed."""
     rows = recorded(Echo(episode_length=5, lives=(3, 9)), 24)
-    source = Source(rows, Span(jnp.int32(0), jnp.int32(24)), (), 64 * 8, 7)
+    ring = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), rows)
+    source = Source(ring, Span(jnp.int32(0), jnp.int32(24)), (), 64 * 8, 7)
     batch, _ = drawn_sequences(jax.random.key(2), source, None, None)
     assert batch.rows.first[1:].any() and batch.rows.terminated.any() and batch.rows.truncated.any()
 
