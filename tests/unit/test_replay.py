@@ -244,7 +244,8 @@ def test_members_write_and_sample_as_if_alone():
 @pytest.mark.parametrize("members", [None, 3])
 def test_a_write_is_one_update_slice_into_the_ring_that_was_given(members):
     row = jax.tree.map(lambda x: x[0], as_rows([life(np.random.default_rng(0), 3, 2)] * 5, 0, 1))
-    ring, new = empty_ring(row, 12), empty_ring(row, 4)
+    ring = empty_ring(row, 12)  # [5, 12, ...]
+    new = jax.tree.map(lambda x: jnp.stack([x] * 4), row)  # [4, 5, ...]
 
     def put(ring, new, iteration):
         return write(ring, new, held(12, 4, 0, iteration, jnp.int32(0)))
@@ -254,7 +255,9 @@ def test_a_write_is_one_update_slice_into_the_ring_that_was_given(members):
         put = jax.vmap(put, in_axes=(0, 0, None))
     compiled = jax.jit(put, donate_argnums=0).lower(ring, new, jnp.int32(0)).compile()
     text = compiled.as_text()
-    assert "dynamic-update-slice(" in text and " scatter(" not in text
+    assert "dynamic-update-slice(" in text and "scatter(" not in text
+    copied = [line for line in text.splitlines() if " copy(" in line]
+    assert not any("5,12" in line.partition(" copy(")[0] for line in copied)  # of the new rows alone
     memory = compiled.memory_analysis()
     size = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(ring))
     assert memory is not None and memory.alias_size_in_bytes == size
