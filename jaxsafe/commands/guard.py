@@ -1,6 +1,7 @@
 """What every command shares: an error that the user can mend is one line and an exit status."""
 
 import errno
+import os
 import sys
 from collections.abc import Callable
 
@@ -12,13 +13,16 @@ from jaxsafe.run import arguments, checkpoint
 from jaxsafe.run.divergence import Diverged
 
 DIVERGED = 3  # the exit status of a run that learns no more
+UNREAD = 128 + 13  # of a command whose output nobody reads, as a shell reports SIGPIPE
 BAD_DISK = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO)
 
 
 def guarded(command: Callable[[], int]) -> int:
     """Run `command`; what the user can mend becomes one line on stderr and an exit status."""
     try:
-        return command()
+        status = command()
+        sys.stdout.flush()  # not after this function, where a reader that has gone is a traceback
+        return status
     except (ConfigError, *arguments.ERRORS) as error:
         return complain(one_line(error), 2)
     except (checkpoint.CheckpointError, NoVideo) as error:
@@ -27,6 +31,9 @@ def guarded(command: Callable[[], int]) -> int:
         return complain(one_line(error), DIVERGED)
     except KeyboardInterrupt:
         return complain("stopped; what was saved stays", 130)
+    except BrokenPipeError:  # whoever read the output has gone, as in `jaxsafe study NAME --list | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return UNREAD
     except OSError as error:
         if error.errno not in BAD_DISK:
             raise

@@ -195,6 +195,14 @@ def test_an_interrupted_study_continues_with_what_is_left(toy, tmp_path, monkeyp
         assert f"(../images/{name})" in text and (toy.folder.parent / "images" / name).exists()
 
 
+def test_a_command_ends_quietly_where_nobody_reads_its_output(toy):
+    command = [sys.executable, "-m", "jaxsafe", "study", str(toy.folder), "--commands"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout and process.stderr
+        process.stdout.close()  # as `head` does when it has seen enough
+        assert (process.stderr.read(), process.wait()) == ("", 141)
+
+
 def test_a_page_keeps_the_words_around_its_tables(toy, tmp_path):
     trained(tmp_path / "run", toy.command(toy.runs[0]))
     (run,) = read_one(tmp_path / "run")
