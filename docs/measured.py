@@ -216,6 +216,23 @@ def training_speeds() -> str:
     return "\n".join(lines)
 
 
+def off_policy_speeds() -> str:
+    """Environment steps a second of SAC's training on one H200, ours and that of peers with as many
+    environments and gradient steps, the fastest first."""
+    rows = [r for r in benchmark_rows("benchmark_h200.jsonl") if (r["algo"] or "").startswith("sac")]
+    ours = latest([r for r in rows if "peer" not in r and not r.get("options")], "env", "num_seeds")
+    theirs = latest([r for r in rows if "peer" in r], "peer")
+    names = {"brax-sac": "Brax {brax}, SAC", "crax-sac-lag": "CRAX {crax-bench}, SAC-Lagrangian"}
+    own = {"sac": "jaxsafe, SAC", "sac_lag": "jaxsafe, SAC-Lagrangian"}
+    found = [(own[r["algo"]], seeds, r) for (_, seeds), r in ours.items()]
+    found += [(names[peer].format(**r), 1, r) for (peer,), r in theirs.items()]
+    lines = ["| | task | seeds | steps/s | slowest, fastest run |", "|---|---|---:|---:|---:|"]
+    for name, seeds, r in sorted(found, key=lambda x: -x[2]["env_steps_per_s"]):
+        rates = f"{r['env_steps_per_s']:,.0f} | {r['slowest']:,.0f}, {r['fastest']:,.0f}"
+        lines.append(f"| {name} | `{r['env']}` | {seeds} | {rates} |")
+    return "\n".join(lines)
+
+
 def training_bars(path: Path) -> None:
     """The README's figure of speed: `training_rows`."""
     rows = training_rows()[::-1]
@@ -373,6 +390,7 @@ def pages() -> dict[Path, str]:
             "throughput": throughput_table(),
             "velocity": velocity_speeds(),
             "training": training_speeds(),
+            "off-policy": off_policy_speeds(),
             "engine jax": engine_jax(),
         },
     }

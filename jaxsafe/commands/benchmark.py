@@ -194,8 +194,9 @@ def measure_peer(spec: str, sizes: dict[str, int]) -> list[dict]:
     name, _, python = spec.partition("=")
     options = [f"--{option}={size}" for option, size in sizes.items()]
     command = [python or sys.executable, Path(__file__).with_name("peers.py"), name, *options]
+    beside = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}  # this process has most of the GPU's memory
     try:
-        done = subprocess.run(command, stdout=subprocess.PIPE, text=True)
+        done = subprocess.run(command, stdout=subprocess.PIPE, text=True, env=os.environ | beside)
     except OSError as error:
         raise ConfigError(f"--peer {spec}: {error.strerror}: {python}") from None
     if done.returncode:

@@ -31,7 +31,7 @@ def guarded(command: Callable[[], int]) -> int:
         return complain(one_line(error), DIVERGED)
     except KeyboardInterrupt:
         return complain("stopped; what was saved stays", 130)
-    except BrokenPipeError:  # whoever read the output has gone, as in `jaxsafe study NAME --list | head`
+    except BrokenPipeError:  # the reader has gone, as in `jaxsafe study NAME --list | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return UNREAD
     except OSError as error:

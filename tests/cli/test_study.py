@@ -197,7 +197,8 @@ def test_an_interrupted_study_continues_with_what_is_left(toy, tmp_path, monkeyp
 
 def test_a_command_ends_quietly_where_nobody_reads_its_output(toy):
     command = [sys.executable, "-m", "jaxsafe", "study", str(toy.folder), "--commands"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True) as process:
         assert process.stdout and process.stderr
         process.stdout.close()  # as `head` does when it has seen enough
         assert (process.stderr.read(), process.wait()) == ("", 141)
