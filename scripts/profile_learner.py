@@ -2,19 +2,24 @@
 
 The environment has the sizes of point_goal1 and costs nothing to step, so that what is left of an
 update is the learner: acting, estimates, the policy's step and the critics'. Options are preset=,
-compat= and algo.OPTION= of train. Prints the median.
+compat= and algo.OPTION= of train. Prints the median, and with --kernels what an update consists of.
 """
 
 import argparse
+import collections
+import re
 import statistics
 import sys
+import tempfile
 from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from jaxsafe import algos
-from jaxsafe.commands.benchmark import config_of, timed, training
+from jaxsafe.commands.benchmark import Timing, config_of, timed, training
 from jaxsafe.config import ConfigError, nearest
 from jaxsafe.types import State
 
@@ -38,6 +43,49 @@ class Weightless:
         return State(x, x, x[0], jnp.abs(x[1]), jnp.abs(x[1:2]), jnp.bool_(False), {})
 
 
+class Kernel(NamedTuple):
+    """What XLA runs, all its runs in an update together."""
+
+    ms: float
+    count: int
+    name: str  # of the kernel
+    source: str  # the line of JAX that it comes from, such as jit(update)/while/body/dot_general
+
+
+HOLDERS = re.compile("while|call|cond|tuple|async")  # operations that consist of others
+
+
+def kernels_of(timing: Timing) -> list[Kernel]:
+    """The kernels of one more update, the slowest first. On a CPU they are XLA's operations."""
+    sources = dict(re.findall(r'%?([\w.-]+) = [^\n]*op_name="([^"]+)"', timing.program.as_text()))
+    with tempfile.TemporaryDirectory() as folder:
+        with jax.profiler.trace(folder):
+            jax.block_until_ready(timing.program(timing.state, timing.i))
+        [path] = Path(folder).rglob("*.xplane.pb")
+        profile = jax.profiler.ProfileData.from_file(str(path))
+    durations: dict[tuple[str, str], list[float]] = collections.defaultdict(list)
+    for plane in profile.planes:
+        for line in plane.lines:
+            on_gpu = plane.name.startswith("/device:GPU") and line.name.startswith("Stream")
+            for event in line.events:
+                operation = str(dict(event.stats).get("hlo_op", event.name if on_gpu else ""))
+                if operation and not HOLDERS.match(operation):
+                    durations[event.name, operation].append(event.duration_ns)
+    found = [
+        Kernel(sum(ns) / 1e6, len(ns), name, sources.get(operation, operation))
+        for (name, operation), ns in durations.items()
+    ]
+    return sorted(found, reverse=True)
+
+
+def show(kernels: list[Kernel], most: int) -> None:
+    total, count = sum(k.ms for k in kernels), sum(k.count for k in kernels)
+    print(f"{total:.1f} ms in {count:,} kernels; the slowest:")
+    for k in kernels[:most]:
+        each = 1e3 * k.ms / k.count
+        print(f"{k.ms:9.2f} ms {k.count:7,} x {each:8.1f} us  {k.name[:40]:40}  {k.source}")
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("algo", metavar="ALGO")
@@ -46,6 +94,7 @@ def main() -> int:
     parser.add_argument("--num-envs", type=int, help="of each seed")
     parser.add_argument("--horizon", type=int)
     parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--kernels", type=int, default=0, help="list so many of the slowest kernels")
     args = parser.parse_intermixed_args()
     try:
         if args.algo not in algos.ALGOS:
@@ -56,11 +105,13 @@ def main() -> int:
         print(error, file=sys.stderr)
         return 2
     before = 2 + -(-getattr(cfg, "learning_starts", 0) // (cfg.num_envs * cfg.horizon))
-    compiling, runs = timed(update, state, before=before, repeats=args.repeats)
+    timing = timed(update, state, before=before, repeats=args.repeats)
     print(
         f"{' '.join([args.algo, *args.options])}, {args.seeds} x {cfg.num_envs} x {cfg.horizon}: "
-        f"{1e3 * statistics.median(runs):.1f} ms an update, compiled in {compiling:.1f} s"
+        f"{1e3 * statistics.median(timing.runs):.1f} ms an update, compiled in {timing.compile_s:.1f} s"
     )
+    if args.kernels:
+        show(kernels_of(timing), args.kernels)
     return 0
 
 

@@ -22,7 +22,7 @@ import sys
 import time
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -45,8 +45,18 @@ from jaxsafe.run.settings import TrainConfig, find_algo, load
 from jaxsafe.types import Shared
 
 
-def timed(fn, state, before: int, repeats: int) -> tuple[float, list[float]]:
-    """Compile time, then the run times of `state = fn(state, i)` after some `before`, in seconds."""
+class Timing(NamedTuple):
+    """What `timed` measured, in seconds, and how to go on: `program(state, i)`."""
+
+    compile_s: float
+    runs: list[float]
+    program: Any  # jax.stages.Compiled
+    state: Any
+    i: np.int32
+
+
+def timed(fn, state, before: int, repeats: int) -> Timing:
+    """Compile `state = fn(state, i)` and run it, `before` times unmeasured and then `repeats` times."""
     start = time.perf_counter()
     compiled = jax.jit(fn, donate_argnums=0).lower(state, np.int32(0)).compile()
     compile_time, runs = time.perf_counter() - start, []
@@ -54,7 +64,7 @@ def timed(fn, state, before: int, repeats: int) -> tuple[float, list[float]]:
         start = time.perf_counter()
         state = jax.block_until_ready(compiled(state, np.int32(i)))
         runs.append(time.perf_counter() - start)
-    return compile_time, runs[before:]
+    return Timing(compile_time, runs[before:], compiled, state, np.int32(before + repeats))
 
 
 def stepping(env, num_envs: int, seeds: int, horizon: int):
@@ -140,7 +150,8 @@ def measure(name: str, wanted: int | None, args: argparse.Namespace) -> dict:
         num_envs, horizon = wanted or 256, args.horizon or 100
         state, fn = stepping(env, num_envs, args.seeds, horizon)
     before = max(1, -(-warmup // horizon))
-    compile_time, runs = timed(fn, state, before=before, repeats=args.repeats)
+    timing = timed(fn, state, before=before, repeats=args.repeats)
+    runs = timing.runs
     seconds = statistics.median(runs)
     rate = num_envs * horizon * args.seeds / seconds
     physics = isinstance(env, SafetyGym | Velocity)  # others do not tell it
@@ -161,7 +172,7 @@ def measure(name: str, wanted: int | None, args: argparse.Namespace) -> dict:
         "simulated_s_per_s": rate * env.step_seconds if physics else None,
         "fastest": num_envs * horizon * args.seeds / min(runs),
         "slowest": num_envs * horizon * args.seeds / max(runs),
-        "compile_s": compile_time,
+        "compile_s": timing.compile_s,
         "memory_bytes": memory(),
     }
 

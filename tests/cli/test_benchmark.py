@@ -2,7 +2,9 @@
 
 import argparse
 import json
+import runpy
 import sys
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -11,6 +13,9 @@ import pytest
 
 from jaxsafe.commands import benchmark, peers
 from jaxsafe.config import ConfigError
+
+SCRIPTS = Path(__file__).parent.parent.parent / "scripts"
+kernels_of = runpy.run_path(str(SCRIPTS / "profile_learner.py"))["kernels_of"]
 
 
 def test_a_row_tells_what_was_measured(tmp_path, monkeypatch, capsys):
@@ -37,9 +42,19 @@ def test_updates_are_timed_one_after_another():
         jax.debug.callback(lambda i: seen.append(int(i)), iteration, ordered=True)
         return state + iteration
 
-    _, runs = benchmark.timed(update, jnp.int32(0), before=3, repeats=2)
+    timing = benchmark.timed(update, jnp.int32(0), before=3, repeats=2)
+    timing.program(timing.state, timing.i)
     jax.effects_barrier()
-    assert len(runs) == 2 and seen == [0, 1, 2, 3, 4]
+    assert len(timing.runs) == 2 and seen == [0, 1, 2, 3, 4, 5]
+
+
+def test_an_update_is_told_apart_by_kernels_and_where_they_come_from():
+    def update(state, iteration):
+        return jax.lax.scan(lambda x, _: (x @ x, None), state, None, length=3)[0]
+
+    timing = benchmark.timed(update, jnp.eye(200), before=0, repeats=1)
+    [product] = [k for k in kernels_of(timing) if k.source.endswith("dot_general")]
+    assert product.count == 3 and product.ms > 0 and "while" in product.source
 
 
 def test_an_algorithm_is_measured_with_the_settings_of_train():
