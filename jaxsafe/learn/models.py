@@ -12,7 +12,7 @@ Source: Chua et al. (2018), "Deep Reinforcement Learning in a Handful of Trials 
 """
 
 from collections.abc import Callable
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import flax.struct
 import jax
@@ -77,6 +77,9 @@ class ModelConfig(EnsembleConfig):
     # Whether the model learns the cost. If not, the environment computes it from the observation, as
     # those of Goal do with env.observation=coordinates. OmniSafe learns it in velocity tasks.
     learn_cost: bool = True
+    # What the model's hidden layers are computed in while it predicts. It is always fitted in float32.
+    # On a GPU bfloat16, which has 8 bits, is faster for thousands of plans. On a CPU float32 is.
+    model_dtype: Literal["float32", "bfloat16"] = "float32"
 
     @property
     def told(self) -> tuple[str, ...]:
@@ -147,7 +150,7 @@ def learned_model(env: Env) -> Model:
         fitted: Fitted, latent: jax.Array, action: jax.Array, key: jax.Array, cfg: Any
     ) -> Prediction:
         inputs = jnp.concatenate([latent, jnp.clip(action, -1.0, 1.0)], -1)
-        dist = outputs_of(fitted.ensemble, fitted.scale, inputs)
+        dist = outputs_of(fitted.ensemble, fitted.scale, inputs, cfg.model_dtype)
         out = sample(dist, key)
         obs = jnp.clip(latent + out[..., -env.obs_size :], -FARTHEST, FARTHEST)
         cost = out[..., 1] if cfg.learn_cost else observed_cost(env)(obs)

@@ -250,7 +250,8 @@ def planning_bytes(env: Env, cfg: Any) -> int:
     outputs = 2 * (1 + cfg.learn_cost + env.obs_size)  # means and variances
     layers = (env.obs_size + env.action_size, *cfg.model_hidden, outputs)
     network = 0 if cfg.true_model else max(a + b for a, b in itertools.pairwise(layers))
-    return 4 * courses * (3 * cfg.plan_steps + env.obs_size + network)
+    size = jnp.dtype(cfg.model_dtype).itemsize
+    return courses * (4 * (3 * cfg.plan_steps + env.obs_size) + size * network)
 
 
 def planning_policy(env: Env, planner: Planner) -> Policy:

@@ -61,20 +61,28 @@ def unscaled(inputs: int) -> Scale:
     return Scale(jnp.zeros(inputs), jnp.ones(inputs))
 
 
-def outputs_of(ensemble: Ensemble, scale: Scale, x: jax.Array) -> Gaussian:
-    """What each model says of its own inputs `x` [M, ..., I]: mean and log std [M, ..., K]."""
+def outputs_of(
+    ensemble: Ensemble, scale: Scale, x: jax.Array, hidden_dtype: str = "float32"
+) -> Gaussian:
+    """What each model says of its own inputs `x` [M, ..., I]: mean and log std [M, ..., K].
+
+    Args:
+        hidden_dtype: of what the hidden layers give. Sums of products are float32 all the same, and so
+            are the outputs.
+    """
 
     def spaced(per_model: jax.Array) -> jax.Array:
         """[M, K] with axes of size 1 between, so that it broadcasts against [M, ..., K]."""
         return per_model.reshape(len(per_model), *(1,) * (x.ndim - 2), -1)
 
-    def linear(layer: Layer, h: jax.Array) -> jax.Array:
-        return jnp.einsum("m...i,mio->m...o", h, layer.weight) + spaced(layer.bias)
+    def linear(layer: Layer, h: jax.Array, dtype: str) -> jax.Array:
+        weight, bias = layer.weight.astype(h.dtype), spaced(layer.bias).astype(dtype)
+        return jnp.einsum("m...i,mio->m...o", h, weight, preferred_element_type=dtype) + bias
 
-    h = (x - scale.mean) / scale.std
+    h = ((x - scale.mean) / scale.std).astype(hidden_dtype)
     for layer in ensemble.layers[:-1]:
-        h = jax.nn.swish(linear(layer, h))
-    mean, v = jnp.split(linear(ensemble.layers[-1], h), 2, axis=-1)
+        h = jax.nn.swish(linear(layer, h, hidden_dtype))
+    mean, v = jnp.split(linear(ensemble.layers[-1], h, "float32"), 2, axis=-1)
     low, high = spaced(ensemble.low), spaced(ensemble.high)
     log_var = low + jax.nn.softplus(high - jax.nn.softplus(high - v) - low)
     return Gaussian(mean, log_var / 2)

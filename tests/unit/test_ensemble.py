@@ -141,6 +141,17 @@ def test_the_loss_by_hand():
     np.testing.assert_allclose(ensemble_loss(ensemble, unscaled(1), x, y, 0.3), expected, rtol=1e-5)
 
 
+def test_predictions_in_bfloat16_round_to_8_bits_and_stay_float32():
+    """Rounding errors of 2^-9 each, some ten of them, one upon the other."""
+    ensemble = init_ensemble(jax.random.key(0), 3, 5, (64, 64, 64), 4)
+    x = jax.random.normal(jax.random.key(1), (3, 500, 5))
+    exact, rounded = (outputs_of(ensemble, unscaled(5), x, dtype) for dtype in ("float32", "bfloat16"))
+    assert rounded.mean.dtype == rounded.log_std.dtype == jnp.float32
+    for a, b in ((exact.mean, rounded.mean), (exact.log_std, rounded.log_std)):
+        varies = jnp.linalg.norm(a - a.mean((0, 1)))  # log std is nearly constant at first
+        assert 1e-4 < jnp.linalg.norm(a - b) / varies < 0.1
+
+
 def test_weights_begin_small_and_are_cut_off():
     layer = init_ensemble(jax.random.key(0), 2, 100, (300,), 1).layers[0]
     std = 1 / (2 * 100**0.5)
