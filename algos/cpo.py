@@ -13,7 +13,7 @@ from jaxsafe.learn.batch import all_finite, pmean
 from jaxsafe.learn.constraints import LimitsConfig, constrained_costs, limit
 from jaxsafe.learn.conventions import Convention
 from jaxsafe.learn.halfspaces import cosines, dot, furthest_point
-from jaxsafe.learn.on_policy import on_policy_pair
+from jaxsafe.learn.on_policy import on_policy_pair, presets
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.steps import Context, Pair, PolicyStep, require_separate_trunk
 from jaxsafe.learn.surrogates import plain
@@ -302,7 +302,7 @@ ROWS = {
         CPOConfig,
         make,
         "trust-region step within a linearised constraint",
-        {"omnisafe": trpo.PUBLISHED},  # CPO.yaml differs from TRPO.yaml by the constraint alone
+        presets(trpo.PUBLISHED),  # CPO.yaml differs from TRPO.yaml by the constraint alone
         omnisafe="CPO",
     ),
 }

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxsafe.algos import pg, ppo
 from jaxsafe.config import Bounds, Cap, KLStop, config
 from jaxsafe.learn.constraints import constrained_costs, each
-from jaxsafe.learn.on_policy import Batch, Improved, Method, TrainState, on_policy_loop
+from jaxsafe.learn.on_policy import Batch, Improved, Method, TrainState, on_policy_loop, presets
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.steps import Context, adam_epochs
 from jaxsafe.learn.surrogates import clipped, plain, with_entropy
@@ -96,7 +96,7 @@ ROWS = {
         CUPConfig,
         make,
         "PPO step, then a projection towards lower cost",
-        {"omnisafe": ppo.PUBLISHED | {"dual_lr": 0.035}},
+        presets(ppo.PUBLISHED | {"dual_lr": 0.035}),
         omnisafe="CUP",
         lever=pg.LEVER,
     ),

@@ -5,7 +5,7 @@ from typing import Annotated, ClassVar
 from jaxsafe.algos import pg
 from jaxsafe.config import Bounds, Cap, Weight, config
 from jaxsafe.learn.conventions import Convention
-from jaxsafe.learn.on_policy import on_policy
+from jaxsafe.learn.on_policy import on_policy, presets
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.steps import adam_epochs
 from jaxsafe.learn.surrogates import near_old
@@ -57,7 +57,7 @@ ROWS = {
         FOCOPSConfig,
         make,
         "first-order steps near the optimal policy of a constrained problem",
-        {"omnisafe": pg.PUBLISHED | pg.OFTEN | {"dual_lr": 0.035}},
+        presets(pg.PUBLISHED | pg.OFTEN | {"dual_lr": 0.035}),
         omnisafe="FOCOPS",
         lever=pg.LEVER,
     ),

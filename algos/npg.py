@@ -4,7 +4,7 @@ from functools import partial
 from typing import Any
 
 from jaxsafe.config import config
-from jaxsafe.learn.on_policy import OMNISAFE, OnPolicyConfig, on_policy
+from jaxsafe.learn.on_policy import OMNISAFE, OnPolicyConfig, on_policy, presets
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.surrogates import plain
 from jaxsafe.learn.treatments import LagrangianConfig, Treatment, lagrangian, no_treatment
@@ -56,7 +56,7 @@ ROWS = {
         NPGConfig,
         make,
         "natural policy gradient, no constraint",
-        {"omnisafe": PUBLISHED},
+        presets(PUBLISHED),
         omnisafe="NaturalPG",
         holds="nothing",
     ),
@@ -64,7 +64,7 @@ ROWS = {
         RCPOConfig,
         partial(make, treatment=lagrangian),
         "natural policy gradient with an adaptive price on cost",
-        {"omnisafe": PUBLISHED | {"dual_lr": 0.035}},
+        presets(PUBLISHED | {"dual_lr": 0.035}),
         omnisafe="RCPO",
     ),
 }

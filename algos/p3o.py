@@ -9,7 +9,7 @@ from jaxsafe.algos import pg, ppo
 from jaxsafe.config import Weight, config
 from jaxsafe.learn.batch import pmean
 from jaxsafe.learn.conventions import Convention
-from jaxsafe.learn.on_policy import on_policy_pair
+from jaxsafe.learn.on_policy import on_policy_pair, presets
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.steps import Context, Objective, Pair, PolicyStep, adam_epochs
 from jaxsafe.learn.surrogates import clipped, pessimistic, plain
@@ -97,7 +97,7 @@ ROWS = {
         P3OConfig,
         make,
         "PPO with an exact penalty beyond the limit",
-        {"omnisafe": ppo.PUBLISHED | {"epochs": 10, "critic_epochs": 10}},
+        presets(ppo.PUBLISHED | {"epochs": 10, "critic_epochs": 10}),
         omnisafe="P3O",
         lever=pg.LEVER | {"kappa": 5.0},
     ),

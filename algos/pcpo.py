@@ -10,7 +10,7 @@ from jaxsafe.config import Iterations, Weight, config
 from jaxsafe.learn.constraints import constrained_costs
 from jaxsafe.learn.conventions import Convention
 from jaxsafe.learn.halfspaces import cosines, dot, nearest_point
-from jaxsafe.learn.on_policy import on_policy_pair
+from jaxsafe.learn.on_policy import on_policy_pair, presets
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.surrogates import plain
 from jaxsafe.types import Algorithm, Env
@@ -79,7 +79,7 @@ ROWS = {
         PCPOConfig,
         make,
         "trust-region step projected onto a linearised constraint",
-        {"omnisafe": trpo.PUBLISHED},
+        presets(trpo.PUBLISHED),
         omnisafe="PCPO",
     ),
 }

@@ -4,7 +4,7 @@ from functools import partial
 from typing import Any
 
 from jaxsafe.config import config
-from jaxsafe.learn.on_policy import OMNISAFE, OnPolicyConfig, on_policy
+from jaxsafe.learn.on_policy import OMNISAFE, OnPolicyConfig, on_policy, presets
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.steps import AdamConfig, adam_epochs
 from jaxsafe.learn.surrogates import plain
@@ -65,7 +65,7 @@ ROWS = {
         PGConfig,
         make,
         "policy gradient, no constraint",
-        {"omnisafe": PUBLISHED},
+        presets(PUBLISHED),
         omnisafe="PolicyGradient",
         holds="nothing",
         lever=LEVER,
@@ -74,7 +74,7 @@ ROWS = {
         PDOConfig,
         partial(make, treatment=lagrangian),
         "policy gradient with an adaptive price on cost",
-        {"omnisafe": PUBLISHED | OFTEN | SCALED | {"dual_lr": 0.035}},
+        presets(PUBLISHED | OFTEN | SCALED | {"dual_lr": 0.035}),
         omnisafe="PDO",
         lever=LEVER | {"lr": 3e-3, "target_kl": 0.03},
     ),

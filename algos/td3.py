@@ -193,15 +193,17 @@ ONE_NOISE: dict[str, Any] = {"noise_min": 0.1, "noise_max": 0.1, "learning_start
 
 
 def published(base: dict[str, Any], navigation: dict[str, Any] | None = None) -> dict[str, Any]:
-    """The settings of a row: OmniSafe's for velocity, for navigation, and ours for 64 environments."""
+    """The settings of a row with the treatment's in `base`, if it has one: OmniSafe's for velocity and
+    for navigation, and ours for 64 environments."""
     of_sac = {"alpha_init", "alpha_lr", "target_entropy", "policy_delay"}
     omnisafe = {k: v for k, v in sac.OMNISAFE.items() if k not in of_sac} | ONE_NOISE
     rates = {"lr": 5e-6, "critic_lr": 1e-3}
-    return {
+    found = {
         "omnisafe": omnisafe | base,
         "omnisafe_navigation": omnisafe | rates | (base if navigation is None else navigation),
         "parallel": sac.PARALLEL | (sac.PRICED_PARALLEL if base else {}),
     }
+    return found | ({"parallel_navigation": sac.PARALLEL} if base else {})
 
 
 # for a problem of two levers

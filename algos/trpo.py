@@ -18,7 +18,7 @@ from jaxsafe.learn.augment import (
     schedule,
     simmer,
 )
-from jaxsafe.learn.on_policy import OnPolicyConfig, on_policy
+from jaxsafe.learn.on_policy import OnPolicyConfig, on_policy, presets
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.surrogates import plain
 from jaxsafe.learn.treatments import (
@@ -141,7 +141,7 @@ ROWS = {
         TRPOConfig,
         make,
         "trust-region steps, no constraint",
-        {"omnisafe": PUBLISHED},
+        presets(PUBLISHED),
         omnisafe="TRPO",
         holds="nothing",
     ),
@@ -149,14 +149,14 @@ ROWS = {
         TRPOLagConfig,
         partial(make, treatment=lagrangian),
         "TRPO with an adaptive price on cost",
-        {"omnisafe": PUBLISHED | {"dual_lr": 0.035}},
+        presets(PUBLISHED | {"dual_lr": 0.035}),
         omnisafe="TRPOLag",
     ),
     "trpo_pid": Row(
         TRPOPIDConfig,
         partial(make, treatment=pid),
         "TRPO with a price on cost from a PID controller",
-        {"omnisafe": PUBLISHED},
+        presets(PUBLISHED),
         omnisafe="TRPOPID",
         lever=ppo.CONTROLLED,
     ),
@@ -164,7 +164,7 @@ ROWS = {
         CRPOConfig,
         partial(make, treatment=switch),
         "TRPO on reward or on cost, by whether the limit holds",
-        {"omnisafe": PUBLISHED},
+        presets(PUBLISHED),
         omnisafe="OnCRPO",
         lever={"tolerance": 0.0},
     ),
@@ -172,7 +172,7 @@ ROWS = {
         TRPOSauteConfig,
         partial(make, augmentation=saute),
         "TRPO that sees its budget on cost, and pays a penalty once it is spent",
-        {"omnisafe": PUBLISHED | OMNISAFE_SAUTE},
+        presets(PUBLISHED | OMNISAFE_SAUTE),
         omnisafe="TRPOSaute",
         holds="episode",
         lever=ppo.BUDGETED,
@@ -181,7 +181,7 @@ ROWS = {
         TRPOSimmerPIDConfig,
         partial(make, treatment=schedule, augmentation=simmer),
         "TRPO-Saute with a budget that a PID controller raises",
-        {"omnisafe": PUBLISHED | OMNISAFE_SAUTE | OMNISAFE_SIMMER},
+        presets(PUBLISHED | OMNISAFE_SAUTE | OMNISAFE_SIMMER),
         omnisafe="TRPOSimmerPID",
         holds="episode",
         lever=ppo.BUDGETED | {"budget_ramp": 50.0},
@@ -190,7 +190,7 @@ ROWS = {
         TRPOEarlyTerminatedConfig,
         partial(make, augmentation=early),
         "TRPO whose training episodes end where they break the limit",
-        {"omnisafe": PUBLISHED},
+        presets(PUBLISHED),
         omnisafe="TRPOEarlyTerminated",
         holds="episode",
     ),
