@@ -154,8 +154,8 @@ OMNISAFE: dict[str, Any] = {
     "init": "torch",
     "init_log_std": 0.0,
 }
-# Rollouts four times as long, and four times as many gradient steps. It learns more from a step, and
-# takes about twice the time: docs/results/velocity_settings.
+# For velocity tasks: rollouts four times as long, and four times as many gradient steps, or eight times
+# as many of the critics.
 FREQUENT: dict[str, Any] = {"num_envs": 128, "horizon": 160, "minibatches": 32, "critic_epochs": 20}
 
 
