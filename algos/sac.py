@@ -178,10 +178,18 @@ PARALLEL: dict[str, Any] = {
     "critic_lr": 1e-3, "lr_decay": True, "layer_norm": False,
 }  # fmt: skip
 SAC_PARALLEL: dict[str, Any] = PARALLEL | {"policy_delay": 2}
-# On velocity tasks a policy answers a price within some hundred gradient steps, and one that waits
-# longer swings. On navigation tasks the cost of two episodes, which are 2,000 steps, is mostly chance,
-# and a price that follows it keeps the policy from learning: there it moves every 20,000 steps.
-PRICED_PARALLEL: dict[str, Any] = {"dual_every": 2000}
+
+
+def priced_parallel(parallel: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """`parallel` as presets of an algorithm with a price, for velocity tasks and for navigation.
+
+    On velocity tasks a policy answers a price within some hundred gradient steps, and a price that
+    waits longer swings. On navigation tasks the cost of two episodes, which are 2,000 steps, is mostly
+    chance, so there the price moves every 20,000 steps: see docs/results/price_clock.
+    """
+    return {"parallel": parallel | {"dual_every": 2000}, "parallel_navigation": parallel}
+
+
 # 16 gradient steps for each step of 1,024 environments: it learns from fewer steps, and takes more time
 FREQUENT: dict[str, Any] = {
     "num_envs": 1024, "batch_size": 1024, "tau": 0.01, "lr": 3e-4, "critic_lr": 3e-4, "lr_decay": False,
@@ -240,8 +248,7 @@ ROWS = {
         {
             "omnisafe": OMNISAFE | LAG,
             "omnisafe_navigation": NAVIGATION | LAG_NAVIGATION,
-            "parallel": SAC_PARALLEL | PRICED_PARALLEL,
-            "parallel_navigation": SAC_PARALLEL,
+            **priced_parallel(SAC_PARALLEL),
         },
         omnisafe="SACLag",
         lever=LEVER | LEVER_LAG,
@@ -253,8 +260,7 @@ ROWS = {
         {
             "omnisafe": OMNISAFE | PID,
             "omnisafe_navigation": NAVIGATION | PID_NAVIGATION,
-            "parallel": SAC_PARALLEL | PRICED_PARALLEL,
-            "parallel_navigation": SAC_PARALLEL,
+            **priced_parallel(SAC_PARALLEL),
         },
         omnisafe="SACPID",
         lever=LEVER | LEVER_PID,

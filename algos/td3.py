@@ -198,12 +198,11 @@ def published(base: dict[str, Any], navigation: dict[str, Any] | None = None) ->
     of_sac = {"alpha_init", "alpha_lr", "target_entropy", "policy_delay"}
     omnisafe = {k: v for k, v in sac.OMNISAFE.items() if k not in of_sac} | ONE_NOISE
     rates = {"lr": 5e-6, "critic_lr": 1e-3}
-    found = {
+    return {
         "omnisafe": omnisafe | base,
         "omnisafe_navigation": omnisafe | rates | (base if navigation is None else navigation),
-        "parallel": sac.PARALLEL | (sac.PRICED_PARALLEL if base else {}),
+        **(sac.priced_parallel(sac.PARALLEL) if base else {"parallel": sac.PARALLEL}),
     }
-    return found | ({"parallel_navigation": sac.PARALLEL} if base else {})
 
 
 # for a problem of two levers

@@ -72,6 +72,7 @@ LOOPS = {  # the first that an algorithm's config is one of
     OffPolicyConfig: "off-policy",
     OfflineConfig: "offline",
 }
+STUDIES = ("goal", "button", "push", "omnisafe", "velocity", "off_policy")  # in docs/results
 ABSENT = object()  # where there is no default
 ALGORITHMS = """# Algorithms
 
@@ -446,7 +447,7 @@ def trained() -> list[SettingRun]:
         preset, compat = run.config["preset"], run.config["compat"]
         return run.env, compat if compat != "none" else preset if preset != "fast" else ""
 
-    folders = [HERE / "results" / name for name in ("goal", "button", "push", "omnisafe", "velocity")]
+    folders = [HERE / "results" / name for name in STUDIES]
     return sorted(read(folders), key=place)
 
 
@@ -462,6 +463,7 @@ def measured(name: str) -> str:
         how = f"`{run.env}`, preset {run.config['preset']}, {len(run.seeds)} seeds"
         how += f", `compat={compat}`" if compat != "none" else ""
         how += f", `env.rules={rules}`" if rules != "safety_gym" else ""
+        how += f", {steps:,} steps" if (steps := int(run.config["total_steps"])) != 10_000_000 else ""
         unusual = {k: v for k, v in studies.unusual(run.config).items() if k.startswith("algo.")}
         how += "".join(f", `{k}={v}`" for k, v in unusual.items())
         rows.append(f"| {how} | {ret} | {cost} | {studies.published_cell(run.config, known)} |")
@@ -473,8 +475,11 @@ def measured(name: str) -> str:
         return "Not run at length yet; it keeps away from the ledge of tests/toys.py, Ledge."
     if not rows:
         return "Not run at length yet; it learns the small exact problem of tests/toys.py, Lever."
-    head = "| 1e7 steps a seed, limit 25 | return, last 10% | cost | published |\n|---|---|---|---|\n"
-    return head + "\n".join(rows)
+    head = [
+        "| limit 25, 1e7 steps a seed if not said | return, last 10% | cost | published |",
+        "|---|---|---|---|",
+    ]
+    return "\n".join([*head, *rows])
 
 
 def derivation(name: str) -> str:
