@@ -11,8 +11,9 @@ import numpy as np
 import optax
 import pytest
 from compiling import FAST
-from scipy.special import psi
+from scipy.special import betainc, psi
 from scipy.stats import beta as scipy_beta
+from scipy.stats import kstest
 from toys import START, Lever, momentum
 
 from jaxsafe.algos import ALGOS, seditor
@@ -57,7 +58,39 @@ def test_log_probabilities_are_scipys_and_the_mode_is_where_they_are_highest():
     np.testing.assert_allclose(mode, 2 * (up - 1) / (up + down - 2) - 1, atol=1e-5)
 
 
-def test_samples_are_differentiable_and_the_gradient_of_concentrations_is_short():
+SHAPES = [(1.0, 1.0), (1.001, 300.0), (2.0, 2.0), (30.0, 4.0), (500.0, 700.0), (5000.0, 1.0)]
+
+
+@pytest.mark.parametrize("up, down", SHAPES)
+def test_draws_have_their_distribution(up, down):
+    many = jnp.ones((50_000, 1))
+    action, _ = jax.jit(beta.beta_sample)(beta.Beta(up * many, down * many), jax.random.key(1))
+    x = (np.float64(action[:, 0]) + 1) / 2
+    assert kstest(x, scipy_beta(up, down).cdf).pvalue > 1e-3
+
+
+@pytest.mark.parametrize("up, down", SHAPES)
+def test_a_draw_moves_with_its_concentrations_as_scipys_quantiles_do(up, down):
+    share = np.array([0.001, 0.05, 0.3, 0.5, 0.7, 0.95, 0.999])
+    x = np.float64(np.float32(scipy_beta.ppf(share, up, down)))
+    share = betainc(up, down, x)
+    found = jax.jit(jax.vmap(jax.grad(beta.following, 1), (0, None)))(
+        jnp.float32(x), beta.Beta(jnp.float32(up), jnp.float32(down))
+    )
+    h = 1e-5
+
+    def quantile(up, down):
+        return scipy_beta.ppf(share, up, down)
+
+    slopes = (
+        (quantile(up * (1 + h), down) - quantile(up * (1 - h), down)) / (2 * h * up),
+        (quantile(up, down * (1 + h)) - quantile(up, down * (1 - h))) / (2 * h * down),
+    )
+    np.testing.assert_allclose(found.up, slopes[0], rtol=5e-3)
+    np.testing.assert_allclose(found.down, slopes[1], rtol=5e-3)
+
+
+def test_the_mean_of_draws_moves_as_it_should():
     """The mean of Beta(a, b) is a / (a + b), so that its slope in a at (2, 2) is 1 / 8."""
 
     def mean(a):
@@ -67,6 +100,9 @@ def test_samples_are_differentiable_and_the_gradient_of_concentrations_is_short(
 
     slope = jax.jit(jax.grad(mean), compiler_options=FAST)(jnp.float32(2))
     np.testing.assert_allclose(slope, 0.125, atol=3e-3)
+
+
+def test_the_gradient_of_concentrations_is_short():
     x = jnp.array([[3.0, 4.0], [0.003, 0.004], [0.0, 0.0]])
     slope = jax.grad(lambda x: (x**2 / 2).sum())
     clipped = jax.grad(lambda x: (beta.short_gradient(x, 0.01) ** 2 / 2).sum())(x)
