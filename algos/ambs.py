@@ -538,6 +538,7 @@ ROWS = {
         "Dreamer with a shield that dreams ahead, and a safe policy",
         {name: dreamer.AMBS | options for name, options in PENALTIES.items()}
         | {"pixels": PIXELS, "cpu": CPU, "true_dynamics": TRUE},
+        total_steps=1_000_000,
         holds="nothing",
         note=note,
         examine=examine,

@@ -380,6 +380,7 @@ ROWS = {
         "soft actor-critic within a set that a learned certificate finds safe",
         {"published": PUBLISHED},
         omnisafe="CRABS",
+        total_steps=600_000,
         holds="episode",
     ),
 }

@@ -238,6 +238,7 @@ ROWS = {
         make,
         "an actor that learns in the dreams of a world model, no constraint",
         {"proprio": PROPRIO, "cpu": CPU},
+        total_steps=1_000_000,
         holds="nothing",
         lever=LEVER,
     ),
@@ -246,6 +247,7 @@ ROWS = {
         partial(make, behaviour=priced),
         "Dreamer with an augmented Lagrangian on the cost of its dreams",
         {"ambs": AMBS, "safe_dreamer": SAFE_DREAMER, "cpu": CPU},
+        total_steps=1_000_000,
         lever=LEVER | {"mu_least": 0.05},  # with 1 the multiplier overshoots, and costs stay near 1.4
     ),
 }

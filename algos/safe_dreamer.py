@@ -234,6 +234,7 @@ ROWS = {
         make,
         "SafeDreamer: planning in a world model's dreams, among plans of a low cost",
         {"safe_dreamer": dreamer.VECTORS},
+        total_steps=1_000_000,
         lever=LEVER,
     ),
     "osrp_lag": Row(
@@ -241,6 +242,7 @@ ROWS = {
         partial(make, behaviour=planned_at_a_price, treatment=controller),
         "OSRP whose plans also pay for cost, at the price of a PID controller",
         {"safe_dreamer": dreamer.VECTORS},
+        total_steps=1_000_000,
         lever=LEVER | {"dual_every": 256, "dual_starts": 512},
     ),
 }

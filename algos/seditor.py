@@ -403,6 +403,7 @@ ROWS = {
         make,
         "a policy that seeks reward, and a safety editor of its actions",
         {"paper": PAPER, "parallel": PARALLEL},
+        total_steps=5_000_000,
         lever=LEVER,
     ),
 }

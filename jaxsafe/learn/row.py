@@ -20,6 +20,7 @@ class Row(NamedTuple):
     summary: what it does, in a few words.
     published: setting -> options of the config that reproduce it; `preset=published` is the first.
     omnisafe: OmniSafe's name for it, from which scripts/migrate.py translates; '' if it has none.
+    total_steps: environment steps of a run that does not say how many.
     holds: what keeps to the cost limit: the cost of the average episode, the cost of every episode,
         or nothing, where the limit is only drawn in plots.
     lever: options with which it learns Lever, the small exact problem of tests/toys.py, if its
@@ -35,6 +36,7 @@ class Row(NamedTuple):
     summary: str = ""
     published: Mapping[str, dict[str, Any]] = NOTHING
     omnisafe: str = ""
+    total_steps: int = 10_000_000
     holds: Literal["average", "episode", "nothing"] = "average"
     lever: Mapping[str, Any] = NOTHING
     check: Callable[[Any, Any], None] = lambda cfg, data: None

@@ -64,7 +64,7 @@ COST_LIMITS = "cost_limits"  # an option of algorithms: floats by name, as {haza
 class TrainConfig:
     """The settings beside `env` and `algo`."""
 
-    # environment steps of each seed, rounded up to whole updates
+    # environment steps of each seed, rounded up to whole updates; the default is the algorithm's
     total_steps: RunSteps = 10_000_000
     # gradient steps of each seed; if given, they end the run. null: total_steps, or 100,000 with a data
     # set
@@ -257,7 +257,7 @@ def defaults_of(
     algo_name = names["algo"] or DEFAULT["algo"]
     row = find_algo(algo_name, extras)
     check_preset(algo_name, row, preset)
-    return dataclasses.asdict(TrainConfig()) | {
+    return dataclasses.asdict(TrainConfig(total_steps=row.total_steps)) | {
         "env": {"name": env_name, **entry.defaults},
         "algo": {"name": algo_name, **algo_options(row, preset, compat)},
     }

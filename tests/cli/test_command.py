@@ -138,6 +138,13 @@ def test_published_settings_are_defaults_that_the_command_line_overrides():
     assert request.groups["algo"]["cpo"].items() >= setting.items()
 
 
+def test_a_run_is_as_long_as_its_algorithm_asks_unless_told():
+    for texts, steps in ((["algo=cpo"], 10_000_000), (["algo=sac_lag"], 5_000_000)):
+        assert arguments.compose(texts).train.total_steps == steps
+        assert arguments.compose([*texts, "preset=published"]).train.total_steps == steps
+        assert arguments.compose([*texts, "total_steps=64"]).train.total_steps == 64
+
+
 def test_every_chosen_name_has_its_options_and_no_other():
     texts = ["-m", "env=car_push1,Safexp-PointGoal1-v0", "algo=cpo,trpo"]
     groups = hydra_jobs.check_arguments(texts).groups

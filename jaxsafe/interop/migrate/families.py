@@ -17,10 +17,9 @@ from jaxsafe.learn.model_based import ModelBasedConfig
 from jaxsafe.learn.off_policy import OffPolicyConfig
 from jaxsafe.learn.offline import OfflineConfig
 from jaxsafe.learn.row import Row
-from jaxsafe.run.settings import OFFLINE_UPDATES, TrainConfig
+from jaxsafe.run.settings import OFFLINE_UPDATES
 
 NONE: Mapping[str, Any] = MappingProxyType({})
-ONLINE = {"total_steps": TrainConfig.total_steps}
 
 
 class Family(NamedTuple):
@@ -39,7 +38,7 @@ class Family(NamedTuple):
 
 FAMILIES = {  # the first that an algorithm's config is one of
     "model-based": Family(
-        ModelBasedConfig, MODEL_BASED, ONLINE | {"eval_every": 0, REPEAT: 1}, {"total_steps": 1_000_000}
+        ModelBasedConfig, MODEL_BASED, {"eval_every": 0, REPEAT: 1}, {"total_steps": 1_000_000}
     ),
     "offline": Family(
         OfflineConfig,
@@ -47,8 +46,8 @@ FAMILIES = {  # the first that an algorithm's config is one of
         {"total_updates": OFFLINE_UPDATES, "dataset": None},
         {"total_updates": 1_000_000, "eval_episodes": 10},
     ),
-    "off-policy": Family(OffPolicyConfig, OFF_POLICY, ONLINE, {"total_steps": 1_000_000}),
-    "on-policy": Family(object, ON_POLICY, ONLINE),
+    "off-policy": Family(OffPolicyConfig, OFF_POLICY, NONE, {"total_steps": 1_000_000}),
+    "on-policy": Family(object, ON_POLICY, NONE),
 }
 KNOWN = OFFLINE | OFF_POLICY | MODEL_BASED
 

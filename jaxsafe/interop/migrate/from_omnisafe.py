@@ -89,7 +89,7 @@ def options_of(row: Row, preset: str) -> dict[str, Any]:
     options = {f"algo.{k}": v for k, v in algo_options(row, preset, "omnisafe").items()}
     if "algo.num_envs" in options:
         options["num_envs"] = options["algo.num_envs"]
-    of_all = {"seed": 0, "eval_episodes": TrainConfig.eval_episodes}
+    of_all = {"seed": 0, "eval_episodes": TrainConfig.eval_episodes, "total_steps": row.total_steps}
     return options | of_all | {**FAMILIES[family_of(row)].run}
 
 
