@@ -57,8 +57,9 @@ class SEditorConfig(LagrangianConfig, PriceClockConfig, OffPolicyConfig):
     actions that both policies draw anew. Both policies are Beta distributions. While one is trained,
     the other is fixed. TD(lambda) returns run over replayed sequences of `n_step` + 1 rows. Rewards and
     costs are normalised when they are replayed. lam moves once every `dual_every` environment steps,
-    and J_c is what an episode has cost since then. The paper allows 5e-4 violations a step. Where a
-    step with a violation costs 1, that is a `cost_limit` of 0.5 for an episode of 1,000 steps.
+    and J_c is what a step has cost since then, times the length of an episode. The paper allows
+    5e-4 violations a step. Where a step with a violation costs 1 and the time limit is 1,000 steps,
+    that is a `cost_limit` of 0.5.
 
     Source: Yu, Xu and Zhang (2022), "Towards Safe Reinforcement Learning with a Safety Editor Policy",
     arXiv:2201.12427; networks, returns and schedules are from the authors' code.
@@ -80,7 +81,7 @@ class SEditorConfig(LagrangianConfig, PriceClockConfig, OffPolicyConfig):
     activation: Literal["relu", "tanh"] = "tanh"  # Of the hidden layers, as in the authors' code.
     # The critics' first weights. fan_in: uniform, as in the authors' code. The policies' are Xavier's.
     init: Literal["fan_in", "torch", "orthogonal"] = "fan_in"
-    # The undiscounted cost that an episode may have: 5e-4 a step, as in the paper, in 1,000 steps.
+    # The undiscounted cost of an episode of full length: 5e-4 a step, as in the paper, in 1,000 steps.
     cost_limit: Weight = 0.5
     # How the values of two cost critics become one. max is cautious, as in the authors' code.
     cost_reduce: Literal["mean", "max", "one"] = "max"
@@ -89,8 +90,9 @@ class SEditorConfig(LagrangianConfig, PriceClockConfig, OffPolicyConfig):
     lam_max: Annotated[float, Bounds(1e-6, 1e6, inf="no bound")] = float("inf")
     # Adam's step of l, whatever the size of the violation, as in the authors' code.
     dual_lr: Rate = 0.01
-    # Environment steps between two moves of the price. The authors have 160.
-    dual_every: Annotated[int, Bounds(1, 2**30)] = 1000
+    # Environment steps between two moves of the price, as the authors have. Adam's steps stay short for
+    # some thousand moves after the first violations, which are many.
+    dual_every: Annotated[int, Bounds(1, 2**30)] = 160
     # The share of the critics that their targets take on at each step, as in the authors' code.
     tau: Share = 0.005
     alpha_init: Positive = 1.0  # Both temperatures at first, as in the authors' code.
@@ -384,7 +386,6 @@ PAPER: dict[str, Any] = {
     "layer_norm": False,
     "obs_normalize": False,
     "max_grad_norm": float("inf"),
-    "dual_every": 160,
 }
 # the same for 1,024 environments: 32 gradient steps, and 32 moves of the price, for 5 of their steps
 PARALLEL: dict[str, Any] = PAPER | {"num_envs": 1024, "stagger": True}
