@@ -291,7 +291,7 @@ def page(study: Study) -> tuple[str, list[Picture]]:
         else PAGE.format(title=study.title, about=study.about)
     )
     runs = read_runs([study.folder])
-    groups = in_order(runs)
+    groups = in_order(study, runs)
     known = read_published(study.published) if study.published else {}
     pictures = pictures_of(study, groups, known) if "<!-- measured: figures -->" in text else []
     shown = [
@@ -306,13 +306,23 @@ def page(study: Study) -> tuple[str, list[Picture]]:
     return tables.between_marks(text, made, "measured"), pictures
 
 
-def in_order(runs: Sequence[SettingRun]) -> list[Group]:
-    """The groups of each setting and task, in the order of the runs, the order of their worth."""
-    by = [name for name in telling(runs) if name != "total_steps"]
+def in_order(study: Study, runs: Sequence[SettingRun]) -> list[Group]:
+    """The groups of each setting and task, in the order of the runs, the order of their worth.
+
+    What a preset says anyway is not in their names. How long a run is, is, where the study says it.
+    """
+    long = any("total_steps=" in run for run in study.runs)
+    by = [name for name in telling(runs) if long or name != "total_steps"]
     for name in ("compat", "devices"):
         if name not in by and len({run.config[name] for run in runs}) > 1:
             by.append(name)
-    return group(runs, by)
+    return [g._replace(by=said(g)) for g in group(runs, by)]
+
+
+def said(g: Group) -> dict[str, Any]:
+    """The fields of a group that belong into its name."""
+    named = {"algo.name", "total_steps", "devices", *unusual(g.runs[0].config)}
+    return {name: value for name, value in g.by.items() if name in named}
 
 
 def pictures_of(
