@@ -222,6 +222,8 @@ def measured(
         values["cost rate"] = rate
     for name in cost_names(table):
         values[cost_title(name)] = late(f"train/cost_{name}")
+    if "train/goal_met" in table:
+        values["goals"] = late("train/goal_met")
     return values | normalised(env, values, limits)
 
 

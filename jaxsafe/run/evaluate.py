@@ -15,7 +15,8 @@ COLUMNS = ("eval/return", "eval/cost", "eval/return_sampled", "eval/cost_sampled
 
 
 class Episodes(NamedTuple):
-    """Sums over episodes: `costs` is [S, N, K], the others are [S, N]."""
+    """Sums over episodes: `costs` is [S, N, K], the others are [S, N]. `goals` is NaN where the
+    environment counts none."""
 
     ret: np.ndarray
     cost: np.ndarray
@@ -23,6 +24,7 @@ class Episodes(NamedTuple):
     length: np.ndarray
     discounted_ret: np.ndarray
     discounted_cost: np.ndarray
+    goals: np.ndarray
 
 
 def episode(
@@ -50,7 +52,8 @@ def episode(
             jnp.where(now.alive, x, 0.0) for x in (state.reward, state.cost, state.costs)
         )
         later = discount**t * reward, cost_discount**t * cost
-        sums = summed(reward, cost, costs, jnp.float32(now.alive), *later)
+        goals = jnp.where(now.alive, state.info.get("goal_met", jnp.nan), 0.0)
+        sums = summed(reward, cost, costs, jnp.float32(now.alive), *later, goals)
         return Playing(state, carry, now.alive & ~state.ended), sums
 
     _, sums = jax.lax.scan(step, player.start(reset_key), jnp.arange(env.episode_length))
@@ -116,6 +119,7 @@ def measures(
     costs = {name: episodes.costs[..., k] for k, name in enumerate(cost_names)}
     over = {name: above(costs[name] if name else episodes.cost, most) for name, most in limits.items()}
     shown = costs if len(costs) > 1 else {}
+    goals = {} if np.isnan(episodes.goals).all() else {"goals": episodes.goals}
     return {
         "return": episodes.ret,
         "cost": episodes.cost,
@@ -125,6 +129,7 @@ def measures(
         "discounted return": episodes.discounted_ret,
         "discounted cost": episodes.discounted_cost,
         "episode length": episodes.length,
+        **goals,
     }
 
 

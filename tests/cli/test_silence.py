@@ -126,7 +126,7 @@ def test_what_comes_after_the_end_of_an_episode_does_not_count():
 
 def test_a_cost_that_is_not_known_is_neither_within_the_limit_nor_over_it():
     sums = np.array([[1.0, np.nan, 3.0]])
-    episodes = evaluate.Episodes(sums, sums, sums[..., None], sums, sums, sums)
+    episodes = evaluate.Episodes(sums, sums, sums[..., None], sums, sums, sums, sums)
     rate = evaluate.measures(episodes, ("a",), {"": 2.0})["violation rate"]
     np.testing.assert_array_equal(rate, [[0, np.nan, 1]])
 

@@ -1,9 +1,11 @@
+import dataclasses
 import json
 import lzma
 import math
 import sys
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from toys import Ticker, reflex
@@ -118,7 +120,22 @@ def test_discounted_sums_and_named_costs_of_an_episode_by_hand():
     found = evaluate.measures(own, ("a", "b"), {"a": a - 0.5, "b": b})
     assert [found[f"cost {name}"].item() for name in "ab"] == [a, b]
     assert [found[k].item() for k in (f"a over {a - 0.5:g}", f"b over {b:g}")] == [True, False]
-    assert found["violation rate"].item() and "cost wall" not in found
+    assert found["violation rate"].item() and not {"cost wall", "goals"} & found.keys()
+
+
+def test_goals_of_an_episode_are_counted_until_its_end():
+    class Scoring(Ticker):
+        def reset(self, key):
+            return dataclasses.replace(super().reset(key), info={"goal_met": jnp.float32(0)})
+
+        def step(self, state, action):
+            after = super().step(state, action)
+            return dataclasses.replace(after, info={"goal_met": jnp.float32(after.obs[1] != 2)})
+
+    player = reflex(lambda obs: obs[:1], Scoring(episode_length=9, lives=(4, 4)))
+    four = evaluate.episode(player, jax.random.key(0))
+    own = evaluate.Episodes(*(np.asarray(x)[None, None] for x in four))
+    assert evaluate.measures(own, ("a", "b"), {"": 9.0})["goals"].item() == 3
 
 
 def test_cost_rate_is_total_cost_over_total_steps_of_each_seed():
