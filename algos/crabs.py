@@ -230,7 +230,7 @@ def crabs(env: Env) -> Learner:
         no = jnp.zeros((*obs.shape[:-1], 1), bool)
         return kept(learned, obs, candidates_of(dist, key, jnp.ones(()), no, cfg))
 
-    def explore(learned: Learned, obs: jax.Array, key: jax.Array) -> jax.Array:
+    def explore(learned: Learned, obs: jax.Array, key: jax.Array, remaining: jax.Array) -> jax.Array:
         """A third of the environments each has the policy's noise, twice that, and random actions."""
         cfg = learned.config
         dist = squashed_policy(learned.params["actor"], obs, env.action_size, cfg)

@@ -40,6 +40,9 @@ class DeterministicConfig(ActorCriticConfig):
     noise_min: Noise = 0.05
     # Standard deviation of the noise on actions in training, in the boldest environment.
     noise_max: Noise = 0.5
+    # Whether the noise falls linearly to 0 by the end of training. The price then holds the limit for
+    # the policy without noise, as it is used. OmniSafe keeps the noise.
+    noise_decay: bool = False
 
 
 @config
@@ -140,8 +143,11 @@ def deterministic_actor(
     def noisy(action: jax.Array, noise: jax.Array) -> jax.Array:
         return jnp.clip(action + noise, -1.0, 1.0)
 
-    def explore(params: PyTree, obs: jax.Array, key: jax.Array, cfg: Any) -> jax.Array:
+    def explore(
+        params: PyTree, obs: jax.Array, key: jax.Array, cfg: Any, remaining: jax.Array
+    ) -> jax.Array:
         sigma = jnp.linspace(cfg.noise_min, cfg.noise_max, obs.shape[0])[:, None]
+        sigma *= remaining if cfg.noise_decay else 1.0
         noise = sigma * jax.random.normal(key, (obs.shape[0], action_size))
         return noisy(mu(params["actor"], obs, cfg), noise)
 

@@ -173,7 +173,7 @@ class Actor(NamedTuple):
     next_action(parameters, targets, obs [B, O], key, cfg) -> a' [B, A] and bonus' [B].
     propose(parameters, obs [B, O], key, cfg) -> Proposal.
     pick(q [critics, B]) -> [B], what the policy climbs.
-    explore: see `Learner`.
+    explore(parameters, obs [N, O], key, cfg, remaining): see `Learner`.
     """
 
     critics: int
@@ -186,13 +186,12 @@ class Actor(NamedTuple):
     ]
     propose: Callable[[dict[str, PyTree], jax.Array, jax.Array, Any], Proposal]
     pick: Callable[[jax.Array], jax.Array]
-    explore: Callable[[PyTree, jax.Array, jax.Array, Any], jax.Array] | None = None
+    explore: Callable[[PyTree, jax.Array, jax.Array, Any, jax.Array], jax.Array] | None = None
 
 
 def actor_critic(env: Env, actor: Actor, treatment: Treatment) -> Learner:
     """The learner that `actor` makes. Without a treatment there are no critics of cost."""
     names = treatment.constrained_costs
-    explore = actor.explore or actor.act
 
     def init(key: jax.Array, obs_size: int, action_size: int, cfg: Any) -> Trainable:
         actor_key, critic_key = jax.random.split(key)
@@ -291,13 +290,14 @@ def actor_critic(env: Env, actor: Actor, treatment: Treatment) -> Learner:
 
         return loss
 
-    def acting(by: Callable[..., jax.Array]) -> Callable[[Learned, PyTree, Any], jax.Array]:
-        def act(learned: Learned, obs: PyTree, key: jax.Array | None) -> jax.Array:
-            return by(learned.params, features(learned.params, obs), key, learned.config)
+    def acting(by: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
+        def act(learned: Learned, obs: PyTree, key: jax.Array | None, *more: jax.Array) -> jax.Array:
+            return by(learned.params, features(learned.params, obs), key, learned.config, *more)
 
         return act
 
-    return Learner(init=init, act=acting(actor.act), step=step, explore=acting(explore))
+    explore = None if actor.explore is None else acting(actor.explore)
+    return Learner(init=init, act=acting(actor.act), step=step, explore=explore)
 
 
 def features(params: dict[str, PyTree], obs: PyTree) -> jax.Array:

@@ -60,7 +60,8 @@ class Learner(NamedTuple):
         devices: a mean is `pmean((weight * x).sum())`.
     act(learned, obs [..., O], key) -> action [..., A], the mean one where key is None. `learned` holds
         networks, `params`, the treatment's state, `dual`, and `config`.
-    explore(learned, obs [N, O], key) -> action [N, A], how training acts; None: as `act`.
+    explore(learned, obs [N, O], key, remaining []) -> action [N, A], how training acts while a share
+        `remaining` of it is left; None: as `act`.
     random_start(learned) -> bool [], whether actions are random during the warm-up.
     policy: for methods that remember something, or that look into the simulator. They act and explore
         by this policy. `act` and `explore` are then not used.
@@ -74,7 +75,7 @@ class Learner(NamedTuple):
     init: Callable[[jax.Array, int, int, Any], Trainable]
     step: Callable[[Trainable, PyTree, GradientStep, Any, str | None], tuple[Trainable, Metrics]]
     act: Callable[[Learned, jax.Array, jax.Array | None], jax.Array] = by_policy
-    explore: Callable[[Learned, jax.Array, jax.Array], jax.Array] | None = None
+    explore: Callable[[Learned, jax.Array, jax.Array, jax.Array], jax.Array] | None = None
     random_start: Callable[[Learned], jax.Array] = lambda learned: jnp.bool_(True)
     policy: Policy | None = None
     refit: (

@@ -188,7 +188,8 @@ def off_policy(
         """The rows of a round, and whether the normaliser had to skip them."""
         learned = learned_of(ts)
         random &= learner.random_start(learned)
-        act = at_random_while(random, exploring(learned), (ts.config.num_envs, env.action_size))
+        explore = exploring(learned, remaining(at.iteration, ts.config))
+        act = at_random_while(random, explore, (ts.config.num_envs, env.action_size))
         keys = jax.random.split(device_key(key, axis_name), timetable_of(ts.config, axis_name).rows)
         describe = learner.record(ts.config)
         stepping, (rows, steps) = collect_records(env, act, ts.stepping, keys, describe)
@@ -201,14 +202,16 @@ def off_policy(
         ts = dataclasses.replace(ts, stepping=stepping, replay=replay, normaliser=normaliser)
         return ts, steps, skipped
 
-    def exploring(learned: Learned) -> ActInAll:
-        """How training acts."""
+    def exploring(learned: Learned, share: jax.Array) -> ActInAll:
+        """How training acts while a `share` of it is left."""
         if learner.policy is not None:
             return Player(learner.policy, learned, env).act_in_all
-        explore = learner.explore or learner.act
 
         def act(carry: PyTree, state: State, first: jax.Array, key: jax.Array) -> Acted:
-            return explore(learned, network_inputs(learned.normaliser, state.obs), key), carry, {}
+            obs = network_inputs(learned.normaliser, state.obs)
+            if learner.explore is None:
+                return learner.act(learned, obs, key), carry, {}
+            return learner.explore(learned, obs, key, share), carry, {}
 
         return act
 
