@@ -400,7 +400,7 @@ def test_the_critics_find_the_values_of_a_chain(name, circle, n_step):
 )
 def test_each_environment_has_noise_of_its_own_which_can_fall_to_none(decay, left, share):
     cfg = td3.TD3Config(hidden=(), layer_norm=False, noise_min=0.1, noise_max=0.3, noise_decay=decay)
-    actor = ACTORS["td3"](4000)
+    actor: Any = ACTORS["td3"](4000)
     params = jax.tree.map(jnp.zeros_like, actor.init(jax.random.key(0), 1, 4000, cfg))  # mu(s) = 0
     actions = actor.explore(params, jnp.zeros((3, 1)), jax.random.key(1), cfg, jnp.float32(left))
     np.testing.assert_allclose(actions.std(1), share * np.array([0.1, 0.2, 0.3]), rtol=0.05)
