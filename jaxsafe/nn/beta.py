@@ -89,7 +89,7 @@ def following(x: jax.Array, dist: Beta) -> jax.Array:
 
 
 @following.defjvp
-def _(primals: tuple, tangents: tuple) -> tuple[jax.Array, jax.Array]:
+def follow(primals: tuple, tangents: tuple) -> tuple[jax.Array, jax.Array]:
     (x, (up, down)), (_, (d_up, d_down)) = primals, tangents
     return x, slope(x, 1 - x, up, down) * d_up - slope(1 - x, x, down, up) * d_down
 
