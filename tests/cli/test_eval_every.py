@@ -83,14 +83,14 @@ def test_a_lone_seed_split_over_devices_is_evaluated(tmp_path):
     assert due(tmp_path / "run") == [1, 2]
 
 
-def test_curves_show_evaluations_as_points_on_dashed_lines(watched, monkeypatch):
+def test_curves_show_evaluations_as_points_on_dashed_lines(watched, monkeypatch, tmp_path):
     drawn = []
 
     def savefig(figure, *_: object, **__: object) -> None:
         drawn.append(figure)
 
     monkeypatch.setattr(plots.Figure, "savefig", savefig)
-    plots.curves(run_folder.read_metrics(watched), Path("curves.png"), "title", 25.0)
+    plots.curves(run_folder.read_metrics(watched), tmp_path / "curves.png", "title", 25.0)
     assert [axes.get_ylabel() for axes in drawn[0].axes] == [label for _, label in plots.PANELS]
     for axes in drawn[0].axes:
         lines = {line.get_label(): line for line in axes.lines}
