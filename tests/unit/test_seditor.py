@@ -145,25 +145,13 @@ def nets(obs_size=1, size=1, **changes):
     } | changes
 
 
-@pytest.fixture
-def quick_draws(monkeypatch):
-    """Actions of which the gradient compiles quickly: logistic, with the odds of the concentrations."""
-
-    def sample(dist, key):
-        noise = jax.random.normal(key, dist.up.shape) / jnp.sqrt(dist.up + dist.down)
-        x = jax.nn.sigmoid(jnp.log(dist.up / dist.down) + noise)
-        return 2 * x - 1, beta.beta_log_prob(dist, x)
-
-    monkeypatch.setattr(seditor, "beta_sample", sample)
-
-
 class Price:
     def __init__(self, lam):
         self.lam = jnp.float32(lam)
 
 
 @pytest.mark.parametrize("distance", ["hinge", "action", "reward"])
-def test_an_edit_is_charged_for_the_reward_that_it_loses(distance, quick_draws):
+def test_an_edit_is_charged_for_the_reward_that_it_loses(distance):
     """Q_r is the action itself, so that it loses what the action falls."""
     cfg = dataclasses.replace(CFG, distance=distance, concentration_clip=float("inf"))
     params, obs = nets(), jnp.zeros((200, 1))
@@ -184,7 +172,7 @@ def test_an_edit_is_charged_for_the_reward_that_it_loses(distance, quick_draws):
         assert norms[0] == 0 and norms[1] > 0.1
 
 
-def test_the_proposer_feels_its_own_action_and_what_the_editor_makes_of_it(quick_draws):
+def test_the_proposer_feels_its_own_action_and_what_the_editor_makes_of_it():
     cfg = dataclasses.replace(CFG, concentration_clip=float("inf"))
     params, obs = nets(), jnp.zeros((500, 1))
 
@@ -204,7 +192,7 @@ def test_the_proposer_feels_its_own_action_and_what_the_editor_makes_of_it(quick
     assert opposed[0] < heedless[0] - 0.01
 
 
-def test_the_editor_brings_unsafe_proposals_to_the_bound_as_the_price_grows(monkeypatch, quick_draws):
+def test_the_editor_brings_unsafe_proposals_to_the_bound_as_the_price_grows(monkeypatch):
     """Q_r = -(a - 1/2)^2, and Q_c = a+ costs from 0 on. The proposals stay where reward is."""
 
     def worth(params, obs, action, cfg):
@@ -343,7 +331,7 @@ def batch_of(key) -> SequenceBatch:
     return SequenceBatch(found, jnp.array([0.5, 0.5, 0.0]))
 
 
-def test_each_network_moves_along_its_own_objective_alone(quick_draws):
+def test_each_network_moves_along_its_own_objective_alone():
     """Adam's first moments are a tenth of the gradients: those of the critics by hand, of linear ones,
     and of the policies and temperatures one by one."""
     cfg = jax.tree.map(
