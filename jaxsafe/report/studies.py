@@ -311,8 +311,9 @@ def in_order(study: Study, runs: Sequence[SettingRun]) -> list[Group]:
 
     What a preset says anyway is not in their names. How long a run is, is, where the study says it.
     """
-    long = any("total_steps=" in run for run in study.runs)
-    by = [name for name in telling(runs) if long or name != "total_steps"]
+    lengths = {"total_steps", "total_updates"}
+    long = {name for name in lengths if any(f"{name}=" in run for run in study.runs)}
+    by = [name for name in telling(runs) if name not in lengths - long]
     for name in ("compat", "devices"):
         if name not in by and len({run.config[name] for run in runs}) > 1:
             by.append(name)
@@ -320,9 +321,10 @@ def in_order(study: Study, runs: Sequence[SettingRun]) -> list[Group]:
 
 
 def said(g: Group) -> dict[str, Any]:
-    """The fields of a group that belong into its name."""
-    named = {"algo.name", "total_steps", "devices", *unusual(g.runs[0].config)}
-    return {name: value for name, value in g.by.items() if name in named}
+    """The fields of a group that belong into its name. A data set is called by its file's."""
+    named = {"algo.name", "total_steps", "total_updates", "devices", *unusual(g.runs[0].config)}
+    found = {name: value for name, value in g.by.items() if name in named}
+    return found | ({"dataset": Path(g.by["dataset"]).stem} if g.by.get("dataset") else {})
 
 
 def pictures_of(
