@@ -197,7 +197,7 @@ def steps_of_round(cfg: RoundConfig, num_envs: int, batch: int) -> int:
             f"learn_every={cfg.learn_every} transitions are no whole number of batches of "
             f"{batch}; the nearest that fit are {' or '.join(fitting(cfg, num_envs, batch))}"
         )
-    return transitions // batch
+    return int(transitions // batch)  # a ratio may be a fraction
 
 
 def fitting(cfg: RoundConfig, num_envs: int, batch: int) -> list[str]:
@@ -205,7 +205,7 @@ def fitting(cfg: RoundConfig, num_envs: int, batch: int) -> list[str]:
     steps, replayed = num_envs * cfg.learn_every, num_envs * cfg.replay_ratio
     least = batch // math.gcd(batch, steps)  # ratios that fit are multiples of it
     ratio = least * max(1, round(cfg.replay_ratio / least))
-    size = closest(divisors(cfg.replay_ratio * steps)[::-1], batch)  # of two as near, the larger one
+    size = closest(divisors(round(cfg.replay_ratio * steps))[::-1], batch)  # of two as near, the larger one
     every = [n for n in divisors(cfg.horizon) if replayed * n % batch == 0]
     found = [f"replay_ratio={ratio}", f"batch_size={size}"]
     if every:

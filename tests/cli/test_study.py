@@ -48,6 +48,7 @@ def trained(folder: Path, options: list[str], steps: int = 4000, nonfinite: Any 
     algo = {"name": given["algo"]} | ({"dual_lr": 0.2} if "algo.dual_lr" in given else {})
     folder.mkdir(parents=True)
     config = {"env": {"name": given["env"]}, "algo": algo, "total_steps": 4000, "num_seeds": 2}
+    config |= {"dataset": given["dataset"]} if "dataset" in given else {}
     run_folder.write_config(folder, config)
     run_folder.append_versions(folder, "abacus", "c")
     names = ["train/return", "train/cost", "train/cost_rate", "train/nonfinite"]
@@ -86,6 +87,17 @@ def test_figures_and_curves_of_a_study_are_those_of_its_runs(toy, tmp_path):
     for name in study_files.CURVES:
         here, there = (plots.stretches(r.table, name, edges) for r in (same, run))
         np.testing.assert_allclose(here, there, rtol=2e-3, err_msg=name)
+
+
+def test_a_data_set_is_called_by_its_file(toy, tmp_path):
+    runs = [f"env=point_goal1 algo=bc dataset=data/{beta}.hdf5" for beta in ("0.25", "0.75")]
+    study = toy._replace(runs=runs)
+    for i, run in enumerate(runs):
+        trained(tmp_path / str(i), study.command(run))
+        (found,) = read_one(tmp_path / str(i))
+        studies.add(study, run, found, studies.origin_of(tmp_path / str(i)))
+    groups = studies.in_order(study, read([study.folder]))
+    assert [g.name for g in groups] == ["bc, dataset=0.25", "bc, dataset=0.75"]
 
 
 def test_a_window_has_means_and_the_swing_of_the_cost_by_hand(toy, tmp_path):
