@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+import jaxsafe
+
 ROOT = Path(__file__).parent.parent.parent
 SOURCES = ("jaxsafe", "envs", "algos")
 # Rooms from the lowest to the highest; one may import those below it and its own.
@@ -69,6 +71,18 @@ def test_imports_point_one_way(path):
 def test_only_the_lazy_names_lead_to_the_api():
     users = {path for path in MODULES for name in imported(path) if name.startswith("jaxsafe.api")}
     assert users == {ROOT / "jaxsafe" / "__init__.py"}
+
+
+@pytest.mark.parametrize("parts, threads", [({}, 4), ({"JAX_NUM_CPU_DEVICES": "3"}, 8)])
+def test_xla_has_two_threads_for_each_part_of_the_cpu_and_two_more(parts, threads, monkeypatch):
+    monkeypatch.setattr("os.cpu_count", lambda: 2)
+    monkeypatch.delenv("JAX_NUM_CPU_DEVICES", raising=False)
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=false")
+    for name, value in parts.items():
+        monkeypatch.setenv(name, value)
+    assert jaxsafe.threads() == threads
+    monkeypatch.setenv("XLA_FLAGS", "--xla_force_host_platform_device_count=4")
+    assert jaxsafe.threads() == 10
 
 
 def test_the_links_into_the_package_exist_and_are_relative():

@@ -22,7 +22,7 @@ from jaxsafe.learn.acting import Player
 from jaxsafe.learn.models import EnsembleConfig
 from jaxsafe.learn.next_step_rollout import collect_records
 from jaxsafe.learn.off_policy import OffPolicyConfig
-from jaxsafe.learn.timetable import timetable_of
+from jaxsafe.learn.timetable import ReplayConfig, timetable_of
 from jaxsafe.types import Env, Shared, State
 
 NAMES = [
@@ -262,6 +262,15 @@ def test_a_batch_follows_the_number_of_environments_so_that_the_replay_ratio_sta
     assert batch * gradient_steps == cfg.replay_ratio * num_envs * table.rows
     with pytest.raises(ConfigError, match=r"batches of 4096; .* replay_ratio=4096 or batch_size=16"):
         timetable_of(dataclasses.replace(cfg, num_envs=1), None)  # 16 are too few to learn from
+
+
+@pytest.mark.parametrize(
+    "name, preset", [(name, preset) for name, row in ALGOS.items() for preset in row.published]
+)
+def test_a_preset_takes_whole_gradient_steps(name, preset):
+    cfg = ALGOS[name].config(**ALGOS[name].published[preset])
+    if isinstance(cfg, ReplayConfig):
+        assert isinstance(timetable_of(cfg, None).gradient_steps, int)
 
 
 def test_the_clocks_count_environment_steps_and_gradient_steps():
