@@ -185,6 +185,9 @@ class Kernels:
         self.inputs, results = widths(model, simulation)
         self.results = results | {"overflow": 1}
         self.batches: dict[tuple[str, int], Worlds] = {}
+        # Each call comes with a new object for XLA's stream. Warp forgets the stream as soon as one of
+        # them is collected, even while a graph is captured on it. Those of captures are collected late.
+        self.streams: list[wp.Stream] = []
         self.said = False  # which kernels run
 
     def prepare(self, worlds: int) -> Worlds:
@@ -222,6 +225,7 @@ class Kernels:
             self.advance(w, substeps)
         else:
             if substeps not in w.graphs:
+                self.streams.append(wp.get_stream())
                 with wp.ScopedCapture() as capture:
                     self.advance(w, substeps)
                 w.graphs[substeps] = capture.graph
