@@ -63,15 +63,25 @@ class SEditorConfig(LagrangianConfig, PriceClockConfig, OffPolicyConfig):
 
     Source: Yu, Xu and Zhang (2022), "Towards Safe Reinforcement Learning with a Safety Editor Policy",
     arXiv:2201.12427; networks, returns and schedules are from the authors' code.
-    Differs from it: the defaults are for a thousand environments. Batches are smaller, observations are
-    normalised, and critics have layer norm. `preset=published` has the authors' settings.
+    Differs from it: the defaults are for a thousand environments, which take 32 gradient steps and 32
+    moves of the price for 5 of their steps. `preset=published` has 32 environments, and one of each.
     """
 
-    # Rows replayed for each environment step. The authors have 51.2.
-    replay_ratio: Amount | Annotated[float, Bounds(1e-6, 1e6)] = 16
-    # Rows of a gradient step, of all devices together: 256 sequences of 8. The authors have 1,024. With
-    # `replay_ratio` 16 a gradient step comes every 128 environment steps. The authors have 160.
-    batch_size: Amount = 2048
+    # Environments side by side, of all devices together. The authors have 32.
+    num_envs: Amount = 1024
+    horizon: Amount = 5  # Steps of each environment in an update, as in the authors' code.
+    learn_every: Amount = 5  # Steps of each environment between two rounds of gradient steps, likewise.
+    # Transitions kept, rounded to whole updates. As in the authors' code.
+    replay_size: Annotated[int, Bounds(1, 2**31 - 1)] = 1_600_000
+    # Rows replayed for each environment step, as in the authors' code. A gradient step comes every 160.
+    replay_ratio: Amount | Annotated[float, Bounds(1e-6, 1e6)] = 51.2
+    # Rows of a gradient step, of all devices together: 1,024 sequences of 8, as in the authors' code.
+    batch_size: Amount = 8192
+    layer_norm: bool = False  # Whether the critics normalise their layers. The authors' do not.
+    # Whether observations are normalised by a running mean and variance. The authors' are not.
+    obs_normalize: bool = False
+    # The largest norm of each network's gradient. The authors have no bound.
+    max_grad_norm: Norm = float("inf")
     # Steps of a replayed sequence. It has a row more: 8, as the authors have.
     n_step: Iterations = 7
     # How far TD(lambda) returns reach: 0 is one step. The authors have 0.95.
@@ -374,28 +384,15 @@ def make(env: Env, axis_name: str | None = None) -> Algorithm:
 
 
 # HorizonRobotics/alf @23aca49, examples/seditor_safety_gym_conf.py, without its DEBUG: 32 environments
-# take 5 steps each between two gradient steps of 1,024 sequences.
-PAPER: dict[str, Any] = {
-    "num_envs": 32,
-    "horizon": 5,
-    "learn_every": 5,
-    "stagger": False,
-    "replay_ratio": 51.2,
-    "batch_size": 8192,
-    "replay_size": 1_600_000,
-    "layer_norm": False,
-    "obs_normalize": False,
-    "max_grad_norm": float("inf"),
-}
-# the same for 1,024 environments: 32 gradient steps, and 32 moves of the price, for 5 of their steps
-PARALLEL: dict[str, Any] = PAPER | {"num_envs": 1024, "stagger": True}
+# take 5 steps each between two gradient steps
+PAPER: dict[str, Any] = {"num_envs": 32, "stagger": False}
 # for a problem of two levers
 LEVER: dict[str, Any] = {
     "num_envs": 32, "horizon": 8, "learn_every": 2, "batch_size": 64, "replay_ratio": 2,
     "replay_size": 20_000, "learning_starts": 256, "n_step": 3, "hidden": (32,), "discount": 0.5,
     "cost_discount": 0.5, "lr": 1e-2, "critic_lr": 1e-2, "tau": 0.05, "alpha_init": 0.1,
     "alpha_lr": 3e-3, "min_prob": 0.2, "editor_min_prob": 0.2, "lam_init": 0.3, "dual_lr": 0.05,
-    "dual_every": 256,
+    "dual_every": 256, "layer_norm": True, "obs_normalize": True, "max_grad_norm": 40.0,
 }  # fmt: skip
 
 ROWS = {
@@ -403,7 +400,7 @@ ROWS = {
         SEditorConfig,
         make,
         "a policy that seeks reward, and a safety editor of its actions",
-        {"paper": PAPER, "parallel": PARALLEL},
+        {"paper": PAPER},
         total_steps=5_000_000,
         lever=LEVER,
     ),

@@ -369,7 +369,8 @@ def matrix(groups: Sequence[Group], known: Mapping[tuple[str, str], Published]) 
         for env in tasks:
             cell = []
             if g := found.get((env, name)):
-                cell.append(f"{g.ret.mean:.1f}, {g.cost.mean:.1f}")
+                ended = np.isfinite(g.ret.mean)  # an episode, at least, in the last tenth
+                cell.append(f"{g.ret.mean:.1f}, {g.cost.mean:.1f}" if ended else "-")
                 if theirs := beside(g, known):
                     cell.append(f"*{theirs.ret[0]:.1f}, {theirs.cost[0]:.1f}*")
             cells.append("<br>".join(cell))
