@@ -188,7 +188,12 @@ def init_fitted(key: jax.Array, env: Env, cfg: Any) -> Trainable:
     """An ensemble, `Fitted`, and its optimiser's state."""
     inputs, outputs = env.obs_size + env.action_size, len(cfg.told) + env.obs_size
     ensemble: PyTree = init_ensemble(key, cfg.models, inputs, cfg.model_hidden, outputs)
-    return Trainable(Fitted(ensemble, unscaled(inputs)), optax.adam(cfg.model_lr).init(ensemble))
+    return Trainable(Fitted(ensemble, unscaled(inputs)), optimiser_of(cfg).init(ensemble))
+
+
+def optimiser_of(cfg: Any) -> optax.GradientTransformation:
+    """Adam. All weights are one array to it, so that a step has a few kernels."""
+    return optax.flatten(optax.adam(cfg.model_lr))
 
 
 def model_of(nets: Trainable) -> Trainable:
@@ -309,7 +314,7 @@ def fit(
     batch = (cfg.models, cfg.model_batch // device_count(axis_name))
     steps = jnp.maximum(psum(train.count, axis_name) // cfg.model_batch, 1)
     steps = jnp.int32(cfg.epoch_steps) if cfg.epoch_steps else steps
-    optimiser = optax.adam(cfg.model_lr)
+    optimiser = optimiser_of(cfg)
 
     def errors(ensemble: Ensemble) -> jax.Array:
         """Of each model on all that is held out: mean squared error, float [M]."""
