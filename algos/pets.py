@@ -116,7 +116,7 @@ class CAPConfig(PriceClockConfig, PETSConfig):
     below e^-10 then. On PointGoal1 it was 2 after a short fit to 2,000 random steps. There T is 200.
     With OmniSafe's limit of 1 no plan at all is feasible from kappa = 0.0025 on. The planner then takes
     the plans of the smallest C, whatever they earn. OmniSafe's kappa is 1 after one move from J_c = 50
-    (`preset=published`), and falls by at most 0.1 a move. With a limit of 1, take `kappa_max=0.002`.
+    (`preset=published`), and falls by at most 0.1 a move.
     """
 
     # Environment steps between two moves of kappa. OmniSafe has 20,000 raw steps.
@@ -125,13 +125,14 @@ class CAPConfig(PriceClockConfig, PETSConfig):
     # The change of kappa for each unit of violation. It raises C by T kappa_lr |sigma|, which is 0.4 on
     # PointGoal1. OmniSafe has 0.1, which raises it by 40.
     kappa_lr: Weight = 1e-3
-    # The largest kappa. On PointGoal1 plans without cost are feasible up to cost_limit / (T |sigma|) =
-    # 0.0625. OmniSafe has 1, with a limit of 1.
-    kappa_max: Weight = 0.05
+    # The largest kappa. null: 0.002 for each unit of cost_limit. On PointGoal1 plans without cost are
+    # feasible up to 1 / (T |sigma|) = 0.0025 for each. OmniSafe has 1, with a limit of 1.
+    kappa_max: Weight | None = None
 
 
 def move_kappa(kappa: jax.Array, episode_cost: jax.Array, cfg: Any, iteration: Count) -> jax.Array:
-    return jnp.clip(kappa + cfg.kappa_lr * (episode_cost - cfg.cost_limit), 0.0, cfg.kappa_max)
+    most = 0.002 * cfg.cost_limit if cfg.kappa_max is None else cfg.kappa_max
+    return jnp.clip(kappa + cfg.kappa_lr * (episode_cost - cfg.cost_limit), 0.0, most)
 
 
 caution = Treatment(

@@ -124,6 +124,22 @@ def test_a_planner_without_a_constraint_walks_on_and_its_plan_moves_along_with_i
 # ---- particles -----------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(
+    "limit, most, cost, expected",
+    [
+        (1.0, None, 51.0, 0.002),  # kappa_lr times 50 would leave no plan feasible
+        (25.0, None, 26.0, 0.001),
+        (25.0, None, 1000.0, 0.05),
+        (25.0, 0.03, 1000.0, 0.03),
+        (25.0, None, 20.0, 0.0),
+    ],
+)
+def test_kappa_rises_with_the_violation_up_to_a_share_of_the_limit(limit, most, cost, expected):
+    cfg = pets.CAPConfig(cost_limit=limit, kappa_max=most)
+    found = pets.move_kappa(jnp.float32(0), jnp.float32(cost), cfg, 0)
+    assert found == pytest.approx(expected, rel=1e-5)
+
+
 def test_a_particle_keeps_its_model_its_plan_and_its_penalty():
     """A model whose state remembers who it is: particle p of model m under plan s."""
     m, p, s, h = 2, 3, 8, 2
