@@ -17,12 +17,12 @@ def threads() -> int:
 
     A host callback (the CPU engine is one) holds a thread while it waits for its input, which another
     thread of the pool brings. With two threads, two callbacks at once wait for ever. So there are two
-    for each device that the CPU is split into, and two more. More than that only costs time: with
-    eight on two cores, products of matrices are a quarter slower than with four.
+    for each device that the CPU is split into, and one more. More than that only costs time: with
+    eight on two cores, products of matrices are a quarter slower.
     """
     flag = re.search(r"host_platform_device_count=(\d+)", os.environ.get("XLA_FLAGS", ""))
     devices = flag[1] if flag else os.environ.get("JAX_NUM_CPU_DEVICES", "")
-    return max(2 + 2 * (int(devices) if devices.isdigit() else 1), os.cpu_count() or 1)
+    return max(1 + 2 * (int(devices) if devices.isdigit() else 1), os.cpu_count() or 1)
 
 
 os.environ.setdefault("PJRT_NPROC", str(threads()))  # read when JAX first uses the CPU

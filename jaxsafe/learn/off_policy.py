@@ -245,7 +245,9 @@ def off_policy(
             batches, dropped = jax.vmap(batch_of)(keys[:, 0])
             numbers = at.first_step + jnp.arange(table.gradient_steps)
             new, metrics = jax.lax.scan(step, nets, (numbers, keys[:, 1], batches))
-            finite = psum(~all_finite(new), axis_name) == 0
+            # what is not finite elsewhere, as in Adam's state, is so in the weights at the same step
+            weights = {name: x for name, x in new.params.items() if name != "targets"}
+            finite = psum(~all_finite(weights), axis_name) == 0
             lost = {"train/nonfinite": jnp.float32(dropped + ~finite)}
             return select(finite, new, nets), metrics | lost
 
