@@ -125,8 +125,9 @@ class CAPConfig(PriceClockConfig, PETSConfig):
     # The change of kappa for each unit of violation. It raises C by T kappa_lr |sigma|, which is 0.4 on
     # PointGoal1. OmniSafe has 0.1, which raises it by 40.
     kappa_lr: Weight = 1e-3
-    # The largest kappa. null: 0.002 for each unit of cost_limit. On PointGoal1 plans without cost are
-    # feasible up to 1 / (T |sigma|) = 0.0025 for each. OmniSafe has 1, with a limit of 1.
+    # The largest kappa. null: 0.002 for each unit of cost_limit. On PointGoal1 with T = 200 plans
+    # without cost are feasible up to 1 / (T |sigma|) = 0.0025 for each. Longer episodes need less.
+    # OmniSafe has 1, with a limit of 1.
     kappa_max: Weight | None = None
 
 
