@@ -21,7 +21,7 @@ from jaxsafe.learn.planning import (
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.timetable import ReplayConfig
 from jaxsafe.learn.treatments import Treatment
-from jaxsafe.types import Count
+from jaxsafe.types import Algorithm, Count, Env
 
 
 @config
@@ -125,28 +125,35 @@ class CAPConfig(PriceClockConfig, PETSConfig):
     # The change of kappa for each unit of violation. It raises C by T kappa_lr |sigma|, which is 0.4 on
     # PointGoal1. OmniSafe has 0.1, which raises it by 40.
     kappa_lr: Weight = 1e-3
-    # The largest kappa. null: 0.002 for each unit of cost_limit. On PointGoal1 with T = 200 plans
-    # without cost are feasible up to 1 / (T |sigma|) = 0.0025 for each. Longer episodes need less.
-    # OmniSafe has 1, with a limit of 1.
+    # The largest kappa. null: 0.4 cost_limit / T. On PointGoal1 plans without cost are feasible up to
+    # cost_limit / (T |sigma|) = 0.5 cost_limit / T. OmniSafe has 1, with a limit of 1.
     kappa_max: Weight | None = None
 
 
-def move_kappa(kappa: jax.Array, episode_cost: jax.Array, cfg: Any, iteration: Count) -> jax.Array:
-    most = 0.002 * cfg.cost_limit if cfg.kappa_max is None else cfg.kappa_max
-    return jnp.clip(kappa + cfg.kappa_lr * (episode_cost - cfg.cost_limit), 0.0, most)
+def caution(steps: int) -> Treatment:
+    """The price kappa, for episodes of so many steps."""
 
+    def move(kappa: jax.Array, episode_cost: jax.Array, cfg: Any, iteration: Count) -> jax.Array:
+        most = 0.4 * cfg.cost_limit / steps if cfg.kappa_max is None else cfg.kappa_max
+        return jnp.clip(kappa + cfg.kappa_lr * (episode_cost - cfg.cost_limit), 0.0, most)
 
-caution = Treatment(
-    init=lambda cfg: jnp.asarray(cfg.kappa_init, jnp.float32),
-    update=move_kappa,
-    advantage=lambda kappa, adv_r, adv_c: adv_r - kappa * adv_c,
-    metrics=lambda kappa: {"train/kappa": kappa},
-)
+    return Treatment(
+        init=lambda cfg: jnp.asarray(cfg.kappa_init, jnp.float32),
+        update=move,
+        advantage=lambda kappa, adv_r, adv_c: adv_r - kappa * adv_c,
+        metrics=lambda kappa: {"train/kappa": kappa},
+    )
+
 
 PETS, CCE, RCE, CAP = (
     Planner(mean_return, cost, elites) for cost in (no_cost, mean_cost, worst_cost, cautious_cost)
 )
 make = partial(model_based, planner=PETS)
+
+
+def make_cautious(env: Env, axis_name: str | None = None) -> Algorithm:
+    return model_based(env, axis_name, planner=CAP, treatment=caution(env.episode_length))
+
 
 # OmniSafe @15603dd, configs/model-based; of navigation with env.wrap.action_repeat=5 and
 # env.observation=coordinates, where 5 raw steps are one step here. An update of 40 steps is ours.
@@ -208,7 +215,7 @@ ROWS = {
     ),
     "cap_pets": Row(
         CAPConfig,
-        partial(model_based, planner=CAP, treatment=caution),
+        make_cautious,
         "planning with a cost that the model's uncertainty raises",
         published(LIMIT | {"kappa_lr": 0.1, "kappa_max": 1.0}, dual_every=20_000),
         total_steps=1_000_000,

@@ -64,7 +64,8 @@ class SEditorConfig(LagrangianConfig, PriceClockConfig, OffPolicyConfig):
     Source: Yu, Xu and Zhang (2022), "Towards Safe Reinforcement Learning with a Safety Editor Policy",
     arXiv:2201.12427; networks, returns and schedules are from the authors' code.
     Differs from it: the defaults are for a thousand environments, which take 32 gradient steps and 32
-    moves of the price for 5 of their steps. `preset=published` has 32 environments, and one of each.
+    moves of the price for 5 of their steps. `preset=published` has 32 environments, one gradient step
+    and one move of the price.
     """
 
     # Environments side by side, of all devices together. The authors have 32.

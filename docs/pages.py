@@ -34,7 +34,7 @@ from jaxsafe.learn.off_policy import OffPolicyConfig
 from jaxsafe.learn.offline import OfflineConfig
 from jaxsafe.learn.on_policy import OnPolicyConfig
 from jaxsafe.learn.world_model import WorldModelConfig
-from jaxsafe.report import stats, studies
+from jaxsafe.report import stats, studies, study_files
 from jaxsafe.report import tables as report
 from jaxsafe.report.published import read_published
 from jaxsafe.report.read import SettingRun, read
@@ -73,6 +73,7 @@ LOOPS = {  # the first that an algorithm's config is one of
     OfflineConfig: "offline",
 }
 STUDIES = ("goal", "button", "push", "omnisafe", "velocity", "off_policy")  # in docs/results
+OTHERS = ("planning", "shielding", "offline")  # with limits, lengths or data of their own
 ABSENT = object()  # where there is no default
 ALGORITHMS = """# Algorithms
 
@@ -451,6 +452,12 @@ def trained() -> list[SettingRun]:
     return sorted(read(folders), key=place)
 
 
+@functools.cache
+def algos_of(study: str) -> set[str]:
+    """The algorithms that a study has runs of."""
+    return {row["algo"] for row in study_files.read(HERE / "results" / study).rows}
+
+
 def measured(name: str) -> str:
     """The runs of this algorithm in docs/results."""
     rows = []
@@ -467,6 +474,9 @@ def measured(name: str) -> str:
         unusual = {k: v for k, v in studies.unusual(run.config).items() if k.startswith("algo.")}
         how += "".join(f", `{k}={v}`" for k, v in unusual.items())
         rows.append(f"| {how} | {ret} | {cost} | {studies.published_cell(run.config, known)} |")
+    found = [study for study in OTHERS if name in algos_of(study)]
+    if not rows and found:
+        return f"[Its runs](../results/{found[0]}/README.md)."
     if not rows and issubclass(ALGOS[name].config, OfflineConfig):
         return "Not run at length yet."
     if issubclass(ALGOS[name].config, CertificateConfig):

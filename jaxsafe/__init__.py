@@ -12,20 +12,21 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 
-def threads() -> int:
+def _threads() -> int:
     """How many threads XLA's pool needs on the CPU.
 
     A host callback (the CPU engine is one) holds a thread while it waits for its input, which another
     thread of the pool brings. With two threads, two callbacks at once wait for ever. So there are two
-    for each device that the CPU is split into, and one more. More than that only costs time: with
-    eight on two cores, products of matrices are a quarter slower.
+    for each device that the CPU is split into, as two programs may run on it, and one that brings
+    their inputs. More than that only costs time: with eight on two cores, products of matrices are a
+    quarter slower.
     """
     flag = re.search(r"host_platform_device_count=(\d+)", os.environ.get("XLA_FLAGS", ""))
     devices = flag[1] if flag else os.environ.get("JAX_NUM_CPU_DEVICES", "")
     return max(1 + 2 * (int(devices) if devices.isdigit() else 1), os.cpu_count() or 1)
 
 
-os.environ.setdefault("PJRT_NPROC", str(threads()))  # read when JAX first uses the CPU
+os.environ.setdefault("PJRT_NPROC", str(_threads()))  # read when JAX first uses the CPU
 
 __all__ = [
     "ConfigError",

@@ -245,9 +245,9 @@ def off_policy(
             batches, dropped = jax.vmap(batch_of)(keys[:, 0])
             numbers = at.first_step + jnp.arange(table.gradient_steps)
             new, metrics = jax.lax.scan(step, nets, (numbers, keys[:, 1], batches))
-            # A gradient that is not finite makes the weights so at the same step, and targets follow.
-            weights = {name: x for name, x in new.params.items() if name != "targets"}
-            finite = psum(~all_finite(weights), axis_name) == 0
+            # targets are finite where what they follow is
+            followed = {name: x for name, x in new.params.items() if name != "targets"}
+            finite = psum(~all_finite((followed, new.opt_state)), axis_name) == 0
             lost = {"train/nonfinite": jnp.float32(dropped + ~finite)}
             return select(finite, new, nets), metrics | lost
 

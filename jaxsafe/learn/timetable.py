@@ -205,9 +205,8 @@ def fitting(cfg: RoundConfig, num_envs: int, batch: int) -> list[str]:
     steps, replayed = num_envs * cfg.learn_every, num_envs * cfg.replay_ratio
     least = batch // math.gcd(batch, steps)  # ratios that fit are multiples of it
     ratio = least * max(1, round(cfg.replay_ratio / least))
-    size = closest(
-        divisors(round(cfg.replay_ratio * steps))[::-1], batch
-    )  # of two as near, the larger one
+    transitions = round(cfg.replay_ratio * steps)
+    size = closest(divisors(transitions)[::-1], batch)  # of two as near, the larger one
     every = [n for n in divisors(cfg.horizon) if replayed * n % batch == 0]
     found = [f"replay_ratio={ratio}", f"batch_size={size}"]
     if every:

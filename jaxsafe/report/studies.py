@@ -309,7 +309,7 @@ def page(study: Study) -> tuple[str, list[Picture]]:
 def in_order(study: Study, runs: Sequence[SettingRun]) -> list[Group]:
     """The groups of each setting and task, in the order of the runs, the order of their worth.
 
-    What a preset says anyway is not in their names. How long a run is, is, where the study says it.
+    What a preset says anyway is not in their names. Lengths are, where the study sets them.
     """
     lengths = {"total_steps", "total_updates"}
     long = {name for name in lengths if any(f"{name}=" in run for run in study.runs)}
@@ -321,7 +321,7 @@ def in_order(study: Study, runs: Sequence[SettingRun]) -> list[Group]:
 
 
 def said(g: Group) -> dict[str, Any]:
-    """The fields of a group that belong into its name. A data set is called by its file's."""
+    """The fields of a group that belong in its name. A data set goes by its file's name."""
     named = {"algo.name", "total_steps", "total_updates", "devices", *unusual(g.runs[0].config)}
     found = {name: value for name, value in g.by.items() if name in named}
     return found | ({"dataset": Path(g.by["dataset"]).stem} if g.by.get("dataset") else {})
@@ -369,7 +369,7 @@ def matrix(groups: Sequence[Group], known: Mapping[tuple[str, str], Published]) 
         for env in tasks:
             cell = []
             if g := found.get((env, name)):
-                ended = np.isfinite(g.ret.mean)  # an episode, at least, in the last tenth
+                ended = np.isfinite(g.ret.mean)  # whether an episode did in the last tenth
                 cell.append(f"{g.ret.mean:.1f}, {g.cost.mean:.1f}" if ended else "-")
                 if theirs := beside(g, known):
                     cell.append(f"*{theirs.ret[0]:.1f}, {theirs.cost[0]:.1f}*")

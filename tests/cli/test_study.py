@@ -100,6 +100,14 @@ def test_a_data_set_is_called_by_its_file(toy, tmp_path):
     assert [g.name for g in groups] == ["bc, dataset=0.25", "bc, dataset=0.75"]
 
 
+def test_a_run_without_a_finished_episode_is_a_dash(toy, tmp_path):
+    trained(tmp_path / "run", toy.command(toy.runs[0]), steps=40)  # returns begin with the fifth row
+    (run,) = read_one(tmp_path / "run")
+    studies.add(toy, toy.runs[0], run, studies.origin_of(tmp_path / "run"))
+    found = studies.matrix(studies.in_order(toy, read([toy.folder])), {})
+    assert found.splitlines()[-1] == "| `cpo` | - |"
+
+
 def test_a_window_has_means_and_the_swing_of_the_cost_by_hand(toy, tmp_path):
     trained(tmp_path / "run", toy.command(toy.runs[0]))
     (run,) = read_one(tmp_path / "run")

@@ -203,6 +203,7 @@ def test_every_float_of_every_algorithm_may_differ_between_members(name):
     small: dict[str, Any] = {
         field: (4,) for field in ("hidden", "model_hidden") if hasattr(kind, field)
     }
+    # a horizon that every `learn_every` divides
     cfg = kind(**small) if offline else kind(num_envs=256, horizon=80, **small)
     other = replace(cfg, **{field: 0.25 for field in float_fields(kind)})
     data = data_set_like(Corridor()) if offline else ()

@@ -73,16 +73,22 @@ def test_only_the_lazy_names_lead_to_the_api():
     assert users == {ROOT / "jaxsafe" / "__init__.py"}
 
 
-@pytest.mark.parametrize("parts, threads", [({}, 3), ({"JAX_NUM_CPU_DEVICES": "3"}, 7)])
-def test_xla_has_two_threads_for_each_part_of_the_cpu_and_one_more(parts, threads, monkeypatch):
-    monkeypatch.setattr("os.cpu_count", lambda: 2)
+@pytest.mark.parametrize(
+    "cores, parts, threads",
+    [
+        (2, {}, 3),
+        (2, {"JAX_NUM_CPU_DEVICES": "3"}, 7),
+        (2, {"XLA_FLAGS": "--xla_force_host_platform_device_count=4"}, 9),
+        (16, {}, 16),
+    ],
+)
+def test_xla_has_two_threads_for_each_part_of_the_cpu_and_one_more(cores, parts, threads, monkeypatch):
+    monkeypatch.setattr("os.cpu_count", lambda: cores)
     monkeypatch.delenv("JAX_NUM_CPU_DEVICES", raising=False)
     monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=false")
     for name, value in parts.items():
         monkeypatch.setenv(name, value)
-    assert jaxsafe.threads() == threads
-    monkeypatch.setenv("XLA_FLAGS", "--xla_force_host_platform_device_count=4")
-    assert jaxsafe.threads() == 9
+    assert jaxsafe._threads() == threads
 
 
 def test_the_links_into_the_package_exist_and_are_relative():

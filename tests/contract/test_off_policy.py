@@ -265,12 +265,23 @@ def test_a_batch_follows_the_number_of_environments_so_that_the_replay_ratio_sta
 
 
 @pytest.mark.parametrize(
-    "name, preset", [(name, preset) for name, row in ALGOS.items() for preset in row.published]
+    "name, preset",
+    [
+        (name, preset)
+        for name, row in ALGOS.items()
+        if issubclass(row.config, ReplayConfig)
+        for preset in ("fast", *row.published)
+    ],
 )
-def test_a_preset_takes_whole_gradient_steps(name, preset):
-    cfg = ALGOS[name].config(**ALGOS[name].published[preset])
-    if isinstance(cfg, ReplayConfig):
-        assert isinstance(timetable_of(cfg, None).gradient_steps, int)
+def test_defaults_and_presets_take_whole_gradient_steps(name, preset):
+    cfg = ALGOS[name].config(**ALGOS[name].published.get(preset, {}))
+    assert isinstance(timetable_of(cfg, None).gradient_steps, int)
+
+
+def test_the_nearest_sizes_of_a_ratio_that_is_a_fraction_are_whole():
+    cfg = ALGOS["seditor"].config(num_envs=33)  # 8,448 transitions a round
+    with pytest.raises(ConfigError, match=r"replay_ratio=8192 or batch_size=8448"):
+        timetable_of(cfg, None)
 
 
 def test_the_clocks_count_environment_steps_and_gradient_steps():

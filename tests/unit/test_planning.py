@@ -136,7 +136,7 @@ def test_a_planner_without_a_constraint_walks_on_and_its_plan_moves_along_with_i
 )
 def test_kappa_rises_with_the_violation_up_to_a_share_of_the_limit(limit, most, cost, expected):
     cfg = pets.CAPConfig(cost_limit=limit, kappa_max=most)
-    found = pets.move_kappa(jnp.float32(0), jnp.float32(cost), cfg, 0)
+    found = pets.caution(200).update(jnp.float32(0), jnp.float32(cost), cfg, 0)
     assert found == pytest.approx(expected, rel=1e-5)
 
 

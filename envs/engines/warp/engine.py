@@ -186,7 +186,7 @@ class Kernels:
         self.results = results | {"overflow": 1}
         self.batches: dict[tuple[str, int], Worlds] = {}
         # Each call comes with a new object for XLA's stream. Warp forgets the stream as soon as one of
-        # them is collected, even while a graph is captured on it. Those of captures are collected late.
+        # these is collected, even while a graph is captured on it. So that of each capture is kept.
         self.streams: list[wp.Stream] = []
         self.said = False  # which kernels run
 
