@@ -1,9 +1,10 @@
 """Time updates without physics: python scripts/profile_learner.py ppo_lag [key=value ...] --seeds 5
 
 The environment has the sizes of point_goal1 and costs nothing to step, so that what is left of an
-update is the learner: acting, estimates, the policy's step and the critics'. Options are preset=,
-compat= and algo.OPTION= of train. Prints the median, and with --kernels what an update consists of.
-On a GPU that is compiled without CUDA graphs, which hide what their kernels come from.
+update is the learner: acting, estimates, the policy's step and the critics'. An offline algorithm has
+100,000 transitions of random numbers. Options are preset=, compat= and algo.OPTION= of train. Prints
+the median, and with --kernels what an update consists of. On a GPU that is compiled without CUDA
+graphs, which hide what their kernels come from.
 """
 
 import argparse
@@ -19,10 +20,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxsafe import algos
 from jaxsafe.commands.benchmark import Timing, config_of, timed, training
 from jaxsafe.config import ConfigError, nearest
+from jaxsafe.learn.offline import DataSet, OfflineConfig, data_set
 from jaxsafe.types import State
 
 
@@ -43,6 +46,16 @@ class Weightless:
 
     def _state(self, x: jax.Array) -> State:
         return State(x, x, x[0], jnp.abs(x[1]), jnp.abs(x[1:2]), jnp.bool_(False), {})
+
+
+def transitions(env: Weightless, count: int = 100_000) -> DataSet:
+    """Transitions of random numbers, in episodes of the environment's length."""
+    draw = np.random.default_rng(0).standard_normal
+    time_up = np.arange(1, count + 1) % env.episode_length == 0
+    costs = {name: np.abs(draw(count)) for name in env.cost_names}
+    obs, next_obs = (draw((count, env.obs_size)) for _ in range(2))
+    action, reward, cost = draw((count, env.action_size)), draw(count), np.abs(draw(count))
+    return data_set(obs, action, reward, cost, next_obs, np.zeros(count), time_up, costs)
 
 
 class Kernel(NamedTuple):
@@ -104,14 +117,17 @@ def main() -> int:
         if args.algo not in algos.ALGOS:
             raise ConfigError(f"unknown algo {args.algo!r}{nearest(args.algo, algos.ALGOS)}")
         cfg = config_of(args.algo, args.options, num_envs=args.num_envs, horizon=args.horizon)
-        state, update = training(Weightless(), args.algo, cfg, args.seeds, devices=1)
+        offline = isinstance(cfg, OfflineConfig)
+        data = transitions(Weightless()) if offline else ()
+        state, update = training(Weightless(), args.algo, cfg, args.seeds, devices=1, data=data)
     except ConfigError as error:
         print(error, file=sys.stderr)
         return 2
-    before = 2 + -(-getattr(cfg, "learning_starts", 0) // (cfg.num_envs * cfg.horizon))
-    timing = timed(update, state, before=before, repeats=args.repeats)
+    size = f"{cfg.updates} gradient steps" if offline else f"{cfg.num_envs} x {cfg.horizon}"
+    warm_up = 0 if offline else -(-getattr(cfg, "learning_starts", 0) // (cfg.num_envs * cfg.horizon))
+    timing = timed(update, state, before=2 + warm_up, repeats=args.repeats)
     print(
-        f"{' '.join([args.algo, *args.options])}, {args.seeds} x {cfg.num_envs} x {cfg.horizon}: "
+        f"{' '.join([args.algo, *args.options])}, {args.seeds} x {size}: "
         f"{1e3 * statistics.median(timing.runs):.1f} ms an update, compiled in {timing.compile_s:.1f} s"
     )
     if args.kernels:

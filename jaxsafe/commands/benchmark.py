@@ -88,13 +88,20 @@ def stepping(env, num_envs: int, seeds: int, horizon: int):
     return per_seed(init, seeds), lambda state, i: jax.vmap(run)(state)[0]
 
 
-def training(env, algo: str, cfg, seeds: int, devices: int):
-    """(state, fn): one update of `algo`."""
-    settings = TrainConfig(num_seeds=seeds, devices=devices)
+def training(env, algo: str, cfg, seeds: int, devices: int, data=()):
+    """(state, fn): one update of `algo`, with `data` for one that learns offline."""
+    length = {"total_updates": cfg.updates} if data else {}
+    settings = TrainConfig(num_seeds=seeds, devices=devices, **length)
     check_devices(settings)
-    program = build(env, algos.ALGOS[algo].make, [cfg], settings)
-    state = jax.jit(program.init)(jax.device_put(program.start, program.sharding), program.shared())
-    return state, lambda ts, i: program.update(ts, Shared(i))[0]
+    program = build(env, algos.ALGOS[algo].make, [cfg], settings, data)
+    shared = program.shared()
+    state = jax.jit(program.init)(jax.device_put(program.start, program.sharding), shared)
+
+    def update(now, i):
+        ts, data = now
+        return program.update(ts, Shared(i, data=data))[0], data
+
+    return (state, shared.data), update
 
 
 def per_seed(init, seeds: int):
