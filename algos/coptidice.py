@@ -19,10 +19,11 @@ from jaxsafe.learn.offline import (
     decaying_adam,
     need_episodes,
     offline,
+    offline_adam,
 )
 from jaxsafe.learn.replay import Transitions
 from jaxsafe.learn.row import Row
-from jaxsafe.learn.steps import Trainable, adam, descend_each
+from jaxsafe.learn.steps import Trainable, descend_each
 from jaxsafe.learn.treatments import lagrangian
 from jaxsafe.nn.bounded import bounded_action, bounded_policy, init_bounded
 from jaxsafe.nn.gaussian import log_prob
@@ -111,7 +112,9 @@ def learner(env: Env) -> Learner:
             "chi": coarse_mlp(cfg, count or 1, cfg.layer_norm).init(chi_key, obs),
             "tau": jnp.full((count,) if count else (), cfg.tau_init, jnp.float32),
         }
-        return Trainable(params, {name: adam(cfg.lr, cfg).init(x) for name, x in params.items()})
+        return Trainable(
+            params, {name: offline_adam(cfg.lr, cfg).init(x) for name, x in params.items()}
+        )
 
     def act(learned: Learned, obs: jax.Array, key: jax.Array | None) -> jax.Array:
         return bounded_action(bounded_policy(learned.params["actor"], obs, learned.config), key)
@@ -172,7 +175,7 @@ def learner(env: Env) -> Learner:
             loss = net["tau"] * (cfg.cost_divergence - of_chi["train/cost_divergence"])
             return loss.sum(), {"train/tau": net["tau"]}
 
-        nets, of_tau = descend_each(tau_loss, nets, {"tau": adam(cfg.tau_lr, cfg)})
+        nets, of_tau = descend_each(tau_loss, nets, {"tau": offline_adam(cfg.tau_lr, cfg)})
         tau = jnp.maximum(nets.params["tau"], TAU_MIN)
         nets = nets._replace(params=nets.params | {"tau": tau})
         return nets, of_nu | of_chi | of_policy | of_tau

@@ -192,8 +192,7 @@ def init_fitted(key: jax.Array, env: Env, cfg: Any) -> Trainable:
 
 
 def optimiser_of(cfg: Any) -> optax.GradientTransformation:
-    """Adam. All weights are one array to it, so that a step has a few kernels."""
-    return optax.flatten(optax.adam(cfg.model_lr))
+    return optax.adam(cfg.model_lr)
 
 
 def model_of(nets: Trainable) -> Trainable:

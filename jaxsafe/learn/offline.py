@@ -46,7 +46,7 @@ from jaxsafe.learn.observations import (
     with_vector,
 )
 from jaxsafe.learn.replay import Transitions
-from jaxsafe.learn.steps import Trainable, adam, remaining
+from jaxsafe.learn.steps import Trainable, adam, remaining, skip_nonfinite, skipped_steps
 from jaxsafe.learn.treatments import LagrangianConfig, Treatment, no_treatment
 from jaxsafe.types import Algorithm, Clocks, Env, Metrics, PyTree, Shared
 
@@ -295,16 +295,15 @@ def offline(
             first_obs = first_obs_at(data, first_key, cfg, ts.normaliser)
             at = GradientStep(count, remaining(iteration, cfg), step_key, now.dual, first_obs)
             nets, metrics = learner.step(now.nets, batch, at, cfg, None)
-            finite = all_finite(nets)
-            dual = now.dual
+            lost, dual = skipped_steps(nets.opt_state) > skipped_steps(now.nets.opt_state), now.dual
             if priced:
                 moved = treatment.update(dual, metrics["train/cost_estimate"], cfg, iteration)
-                finite &= all_finite(moved)
+                finite = all_finite(moved)
+                lost |= ~finite
                 dual = select(finite & (count >= cfg.dual_starts), moved, dual)
                 metrics |= treatment.metrics(dual)
-            metrics = metrics_by_constraint(metrics | {"train/nonfinite": ~finite}, names(cfg))
-            new = Carry(select(finite, nets, now.nets), dual)
-            return new, jax.tree.map(jnp.float32, metrics)
+            metrics = metrics_by_constraint(metrics | {"train/nonfinite": lost}, names(cfg))
+            return Carry(nets, dual), jax.tree.map(jnp.float32, metrics)
 
         counts = iteration * cfg.updates + jnp.arange(cfg.updates)
         keys = jax.random.split(steps_key, cfg.updates)
@@ -384,9 +383,14 @@ def episode_cost(q_c: jax.Array, cfg: Any, env: Env) -> jax.Array:
     return (1 - cfg.cost_discount) * env.episode_length * q_c
 
 
+def offline_adam(lr: jax.Array, cfg: Any) -> optax.GradientTransformation:
+    """Adam that leaves out a gradient that is not finite."""
+    return skip_nonfinite(adam(lr, cfg))
+
+
 def decaying_adam(lr: jax.Array, at: GradientStep, cfg: Any) -> optax.GradientTransformation:
-    """Adam at this moment, whose step has decayed if `cfg.lr_decay`."""
-    return adam(lr * at.remaining if cfg.lr_decay else lr, cfg)
+    """`offline_adam` at this moment, whose step has decayed if `cfg.lr_decay`."""
+    return offline_adam(lr * at.remaining if cfg.lr_decay else lr, cfg)
 
 
 def check_costs(names: Names, data: DataSet) -> None:

@@ -101,6 +101,36 @@ def adam(lr: jax.Array | float, cfg: Any, eps: float = 1e-8) -> optax.GradientTr
     return optax.flatten(steps)
 
 
+class Skipping(NamedTuple):
+    """State of an optimiser that leaves steps out. skipped: int32 [], how many so far."""
+
+    skipped: jax.Array
+    inner: PyTree
+
+
+def skip_nonfinite(optimiser: optax.GradientTransformation) -> optax.GradientTransformation:
+    """`optimiser`, for which a gradient that is not finite is none at all: nothing moves, and the step
+    is counted. To choose is part of the step's own kernels, unlike a choice among whole networks after
+    it, which is a second pass over all of them."""
+
+    def init(params: PyTree) -> Skipping:
+        return Skipping(jnp.int32(0), optimiser.init(params))
+
+    def update(updates: PyTree, state: Any, params: PyTree | None = None) -> tuple[PyTree, Any]:
+        finite = jnp.isfinite(optax.tree.norm(updates))
+        change, inner = optimiser.update(updates, state.inner, params)
+        change = jax.tree.map(lambda x: jnp.where(finite, x, 0.0), change)
+        return change, Skipping(state.skipped + ~finite, select(finite, inner, state.inner))
+
+    return optax.GradientTransformation(init, update)
+
+
+def skipped_steps(opt_state: PyTree) -> jax.Array:
+    """The steps that all optimisers in `opt_state` left out so far, int32 []."""
+    leaves = jax.tree.leaves(opt_state, is_leaf=lambda x: isinstance(x, Skipping))
+    return sum((x.skipped for x in leaves if isinstance(x, Skipping)), jnp.int32(0))
+
+
 def remaining(iteration: Count, cfg: Any) -> jax.Array:
     """The share of training that is left: 1 at first, 0 from `cfg.total_iterations` on."""
     total = jnp.where(cfg.total_iterations > 0, cfg.total_iterations, jnp.inf)

@@ -18,8 +18,14 @@ from jaxsafe.types import PyTree
 
 
 def net(cfg: Any, out: int) -> MLP:
-    precision = jax.lax.Precision.DEFAULT
-    return MLP(cfg.vae_hidden, out, cfg.init, cfg.activation, precision=precision)
+    return MLP(
+        cfg.vae_hidden,
+        out,
+        cfg.init,
+        cfg.activation,
+        precision=jax.lax.Precision.DEFAULT,
+        hidden_dtype=cfg.hidden_dtype,
+    )
 
 
 def init_vae(key: jax.Array, obs_size: int, action_size: int, cfg: Any) -> PyTree:

@@ -138,6 +138,27 @@ def test_learning_goes_on_after_any_number_of_gradient_steps():
 
 
 @pytest.mark.parametrize("name", COMPILED)
+def test_steps_on_transitions_that_are_not_finite_are_left_out_and_counted(name):
+    """Of 400 transitions 10 have a NaN: about every third batch of 16."""
+    imitates = {"bcq_lag": "vae"}.get(name, "actor")  # what learns from the actions of the data
+    algo, before = start(name, updates=40)
+    action = linear_data().action.copy()
+    action[::40] = np.nan
+    holed = Shared(np.int32(0), data=linear_data()._replace(action=action))
+    update = jax.jit(algo.update, compiler_options=FAST)
+    after, metrics = update(before, holed)
+    assert 5 <= metrics["train/nonfinite"] <= 25
+    assert all(bool(jnp.isfinite(x).all()) for x in jax.tree.leaves((after.params, after.dual)))
+    moved = jax.tree.map(lambda x, y: bool((x != y).any()), before.params, after.params)
+    assert all(jax.tree.leaves(moved))
+    action[:] = np.nan
+    still, metrics = update(before, holed)
+    assert metrics["train/nonfinite"] == 40
+    nets = before.params[imitates], still.params[imitates]
+    assert all(bool((x == y).all()) for x, y in zip(*map(jax.tree.leaves, nets), strict=True))
+
+
+@pytest.mark.parametrize("name", COMPILED)
 def test_observations_are_normalised_by_the_data(name):
     _, ts = start(name)
     np.testing.assert_allclose(ts.normaliser.mean, linear_data().obs.mean(0), rtol=1e-4, atol=1e-5)
