@@ -48,11 +48,14 @@ class CRRConfig(OfflineTargetConfig):
         Q' <- Q' + tau (Q - Q'),   pi' <- pi' + tau (pi - pi')
 
     j = 1, 2. The policy is a Gaussian about a mean in (-1, 1); its samples are clipped to [-1, 1].
+    Values in y are kept between r_min / (1 - discount) and r_max / (1 - discount), of the data's
+    rewards and 0. Without this they run away where the policy draws actions that the data lack.
 
     Source: Wang et al. (2020), "Critic Regularized Regression", arXiv:2006.15134, algorithm 1 with the
     weights exp and the advantage's mean.
-    Differs from it: the critics are twins instead of one that is distributional, and the policy is one
-    Gaussian instead of several, as in OmniSafe. The targets follow at each step.
+    Differs from it: the critics are twins instead of one that is distributional, whose values have
+    bounds of their own, and the policy is one Gaussian instead of several, as in OmniSafe. The targets
+    follow at each step.
     """
 
     # A by which the weight grows e-fold, in units of the return, as in the paper.
@@ -73,8 +76,8 @@ class CCRRConfig(OfflineCostConfig, CRRConfig):
         minimise_lam  -lam (J_c - cost_limit),  lam >= 0,  by Adam, after each gradient step
         J_c = (1 - cost_discount) T E[Q'_c(s', a')],   T the steps of an episode
 
-    The rest is as in CRR. Values go on after the time limit, so J_c is the undiscounted cost of an
-    episode at the rate that Q_c says.
+    The rest is as in CRR, and values of cost have such bounds, too. Values go on after the time limit,
+    so J_c is the undiscounted cost of an episode at the rate that Q_c says.
 
     Source: CRR of Wang et al. (2020), arXiv:2006.15134, with the multiplier of OmniSafe's CCRR.
     Differs from OmniSafe: there the critic of reward also learns the costs, and the critic of cost
@@ -126,6 +129,8 @@ def learner(env: Env, treatment: Treatment = no_treatment) -> Learner:
 
         # critics
         after = next_values(nets.params["targets"], batch, next_key, cfg)
+        if at.ranges:
+            after = Values(*(jnp.clip(x, *range) for x, range in zip(after, at.ranges, strict=True)))
         y = targets_of(batch, constrained(batch, names(cfg)), after, names(cfg), cfg)
 
         def errors(critics: dict[str, PyTree]) -> tuple[jax.Array, Metrics]:

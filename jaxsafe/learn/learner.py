@@ -23,6 +23,7 @@ class GradientStep(NamedTuple):
     dual: the state of the treatment of the constraint, () without one.
     first_obs: of a data set, float [B, O]: observations at which its episodes begin, normalised; ()
         where none is known.
+    ranges: of a data set, (low, high) for reward and for cost: between them its values must lie.
     """
 
     number: jax.Array
@@ -30,6 +31,7 @@ class GradientStep(NamedTuple):
     key: jax.Array
     dual: PyTree = ()
     first_obs: PyTree = ()
+    ranges: PyTree = ()
 
 
 def drawn_transitions(

@@ -286,14 +286,15 @@ def offline(
         cfg, data = ts.config, data_of(shared, env)
         iteration = jnp.asarray(shared.iteration)
         key, steps_key = jax.random.split(ts.key)
-        rows_by = draw(data, cfg)
+        rows_by, ranges = draw(data, cfg), value_ranges(data, names(cfg), cfg)
 
         def step(now: Carry, x: tuple[jax.Array, jax.Array]) -> tuple[Carry, Metrics]:
             count, key = x
             draw_key, first_key, step_key = jax.random.split(key, 3)
             batch = batch_at(data, rows_by(draw_key), cfg, ts.normaliser, names(cfg))
             first_obs = first_obs_at(data, first_key, cfg, ts.normaliser)
-            at = GradientStep(count, remaining(iteration, cfg), step_key, now.dual, first_obs)
+            share = remaining(iteration, cfg)
+            at = GradientStep(count, share, step_key, now.dual, first_obs, ranges)
             nets, metrics = learner.step(now.nets, batch, at, cfg, None)
             lost, dual = skipped_steps(nets.opt_state) > skipped_steps(now.nets.opt_state), now.dual
             if priced:
@@ -365,6 +366,20 @@ def first_obs_at(data: DataSet, key: jax.Array, cfg: Any, normaliser: PyTree) ->
     first_obs = data.episodes.first_obs
     rows = jax.random.randint(key, (cfg.batch_size,), 0, len(vector_of(first_obs)))
     return network_inputs(normaliser, jax.tree.map(lambda x: jnp.asarray(x)[rows], first_obs))
+
+
+def value_ranges(data: DataSet, names: Names, cfg: Any) -> tuple[Any, Any]:
+    """Between what values of reward and of cost must lie, (low, high) each: float [] or, of several
+    constraints, [K]. Where no reward is above r_max, no sum of discounted rewards is above
+    max(0, r_max) / (1 - discount)."""
+
+    def of(x: Array, discount: jax.Array) -> tuple[jax.Array, jax.Array]:
+        steps = 1 / jnp.maximum(1 - discount, 1e-6)
+        low, high = jnp.nanmin(jnp.asarray(x), 0), jnp.nanmax(jnp.asarray(x), 0)
+        return steps * jnp.minimum(low, 0.0), steps * jnp.maximum(high, 0.0)
+
+    costs = jnp.stack([jnp.asarray(data.costs[name]) for name in names], -1) if names else data.cost
+    return of(data.reward, cfg.discount), of(costs, cfg.cost_discount)
 
 
 def constrained(batch: Transitions, names: Names) -> jax.Array:

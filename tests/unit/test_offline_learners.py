@@ -14,7 +14,7 @@ from jaxsafe.algos import ALGOS, bc, bcq, coptidice, crr
 from jaxsafe.config import ConfigError
 from jaxsafe.learn.acting import Learned
 from jaxsafe.learn.learner import GradientStep
-from jaxsafe.learn.offline import batch_at, constrained, data_set, first_obs_at
+from jaxsafe.learn.offline import batch_at, constrained, data_set, first_obs_at, value_ranges
 from jaxsafe.learn.treatments import Multiplier, lagrangian
 from jaxsafe.run import evaluate
 from jaxsafe.types import Shared
@@ -203,10 +203,12 @@ def density(actor, obs, action):
     return (-0.5 * z**2 - log_std - 0.5 * np.log(2 * np.pi)).sum(-1)
 
 
-def test_gradients_of_ccrr():
+@pytest.mark.parametrize("ranges", [(), ((-0.1, 0.2), (0.0, 0.1))], ids=["free", "kept in range"])
+def test_gradients_of_ccrr(ranges):
     cfg = crr.CCRRConfig(**LINEAR, actions=3, cost_discount=0.8, temperature=0.5, weight_max=1.1)
     learner = crr.learner(Corridor(), crr.unscaled)
     nets, batch, at, b = prepared(learner, cfg)
+    at = at._replace(ranges=ranges)
     other = learner.init(jax.random.key(5), 4, 2, cfg).params["targets"]
     nets = nets._replace(params=nets.params | {"targets": other})
     after, metrics = stepped(learner, nets, batch, at, cfg)
@@ -218,8 +220,12 @@ def test_gradients_of_ccrr():
         return np.clip(np.tanh(linear(actor["mean"], obs)) + std * noise(key, (5, 2)), -1, 1)
 
     ahead, go = sample(old["actor"], b["next_obs"], next_key), 1 - b["terminated"]
-    y = b["reward"] + 0.9 * go * q(old["critic_r"], b["next_obs"], ahead).min(0)
-    next_c = go * q(old["critic_c"], b["next_obs"], ahead).mean(0)
+    next_r = q(old["critic_r"], b["next_obs"], ahead).min(0)
+    next_c = q(old["critic_c"], b["next_obs"], ahead).mean(0)
+    if ranges:
+        assert ((next_r < -0.1) | (next_r > 0.2)).any() and ((next_c < 0) | (next_c > 0.1)).any()
+        next_r, next_c = np.clip(next_r, *ranges[0]), np.clip(next_c, *ranges[1])
+    y, next_c = b["reward"] + 0.9 * go * next_r, go * next_c
 
     def error(aims):
         return lambda net: ((q(net, b["obs"], b["action"]) - aims) ** 2).sum(0).mean()
@@ -243,6 +249,17 @@ def test_gradients_of_ccrr():
         return -(weight * density(actor, b["obs"], b["action"])).mean()
 
     assert_gradient(after, "actor", imitate, nets.params["actor"])
+
+
+def test_the_range_of_values():
+    """Sums of rewards between -0.5 and 2 and of costs between 0.1 and 1, discounted by 0.9 and 0.8."""
+    reward, cost = np.float32([-0.5, 2, 1]), np.float32([0.1, 1, 0.3])
+    obs, no = np.zeros((3, 4)), np.zeros(3, bool)
+    data = data_set(obs, np.zeros((3, 2)), reward, cost, obs, no, no, {"a": cost, "b": 2 * cost})
+    cfg = crr.CCRRConfig(discount=0.9, cost_discount=0.8)
+    (low, high), (low_c, high_c) = value_ranges(data, (), cfg)
+    np.testing.assert_allclose([low, high, low_c, high_c], [-5, 20, 0, 5], rtol=1e-5)
+    np.testing.assert_allclose(value_ranges(data, ("a", "b"), cfg)[1], [[0, 0], [5, 10]], rtol=1e-5)
 
 
 def visits(nu, b, alpha, rows=slice(None)):
