@@ -73,7 +73,7 @@ LOOPS = {  # the first that an algorithm's config is one of
     OfflineConfig: "offline",
 }
 STUDIES = ("goal", "button", "push", "omnisafe", "velocity", "off_policy")  # in docs/results
-OTHERS = ("planning", "shielding", "offline")  # with limits, lengths or data of their own
+OTHERS = ("planning", "shielding", "offline", "seditor")  # with limits, lengths or data of their own
 ABSENT = object()  # where there is no default
 ALGORITHMS = """# Algorithms
 
