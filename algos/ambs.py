@@ -172,7 +172,7 @@ def penalised(found: Advantages, cfg: Any) -> jax.Array:
 
 def learn(trained: dict[str, PyTree], memory: PyTree, scene: Scene, key: jax.Array) -> Outcome:
     cfg, axis_name = scene.cfg, scene.axis_name
-    discount = cfg.discount
+    discount, least = cfg.discount, cfg.least_scale
     actors = jax.tree.map(lambda *x: jnp.stack(x), trained["actor"], trained["safe"])
     both = jax.vmap(scene.dream)(actors, jax.random.split(key))  # in one program
     task_dreams, safe_dreams = (jax.tree.map(operator.itemgetter(i), both) for i in range(2))
@@ -182,7 +182,7 @@ def learn(trained: dict[str, PyTree], memory: PyTree, scene: Scene, key: jax.Arr
     cost = clipped(dreams.read["cost"], cfg)
     judged = scene.judge("critic_safe", dreams, -cost, discount)
     range_safe = moved(memory["safe"], judged.returns, axis_name)
-    loss = scene.actor_loss(dreams, judged.advantage / range_safe.scale)
+    loss = scene.actor_loss(dreams, judged.advantage / range_safe.scale(least))
     loss += scene.critic_loss(trained, "critic_safe", dreams, judged.returns)
     metrics: Metrics = {"train/value_safe": scene.over_dreams(judged.value[:-1])}
 
@@ -195,8 +195,8 @@ def learn(trained: dict[str, PyTree], memory: PyTree, scene: Scene, key: jax.Arr
     range_p = moved(memory["penalty"], paid.returns, axis_name)
     value_c = safety_value(scene.params, dreams.features, cfg)
     found = Advantages(
-        reward=earned.advantage / range_r.scale,
-        penalty=paid.advantage / range_p.scale,
+        reward=earned.advantage / range_r.scale(least),
+        penalty=paid.advantage / range_p.scale(least),
         cost=cost,
         value_safe=scene.value(scene.params["critic_safe"], dreams.features),
         returns_c=dream_returns(cost, value_c, dreams.read["cont"], discount=discount, decay=1.0),
@@ -218,7 +218,7 @@ def learn(trained: dict[str, PyTree], memory: PyTree, scene: Scene, key: jax.Arr
         "train/entropy": scene.over_dreams(dreams.entropy),
         "train/value": scene.over_dreams(earned.value[:-1]),
         "train/value_c": scene.over_dreams(value_c[:-1]),
-        "train/return_scale": range_r.scale,
+        "train/return_scale": range_r.scale(least),
     }
     return Outcome(loss, {"reward": range_r, "penalty": range_p, "safe": range_safe}, metrics)
 

@@ -35,7 +35,7 @@ class DreamerConfig(WorldModelConfig):
         R_t      = r_{t+1} + discount k_{t+1} ((1 - td_lambda) V_{t+1} + td_lambda R_{t+1}),   R_H = V_H
         L_critic = E[u_t (-log p_V(R_t) - log p_V(V'_t))],   u_t = k_0 discount k_1 .. discount k_t
         L_actor  = -E[u_t (sg (R_t - V_t) / S log pi(a_t) + entropy_coef H(pi))]
-        S        = max(1, P95(R) - P5(R)),   running percentiles;   V' <- V' + tau (V - V')
+        S        = max(least_scale, P95(R) - P5(R)),   running percentiles;   V' <- V' + tau (V - V')
 
     x is the observation after symlog, r the reward, and k says whether the episode goes on. Rewards and
     values are distributions over 255 fixed numbers (two-hot). Dreams of H steps begin at every replayed
@@ -101,7 +101,8 @@ def learn_reward(trained: dict[str, PyTree], past: Range, scene: Scene, key: jax
     dreams = scene.dream(trained["actor"], key)
     judged = scene.judge("critic_r", dreams, dreams.read["reward"], cfg.discount)
     now = moved(past, judged.returns, scene.axis_name)
-    actor_loss = scene.actor_loss(dreams, judged.advantage / now.scale)
+    scale = now.scale(cfg.least_scale)
+    actor_loss = scene.actor_loss(dreams, judged.advantage / scale)
     critic_loss = scene.critic_loss_with_rows(
         trained, "critic_r", dreams, judged.returns, scene.batch.rows.reward, cfg.discount
     )
@@ -110,7 +111,7 @@ def learn_reward(trained: dict[str, PyTree], past: Range, scene: Scene, key: jax
         "train/critic_loss": critic_loss,
         "train/entropy": scene.over_dreams(dreams.entropy),
         "train/value": scene.over_dreams(judged.value[:-1]),
-        "train/return_scale": now.scale,
+        "train/return_scale": scale,
     }
     return Wishes(dreams, now, actor_loss + critic_loss, metrics)
 

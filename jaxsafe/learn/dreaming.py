@@ -52,10 +52,9 @@ class Range(NamedTuple):
     low: jax.Array
     high: jax.Array
 
-    @property
-    def scale(self) -> jax.Array:
-        """What advantages are divided by. Small returns are not magnified."""
-        return jnp.maximum(1.0, self.high - self.low)
+    def scale(self, least: jax.Array | float) -> jax.Array:
+        """What advantages are divided by: no range below `least` magnifies them further."""
+        return jnp.maximum(least, self.high - self.low)
 
 
 def no_range() -> Range:

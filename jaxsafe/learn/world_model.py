@@ -7,13 +7,13 @@ the first of an episode, what came before is forgotten.
 """
 
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 
-from jaxsafe.config import Amount, Iterations, Norm, Rate, Share, Weight, config
+from jaxsafe.config import Amount, Bounds, Iterations, Norm, Rate, Share, Weight, config
 from jaxsafe.learn.observations import EncoderConfig, observation_like
 from jaxsafe.learn.replay import Record
 from jaxsafe.learn.sequences import SequenceBatch
@@ -70,6 +70,8 @@ class WorldModelConfig(EncoderConfig, RoundConfig):
     # gradient of returns through the model.
     actor_grad: Literal["reinforce", "backprop"] = "reinforce"
     entropy_coef: Weight = 3e-4  # The weight of the actor's entropy, as in the paper.
+    # The least that advantages are divided by, in units of the return, as in the paper.
+    least_scale: Annotated[float, Bounds(1e-6, 1e6)] = 1.0
     # The share of a critic that its slow copy takes on at each step, as in the paper.
     tau: Share = 0.02
     # The weight of the critics' loss on replayed rewards, as in the authors' code.

@@ -100,13 +100,14 @@ def test_the_returns_of_dreams_by_hand():
     np.testing.assert_allclose(got, [[4.1875], [4.5]])
 
 
-def test_returns_are_scaled_by_their_running_percentiles_but_never_magnified():
+def test_returns_are_scaled_by_their_running_percentiles_but_not_magnified_beyond_the_least_scale():
     returns = jnp.arange(101.0)  # P5 = 5, P95 = 95
     one = moved(Range(jnp.float32(0), jnp.float32(0)), returns, None)
     np.testing.assert_allclose(one, [0.05, 0.95], rtol=1e-5)
-    assert one.scale == 1
+    assert one.scale(1.0) == 1
+    np.testing.assert_allclose(one.scale(0.1), 0.9, rtol=1e-5)
     two = moved(one, returns, None)
-    np.testing.assert_allclose(two.scale, 0.9 * (1 + 0.99), rtol=1e-5)
+    np.testing.assert_allclose(two.scale(1.0), 0.9 * (1 + 0.99), rtol=1e-5)
 
 
 def test_only_long_gradients_are_shortened_array_by_array():
