@@ -40,8 +40,8 @@ class DeterministicConfig(ActorCriticConfig):
     noise_min: Noise = 0.05
     # Standard deviation of the noise on actions in training, in the boldest environment.
     noise_max: Noise = 0.5
-    # Whether the noise falls linearly to 0 by the end of training. The price then holds the limit for
-    # the policy without noise, as it is used. OmniSafe keeps the noise.
+    # Whether the noise falls linearly to 0 by the end of training, so that the price is learned for the
+    # policy without noise, as it is used. OmniSafe keeps the noise.
     noise_decay: bool = False
 
 
