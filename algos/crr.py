@@ -43,13 +43,14 @@ class CRRConfig(OfflineTargetConfig):
 
         A(s, a) = min_j Q_j(s, a) - mean_i min_j Q_j(s, a_i),   a_i ~ pi(s)
         maximise_pi  E[min(exp(A(s, a) / temperature), weight_max) log pi(a | s)]
-        y = r + discount (1 - terminated) min_j Q'_j(s', a'),   a' ~ pi'(s')
+        y = r + discount (1 - terminated) clip(min_j Q'_j(s', a'), low, high),   a' ~ pi'(s')
         minimise_Q   E[sum_j (Q_j(s, a) - y)^2]
         Q' <- Q' + tau (Q - Q'),   pi' <- pi' + tau (pi - pi')
 
     j = 1, 2. The policy is a Gaussian about a mean in (-1, 1); its samples are clipped to [-1, 1].
-    Values in y are kept between r_min / (1 - discount) and r_max / (1 - discount), of the data's
-    rewards and 0. Without this they run away where the policy draws actions that the data lack.
+    low = min(0, r_min) / (1 - discount) and high = max(0, r_max) / (1 - discount), of the least and the
+    largest reward of the data. Without these bounds values run away where the policy draws actions that
+    the data lack.
 
     Source: Wang et al. (2020), "Critic Regularized Regression", arXiv:2006.15134, algorithm 1 with the
     weights exp and the advantage's mean.
@@ -76,12 +77,13 @@ class CCRRConfig(OfflineCostConfig, CRRConfig):
         minimise_lam  -lam (J_c - cost_limit),  lam >= 0,  by Adam, after each gradient step
         J_c = (1 - cost_discount) T E[Q'_c(s', a')],   T the steps of an episode
 
-    The rest is as in CRR, and values of cost have such bounds, too. Values go on after the time limit,
-    so J_c is the undiscounted cost of an episode at the rate that Q_c says.
+    The rest is as in CRR. Q'_c is clipped likewise in y_c and in J_c, by the costs of the data. Values
+    go on after the time limit, so J_c is the undiscounted cost of an episode at the rate that Q_c says.
 
     Source: CRR of Wang et al. (2020), arXiv:2006.15134, with the multiplier of OmniSafe's CCRR.
-    Differs from OmniSafe: there the critic of reward also learns the costs, and the critic of cost
-    learns nothing. Its published numbers depend on that, and no option brings it back.
+    Differs from OmniSafe: there values have no bounds, the critic of reward also learns the costs, and
+    the critic of cost learns nothing. Its published numbers depend on that, and no option brings it
+    back.
     """
 
 
@@ -130,7 +132,7 @@ def learner(env: Env, treatment: Treatment = no_treatment) -> Learner:
         # critics
         after = next_values(nets.params["targets"], batch, next_key, cfg)
         if at.ranges:
-            after = Values(*(jnp.clip(x, *range) for x, range in zip(after, at.ranges, strict=True)))
+            after = Values(*(jnp.clip(x, *ends) for x, ends in zip(after, at.ranges, strict=True)))
         y = targets_of(batch, constrained(batch, names(cfg)), after, names(cfg), cfg)
 
         def errors(critics: dict[str, PyTree]) -> tuple[jax.Array, Metrics]:

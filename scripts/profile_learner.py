@@ -116,8 +116,10 @@ def main() -> int:
     try:
         if args.algo not in algos.ALGOS:
             raise ConfigError(f"unknown algo {args.algo!r}{nearest(args.algo, algos.ALGOS)}")
+        offline = issubclass(algos.ALGOS[args.algo].config, OfflineConfig)
+        if offline and (args.num_envs or args.horizon):
+            raise ConfigError(f"{args.algo} has no environments: leave out --num-envs and --horizon")
         cfg = config_of(args.algo, args.options, num_envs=args.num_envs, horizon=args.horizon)
-        offline = isinstance(cfg, OfflineConfig)
         data = transitions(Weightless()) if offline else ()
         state, update = training(Weightless(), args.algo, cfg, args.seeds, devices=1, data=data)
     except ConfigError as error:

@@ -33,6 +33,7 @@ from jaxsafe.commands.guard import guarded
 from jaxsafe.config import Amount, ConfigError, Devices, Iterations, Period
 from jaxsafe.envs import SafetyGym, Velocity
 from jaxsafe.learn.observations import EncoderConfig
+from jaxsafe.learn.offline import OfflineConfig
 from jaxsafe.learn.rollout import collect, init_rollout, memoryless
 from jaxsafe.learn.timetable import ReplayConfig, RoundConfig, timetable_of
 from jaxsafe.run import run_folder
@@ -146,6 +147,10 @@ def measure(name: str, wanted: int | None, args: argparse.Namespace) -> dict:
     """A row, of so many environments as are `wanted`, or as the algorithm has, or 256."""
     env, warmup = envs.make(name, **options_of(args)), args.warmup
     if args.algo:
+        if issubclass(algos.ALGOS[args.algo].config, OfflineConfig):
+            raise ConfigError(
+                f"--algo {args.algo} takes no environment steps; scripts/profile_learner.py measures it"
+            )
         sees = args.vision and issubclass(algos.ALGOS[args.algo].config, EncoderConfig)
         encoder = {"encoder": "cnn"} if sees else {}
         cfg = config_of(args.algo, args.options, num_envs=wanted, horizon=args.horizon, **encoder)

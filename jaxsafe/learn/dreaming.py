@@ -53,7 +53,7 @@ class Range(NamedTuple):
     high: jax.Array
 
     def scale(self, least: jax.Array | float) -> jax.Array:
-        """What advantages are divided by: no range below `least` magnifies them further."""
+        """What advantages are divided by: the range, or `least` where that is larger."""
         return jnp.maximum(least, self.high - self.low)
 
 

@@ -23,7 +23,7 @@ class GradientStep(NamedTuple):
     dual: the state of the treatment of the constraint, () without one.
     first_obs: of a data set, float [B, O]: observations at which its episodes begin, normalised; ()
         where none is known.
-    ranges: of a data set, (low, high) for reward and for cost: between them its values must lie.
+    ranges: of a data set, (low, high) for reward and for cost, between which values lie; () elsewhere.
     """
 
     number: jax.Array

@@ -263,6 +263,9 @@ def offline(
 
     A learner with a treatment is told the price as `at.dual`, and as `learned.dual` where it acts. It
     reports J_c as `train/cost_estimate`, float [] or [K].
+
+    A network whose gradient is not finite sits a step out, and the others move. `train/nonfinite`
+    counts the steps in which one does. An iteration of such steps alone has no effect.
     """
     priced = treatment is not no_treatment
     names = treatment.constrained_costs
@@ -311,6 +314,7 @@ def offline(
         start = Carry(Trainable(ts.params, ts.opt_state), ts.dual)
         end, metrics = jax.lax.scan(step, start, (counts, keys))
         lost = metrics.pop("train/nonfinite").sum()
+        end = select(lost < cfg.updates, end, start)  # without a whole step nothing is learned
         metrics = jax.tree.map(jnp.mean, metrics) | {"train/nonfinite": lost}
         nets = end.nets
         ts = dataclasses.replace(
@@ -369,7 +373,7 @@ def first_obs_at(data: DataSet, key: jax.Array, cfg: Any, normaliser: PyTree) ->
 
 
 def value_ranges(data: DataSet, names: Names, cfg: Any) -> tuple[Any, Any]:
-    """Between what values of reward and of cost must lie, (low, high) each: float [] or, of several
+    """The bounds of values of reward and of cost, (low, high) each: float [] or, of several
     constraints, [K]. Where no reward is above r_max, no sum of discounted rewards is above
     max(0, r_max) / (1 - discount)."""
 
