@@ -253,7 +253,7 @@ def test_gradients_of_ccrr(ranges):
 
 def test_the_range_of_values():
     """Sums of rewards between -0.5 and 2 and of costs between 0.1 and 1, discounted by 0.9 and 0.8."""
-    reward, cost = np.float32([-0.5, 2, 1]), np.float32([0.1, 1, 0.3])
+    reward, cost = np.array([-0.5, 2.0, 1.0]), np.array([0.1, 1.0, 0.3])
     obs, no = np.zeros((3, 4)), np.zeros(3, bool)
     data = data_set(obs, np.zeros((3, 2)), reward, cost, obs, no, no, {"a": cost, "b": 2 * cost})
     cfg = crr.CCRRConfig(discount=0.9, cost_discount=0.8)
