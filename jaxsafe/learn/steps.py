@@ -140,11 +140,12 @@ def remaining(iteration: Count, cfg: Any) -> jax.Array:
 def descend(
     optimiser: optax.GradientTransformation, params: PyTree, opt_state: PyTree, grads: PyTree
 ) -> tuple[PyTree, PyTree, jax.Array]:
-    """One step of `optimiser`, or none if a gradient is not finite: (params, opt_state, skipped)."""
-    change, new_state = optimiser.update(grads, opt_state, params)
-    finite = jnp.isfinite(optax.tree.norm(grads))
-    new = (optax.apply_updates(params, change), new_state)
-    return *select(finite, new, (params, opt_state)), ~finite
+    """One step of `optimiser`, or none if a gradient is not finite: (params, opt_state, skipped), of
+    which the last is 0 or 1, int32 []."""
+    before = Skipping(jnp.int32(0), opt_state)
+    found: Any = skip_nonfinite(optimiser).update(grads, before, params)
+    change, after = found
+    return optax.apply_updates(params, change), after.inner, after.skipped
 
 
 def one_pass(
