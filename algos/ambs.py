@@ -29,7 +29,7 @@ from jaxsafe.learn.dreaming import (
 from jaxsafe.learn.off_policy import off_policy
 from jaxsafe.learn.replay import Record
 from jaxsafe.learn.row import Row
-from jaxsafe.learn.world_model import CHANCE, dream_returns, read, value_of, world_of
+from jaxsafe.learn.world_model import CHANCE, CostHeadConfig, dream_returns, read, value_of, world_of
 from jaxsafe.nn.rssm import Latent
 from jaxsafe.nn.two_hot import BINS
 from jaxsafe.types import Algorithm, Env, Metrics, Policy, PyTree, State
@@ -38,7 +38,7 @@ ROUNDING = 1e-5  # a sum of costs that is above a bound by less is at the bound
 
 
 @config
-class AMBSConfig(dreamer.DreamerConfig):
+class AMBSConfig(CostHeadConfig, dreamer.DreamerConfig):
     """AMBS: Dreamer with a shield. Where its dreams look unsafe, a safe policy acts instead.
 
         p(s)  = share of m dreams of pi from s with  R > C discount^T,   R = sum of discounted costs
@@ -100,6 +100,9 @@ class AMBSConfig(dreamer.DreamerConfig):
     eps: Annotated[float, Bounds(1e-6, 1)] = 0.09
     # The probability that the estimate is further off, as in the paper.
     confidence: Annotated[float, Bounds(1e-12, 1)] = 0.01
+    # How a dream is found unsafe. summed: by the sum R of what its steps are expected to cost, as in the
+    # paper. drawn: each of T dreamed states has a violation with the probability that the model gives it.
+    verdict: Literal["summed", "drawn"] = "summed"
     # Whether the dreams begin with the proposed action. The authors' draw theirs anew.
     verify_action: bool = False
     kappa: Weight = 10.0  # How sharply copt decides, as in the authors' code.
@@ -245,44 +248,53 @@ def safety_value(params: dict[str, PyTree], features: jax.Array, cfg: Any) -> ja
 
 class Dreamt(NamedTuple):
     """m dreams of H states: their costs, float [H, m]; whether the episode goes on from them, bool
-    [H, m]; the cost that follows the last one, float [m]."""
+    [H, m]; the cost that follows the last one, float [m]; whether a violation was drawn in them, bool
+    [H, m]."""
 
     cost: jax.Array
     alive: jax.Array
     value: jax.Array
+    hit: jax.Array
 
 
 def risk(env: Env, learned: Learned, latent: Latent, proposed: jax.Array, key: jax.Array) -> jax.Array:
     """p, the share of dreams from `latent` that have a violation within T steps, float []."""
-    return unsafe(*dreamt(env, learned, latent, proposed, key), learned.config).mean()
+    return unsafe(dreamt(env, learned, latent, proposed, key), learned.config).mean()
 
 
 def dreamt(env: Env, learned: Learned, latent: Latent, proposed: jax.Array, key: jax.Array) -> Dreamt:
-    """Dreams of the task's policy from `latent`.
+    """Dreams of the task's policy from `latent`: of T steps if violations are drawn, else of H.
 
     proposed: float [A], with which they begin where `verify_action` is set.
     """
     cfg, params = learned.config, learned.params
+    steps = cfg.shield_horizon if cfg.verdict == "drawn" else cfg.imagine_steps
     world = world_of(env, shielded_behaviour.all_heads, cfg)
     rollouts = (cfg.shield_rollouts,)
     start = jax.tree.map(lambda x: jnp.broadcast_to(x, (*rollouts, *x.shape)), latent)
 
     def step(now: Latent, x: tuple[jax.Array, jax.Array]) -> tuple[Latent, Any]:
         h, key = x
-        act_key, model_key = jax.random.split(key)
+        act_key, model_key, draw_key = jax.random.split(key, 3)
         action = chosen(env, learned, "actor", now, act_key)
         action = jnp.where((h == 0) & cfg.verify_action, proposed, action)
         after: Any = world.apply(params["model"], now, action, model_key, method="imagine")
         says = read(world, params["model"], after.features)
-        return after, (clipped(says["cost"], cfg), says["cont"] > 0.5)
+        hit = jax.random.bernoulli(draw_key, 1 - says["safe"])
+        return after, (clipped(says["cost"], cfg), says["cont"] > 0.5, hit)
 
-    keys = jax.random.split(key, cfg.imagine_steps)
-    last, (cost, alive) = jax.lax.scan(step, start, (jnp.arange(cfg.imagine_steps), keys))
-    return Dreamt(cost, alive, safety_value(params, last.features, cfg))
+    found = jax.lax.scan(step, start, (jnp.arange(steps), jax.random.split(key, steps)))
+    last, (cost, alive, hit) = found
+    return Dreamt(cost, alive, safety_value(params, last.features, cfg), hit)
 
 
-def unsafe(cost: jax.Array, alive: jax.Array, value: jax.Array, cfg: Any) -> jax.Array:
-    """Which dreams have a violation within T steps: R > C discount^T, bool [m]. See `Dreamt`."""
+def unsafe(dreams: Dreamt, cfg: Any) -> jax.Array:
+    """Which dreams have a violation within T steps, bool [m]: one was drawn before the episode ended;
+    or, with verdict=summed, R > C discount^T."""
+    cost, alive, value, hit = dreams
+    if cfg.verdict == "drawn":
+        runs = jnp.cumprod(jnp.concatenate([jnp.ones_like(alive[:1]), alive[:-1]]), axis=0)
+        return (hit * runs).any(0)
 
     def backward(later: jax.Array, x: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
         cost, alive = x

@@ -21,7 +21,7 @@ from jaxsafe.learn.dreaming import (
 )
 from jaxsafe.learn.off_policy import off_policy
 from jaxsafe.learn.row import Row
-from jaxsafe.learn.world_model import Dreams, WorldModelConfig
+from jaxsafe.learn.world_model import CostHeadConfig, Dreams, WorldModelConfig
 from jaxsafe.nn.two_hot import BINS
 from jaxsafe.types import Algorithm, Env, Metrics, PyTree
 
@@ -51,7 +51,7 @@ class DreamerConfig(WorldModelConfig):
 
 
 @config
-class DreamerLagConfig(DreamerConfig):
+class DreamerLagConfig(CostHeadConfig, DreamerConfig):
     """Dreamer-Lagrangian: Dreamer whose actor pays for cost in its dreams, by an augmented Lagrangian.
 
         L_actor <- L_actor + E[u_t psi(R_c_t - d)],   d = cost_limit / (T (1 - cost_discount))
@@ -201,6 +201,7 @@ def make(env: Env, axis_name: str | None = None, behaviour: Behaviour = blind) -
 PROPRIO: dict[str, Any] = {
     "num_envs": 16, "learn_every": 1, "replay_ratio": 1024, "n_step": 63, "replay_size": 5_000_000,
     "learning_starts": 1024, "model_lr": 4e-5, "lr": 4e-5, "critic_lr": 4e-5,
+    "obs_bins": 0, "obs_scale": 1.0,
 }  # fmt: skip
 # sacktock/AMBS @5184901: its settings of Safety Gym's vectors, for env.wrap.action_repeat=2; the size
 # is the nearest to its own
@@ -208,6 +209,7 @@ AMBS: dict[str, Any] = {
     "num_envs": 8, "horizon": 128, "learn_every": 2, "stagger": False, "replay_ratio": 64,
     "n_step": 63, "learning_starts": 1024, "model_lr": 1e-4, "lr": 3e-5, "critic_lr": 3e-5,
     "dyn_scale": 0.5, "replay_value": 0.0, "limit_ends": True, "size": "12m",
+    "obs_bins": 0, "obs_scale": 1.0, "cost_scale": 1.0,
 }  # fmt: skip
 # PKU-Alignment/SafeDreamer @529221f: on vectors, for env.wrap.action_repeat=4; the size is the nearest
 # to its own
@@ -215,6 +217,7 @@ VECTORS: dict[str, Any] = {
     "num_envs": 8, "horizon": 128, "learn_every": 2, "stagger": False, "replay_ratio": 512,
     "n_step": 63, "learning_starts": 1024, "model_lr": 1e-4, "lr": 3e-5, "critic_lr": 3e-5,
     "dyn_scale": 0.5, "replay_value": 0.0, "actor_grad": "backprop", "size": "12m",
+    "obs_bins": 0, "obs_scale": 5.0, "cost_scale": 1.0,
 }  # fmt: skip
 # its BSRP-Lag, whose mu is below 1 for 1.9 million gradient steps
 SAFE_DREAMER: dict[str, Any] = VECTORS | {

@@ -58,6 +58,10 @@ class WorldModelConfig(EncoderConfig, RoundConfig):
     lr_warmup: Iterations = 1000
     # The longest gradient of an array, as a share of the array's own length, as in the authors' code.
     clip: Norm = 0.3
+    # Steps from -1 to 1 between which the model reads each number of a vector, beside its symlog.
+    # 0: none, as in the paper.
+    obs_bins: Annotated[int, Bounds(0, 1000)] = 21
+    obs_scale: Weight = 10.0  # The weight of the loss of vectors. The paper has 1.
     dyn_scale: Weight = 1.0  # The weight of the prior's loss, as in the paper.
     rep_scale: Weight = 0.1  # The weight of the posterior's loss, as in the paper.
     free_nats: Weight = 1.0  # Nats below which neither loss is lowered further, as in the paper.
@@ -78,6 +82,14 @@ class WorldModelConfig(EncoderConfig, RoundConfig):
     replay_value: Weight = 0.3
 
 
+@config
+class CostHeadConfig:
+    """What algorithms share whose model foretells cost."""
+
+    # The weight of the losses of cost and of what is safe. The paper has no such heads.
+    cost_scale: Weight = 10.0
+
+
 # ---- networks ----------------------------------------------------------------------------------
 
 
@@ -91,11 +103,11 @@ def world_of(env: Env, heads: dict[str, int], cfg: Any) -> WorldModel:
     """
     size = SIZES[cfg.size]
     if cfg.encoder == "none":
-        encoder, decoder = VectorEncoder(size), VectorDecoder(size, env.obs_size)
+        encoder, decoder = VectorEncoder(size, cfg.obs_bins), VectorDecoder(size, env.obs_size)
     else:
         shape = observation_like(env)["vision"].shape
         check_picture(shape, size, cfg.size)
-        encoder, decoder = Encoder(size), Decoder(size, shape, env.obs_size)
+        encoder, decoder = Encoder(size, cfg.obs_bins), Decoder(size, shape, env.obs_size)
     return WorldModel(size, encoder, decoder, tuple(heads.items()))
 
 
@@ -184,12 +196,14 @@ def model_loss(
     targets: dict[str, jax.Array],
     key: jax.Array,
     cfg: Any,
+    scales: dict[str, jax.Array | float] | None = None,
 ) -> tuple[jax.Array, tuple[Latent, Metrics]]:
     """This device's share of the loss; the latents [T, B], and metrics.
 
         L = -log p(x, targets | h, z) + dyn max(free, KL(sg q || p)) + rep max(free, KL(q || sg p))
 
     targets: for each head, float [T, B].
+    scales: what the losses of heads are multiplied by, if not by 1.
     """
     latents, (prior, posterior) = filtered(world, params, batch.rows, key)
     fixed = jax.lax.stop_gradient
@@ -199,13 +213,14 @@ def model_loss(
 
     decoded = world.apply(params, latents, method="decode")
     read: Any = world.apply(params, latents.features, method="read")
-    losses = {"obs": mean(world.decoder.loss(decoded, batch.rows.obs))}
+    losses = {"obs": mean(world.decoder.loss(decoded, batch.rows.obs, cfg.obs_scale))}
     losses |= {name: mean(head_loss(read[name], target)) for name, target in targets.items()}
     dyn = mean(jnp.maximum(cfg.free_nats, kl(fixed(posterior), prior)))
     rep = mean(jnp.maximum(cfg.free_nats, kl(posterior, fixed(prior))))
     metrics = {f"train/model_{name}_loss": loss for name, loss in losses.items()}
     metrics |= {"train/model_kl": mean(kl(posterior, prior))}
-    total = sum(losses.values()) + cfg.dyn_scale * dyn + cfg.rep_scale * rep
+    weighted = (loss * (scales or {}).get(name, 1.0) for name, loss in losses.items())
+    total = sum(weighted) + cfg.dyn_scale * dyn + cfg.rep_scale * rep
     return total, (latents, metrics)
 
 

@@ -83,7 +83,8 @@ def one_dream(costs: dict[int, float], value: float = 0.0, ends: int = 99, steps
         .set(jnp.array([*costs.values()] or [0.0]))
     )
     alive = (jnp.arange(1, steps + 1) < ends)[:, None]
-    return bool(ambs.unsafe(cost, alive, jnp.array([value]), CFG)[0])
+    dreams = ambs.Dreamt(cost, alive, jnp.array([value]), jnp.zeros_like(alive))
+    return bool(ambs.unsafe(dreams, CFG)[0])
 
 
 def test_a_violation_counts_within_the_horizon_and_not_a_step_later():
@@ -101,6 +102,16 @@ def test_costs_add_up_and_end_with_the_episode():
 def test_the_critics_stand_for_the_steps_that_are_not_dreamed():
     """V counts from 10 discount^30 / discount^15 = 9.5589 on."""
     assert one_dream({}, value=9.56, steps=15) and not one_dream({}, value=9.558, steps=15)
+
+
+def test_a_drawn_violation_counts_until_the_episode_ends():
+    """Four dreams of three steps: none, one in the last step, and one in and one after the step that
+    ends the episode."""
+    hit = jnp.array([[0, 0, 0, 0], [0, 0, 1, 0], [0, 1, 0, 1]], bool)
+    alive = jnp.array([[1, 1, 1, 1], [1, 1, 0, 0], [1, 1, 1, 1]], bool)
+    dreams = ambs.Dreamt(jnp.zeros((3, 4)), alive, jnp.zeros(4), hit)
+    drawn = dataclasses.replace(CFG, verdict="drawn")
+    assert ambs.unsafe(dreams, drawn).tolist() == [False, True, True, False]
 
 
 def test_six_of_512_unsafe_dreams_overrule_and_five_do_not():
@@ -238,15 +249,18 @@ class Chain:
         return 1 - np.linalg.matrix_power(safe, steps)[state].sum()
 
 
-def test_on_a_known_chain_it_overrules_where_the_bound_says(monkeypatch):
+@pytest.mark.parametrize("verdict", ["summed", "drawn"])
+def test_on_a_known_chain_it_overrules_where_the_bound_says(monkeypatch, verdict):
     """With eps for the error of 512 dreams: always above delta, and never below delta - 2 eps."""
-    chain, cfg = Chain(), dataclasses.replace(CFG, shield_horizon=15, delta=0.8)
+    chain = Chain()
+    cfg = dataclasses.replace(CFG, shield_horizon=15, delta=0.8, verdict=verdict)
     monkeypatch.setattr(ambs, "world_of", lambda *_: chain)
     monkeypatch.setattr(ambs, "chosen", lambda *_: jnp.zeros(2))
     monkeypatch.setattr(ambs, "safety_value", lambda params, features, cfg: jnp.zeros(len(features)))
 
     def says(world, params, x):
-        return {"cost": 10.0 * (x[:, 0] == 5), "cont": jnp.ones(len(x))}
+        bad = x[:, 0] == 5
+        return {"cost": 10.0 * bad, "safe": 1.0 - bad, "cont": jnp.ones(len(x))}
 
     monkeypatch.setattr(ambs, "read", says)
     learned = Learned(cfg, {"model": ()}, (), ())

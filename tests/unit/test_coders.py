@@ -54,3 +54,22 @@ def test_pictures_alone_are_an_observation_too(obs_size):
     assert decoded.keys() == obs.keys()
     assert all(x.shape == obs[name].shape for name, x in decoded.items())
     assert jax.eval_shape(decoder.loss, decoded, obs).shape == (3,)
+
+
+def test_a_number_lies_between_two_steps_and_is_their_mean():
+    x = jnp.array([-3.0, -1.0, -0.24, 0.0, 0.93, 1.0, 50.0])
+    found = coders.shares(x, 21)
+    np.testing.assert_allclose(found.sum(-1), 1.0, rtol=1e-6)
+    np.testing.assert_allclose(found @ jnp.linspace(-1, 1, 21), jnp.clip(x, -1, 1), atol=1e-6)
+    assert ((found > 0).sum(-1) <= 2).all()
+    np.testing.assert_allclose(found[4, -2:], [0.7, 0.3], atol=1e-5)
+
+
+def test_bins_are_seen_beside_the_number():
+    """Numbers beyond the last step differ by their symlog alone, and bins can be left out."""
+    x, beyond = jnp.array([[0.5, 2.0]]), jnp.array([[0.5, 9.0]])
+    plain, binned = coders.VectorEncoder(SIZES["tiny"]), coders.VectorEncoder(SIZES["tiny"], bins=5)
+    for encoder, inputs in ((plain, 2), (binned, 2 + 2 * 5)):
+        params: Any = encoder.init(jax.random.key(0), x)
+        assert inputs in {leaf.shape[0] for leaf in jax.tree.leaves(params)}
+        assert (encoder.apply(params, x) != encoder.apply(params, beyond)).any()
