@@ -29,7 +29,7 @@ from jaxsafe.learn.dreaming import (
 from jaxsafe.learn.off_policy import off_policy
 from jaxsafe.learn.replay import Record
 from jaxsafe.learn.row import Row
-from jaxsafe.learn.world_model import CHANCE, CostHeadConfig, dream_returns, read, value_of, world_of
+from jaxsafe.learn.world_model import CHANCE, dream_returns, read, value_of, world_of
 from jaxsafe.nn.rssm import Latent
 from jaxsafe.nn.two_hot import BINS
 from jaxsafe.types import Algorithm, Env, Metrics, Policy, PyTree, State
@@ -38,7 +38,7 @@ ROUNDING = 1e-5  # a sum of costs that is above a bound by less is at the bound
 
 
 @config
-class AMBSConfig(CostHeadConfig, dreamer.DreamerConfig):
+class AMBSConfig(dreamer.DreamerConfig):
     """AMBS: Dreamer with a shield. Where its dreams look unsafe, a safe policy acts instead.
 
         p(s)  = share of m dreams of pi from s with  R > C discount^T,   R = sum of discounted costs
@@ -78,9 +78,6 @@ class AMBSConfig(CostHeadConfig, dreamer.DreamerConfig):
 
     # The undiscounted cost that an episode may have. It is only drawn in plots.
     cost_limit: Weight = 0.0
-    # How the actor learns. backprop: by the gradient of returns through the model, as in the authors'
-    # code. reinforce: from its actions' advantages.
-    actor_grad: Literal["reinforce", "backprop"] = "backprop"
     # How the task's policy learns to avoid what the shield hides from it: see above.
     penalty: Literal["penl", "plpg", "copt", "none"] = "plpg"
     # The weight of A_pen. The authors have 1 with penl and copt, and 0.8 with plpg.
@@ -100,8 +97,8 @@ class AMBSConfig(CostHeadConfig, dreamer.DreamerConfig):
     eps: Annotated[float, Bounds(1e-6, 1)] = 0.09
     # The probability that the estimate is further off, as in the paper.
     confidence: Annotated[float, Bounds(1e-12, 1)] = 0.01
-    # How a dream is found unsafe. summed: by the sum R of what its steps are expected to cost, as in the
-    # paper. drawn: each of T dreamed states has a violation with the probability that the model gives it.
+    # How a dream is found unsafe. summed: by the sum R of what its steps are expected to cost, as in
+    # the paper. drawn: each of T dreamed states has a violation as likely as the model says.
     verdict: Literal["summed", "drawn"] = "summed"
     # Whether the dreams begin with the proposed action. The authors' draw theirs anew.
     verify_action: bool = False

@@ -23,13 +23,13 @@ from jaxsafe.learn.off_policy import off_policy
 from jaxsafe.learn.planning import PlanConfig, cem, elites, particles_of
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.treatments import Treatment, no_treatment
-from jaxsafe.learn.world_model import CostHeadConfig, dream_returns, read, value_of, world_of
+from jaxsafe.learn.world_model import dream_returns, read, value_of, world_of
 from jaxsafe.nn.rssm import Latent
 from jaxsafe.types import Algorithm, Count, Env, Metrics, Policy, PyTree
 
 
 @config
-class OSRPConfig(PlanConfig, CostHeadConfig, dreamer.DreamerConfig):
+class OSRPConfig(PlanConfig, dreamer.DreamerConfig):
     """OSRP: SafeDreamer that plans in dreams, among plans of a low cost.
 
         R(a_1 .. a_H) = r_1 + discount k_1 ((1 - td_lambda) V(s_1) + td_lambda (r_2 + ..)),   V at s_H

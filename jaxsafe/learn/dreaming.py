@@ -193,7 +193,7 @@ class Behaviour(NamedTuple):
 
     actors, critics: their names. The policy acts by `actor`.
     heads: name -> BINS for a number, CHANCE for a probability: heads of the model besides `reward` and
-        `cont`, which tell of cost. Their losses weigh `cost_scale`.
+        `cont`.
     targets(env, rows, cfg) -> {name: float [T, B]}, what these heads learn to say.
     memory(cfg) -> what is remembered besides networks, a pytree.
     learn(trained, memory, scene, key) -> Outcome. `trained` are the actors and critics.
@@ -307,9 +307,8 @@ def dreaming_learner(env: Env, behaviour: Behaviour, policy: Policy | None = Non
         targets |= behaviour.targets(env, batch.rows, cfg)
 
         def loss(trained: dict[str, PyTree]) -> tuple[jax.Array, dict[str, Any]]:
-            scales = {name: cfg.cost_scale for name, _ in behaviour.heads}
             of_model, (latents, metrics) = model_loss(
-                world, trained["model"], batch, targets, model_key, cfg, scales
+                world, trained["model"], batch, targets, model_key, cfg
             )
             params = nets.params | fixed(trained)
             scene = Scene(env, world, params, batch, fixed(latents), cfg, axis_name)

@@ -41,34 +41,33 @@ class WorldModelConfig(EncoderConfig, RoundConfig):
     learn_every: Amount = 16
     # Rows replayed for each environment step. The authors have 32 to 1024.
     replay_ratio: Amount = 32
-    batch_size: Amount = 1024  # Rows of a gradient step, of all devices together, as in the paper.
-    # Steps of a replayed sequence. It has a row more: 32. The authors have 64.
-    n_step: Iterations = 31
+    batch_size: Amount = 256  # Rows of a gradient step, of all devices together. The paper has 1024.
+    # Steps of a replayed sequence. It has a row more: 16. The authors have 64.
+    n_step: Iterations = 15
     # Environment steps with random actions and without learning.
     learning_starts: Amount = 5_000
     # The discount of rewards: 1 - 1/333, as in the paper.
     discount: Share = 0.997
     cost_discount: Share = 0.997  # The discount of costs.
     # The networks' size: about the number of parameters, if pictures are observed. The paper's is 200m.
-    size: Literal["tiny", "300k", "1m", "12m", "25m", "50m", "100m", "200m"] = "1m"
-    model_lr: Rate = 3e-4  # The model's learning rate, by LaProp. The authors have 4e-5.
-    lr: Rate = 3e-4  # The actor's learning rate, by LaProp. The authors have 4e-5.
-    critic_lr: Rate = 3e-4  # The critics' learning rate, by LaProp. The authors have 4e-5.
-    # Gradient steps in which the learning rates rise to their values, as in the authors' code.
-    lr_warmup: Iterations = 1000
+    size: Literal["tiny", "300k", "1m", "12m", "25m", "50m", "100m", "200m"] = "300k"
+    model_lr: Rate = 1e-3  # The model's learning rate, by LaProp. The authors have 4e-5.
+    lr: Rate = 5e-4  # The actor's learning rate, by LaProp. The authors have 4e-5.
+    critic_lr: Rate = 1e-3  # The critics' learning rate, by LaProp. The authors have 4e-5.
+    # Gradient steps in which the learning rates rise to their values. The authors have 1000.
+    lr_warmup: Iterations = 500
     # The longest gradient of an array, as a share of the array's own length, as in the authors' code.
     clip: Norm = 0.3
     # Steps from -1 to 1 between which the model reads each number of a vector, beside its symlog.
     # 0: none, as in the paper.
     obs_bins: Annotated[int, Bounds(0, 1000)] = 21
-    obs_scale: Weight = 10.0  # The weight of the loss of vectors. The paper has 1.
     dyn_scale: Weight = 1.0  # The weight of the prior's loss, as in the paper.
     rep_scale: Weight = 0.1  # The weight of the posterior's loss, as in the paper.
     free_nats: Weight = 1.0  # Nats below which neither loss is lowered further, as in the paper.
     # Whether running out of time is learned as an end, as the code of AMBS does. A time limit that is
     # not observed is no end, so the default is not to.
     limit_ends: bool = False
-    imagine_steps: Iterations = 15  # Steps of a dream, as in the paper.
+    imagine_steps: Iterations = 10  # Steps of a dream. The paper has 15.
     td_lambda: Share = 0.95  # How far the returns of dreams reach: 0 is one step. As in the paper.
     # How the actor learns. reinforce: from its actions' advantages, as in the paper. backprop: by the
     # gradient of returns through the model.
@@ -80,14 +79,6 @@ class WorldModelConfig(EncoderConfig, RoundConfig):
     tau: Share = 0.02
     # The weight of the critics' loss on replayed rewards, as in the authors' code.
     replay_value: Weight = 0.3
-
-
-@config
-class CostHeadConfig:
-    """What algorithms share whose model foretells cost."""
-
-    # The weight of the losses of cost and of what is safe. The paper has no such heads.
-    cost_scale: Weight = 10.0
 
 
 # ---- networks ----------------------------------------------------------------------------------
@@ -196,14 +187,12 @@ def model_loss(
     targets: dict[str, jax.Array],
     key: jax.Array,
     cfg: Any,
-    scales: dict[str, jax.Array | float] | None = None,
 ) -> tuple[jax.Array, tuple[Latent, Metrics]]:
     """This device's share of the loss; the latents [T, B], and metrics.
 
         L = -log p(x, targets | h, z) + dyn max(free, KL(sg q || p)) + rep max(free, KL(q || sg p))
 
     targets: for each head, float [T, B].
-    scales: what the losses of heads are multiplied by, if not by 1.
     """
     latents, (prior, posterior) = filtered(world, params, batch.rows, key)
     fixed = jax.lax.stop_gradient
@@ -213,14 +202,13 @@ def model_loss(
 
     decoded = world.apply(params, latents, method="decode")
     read: Any = world.apply(params, latents.features, method="read")
-    losses = {"obs": mean(world.decoder.loss(decoded, batch.rows.obs, cfg.obs_scale))}
+    losses = {"obs": mean(world.decoder.loss(decoded, batch.rows.obs))}
     losses |= {name: mean(head_loss(read[name], target)) for name, target in targets.items()}
     dyn = mean(jnp.maximum(cfg.free_nats, kl(fixed(posterior), prior)))
     rep = mean(jnp.maximum(cfg.free_nats, kl(posterior, fixed(prior))))
     metrics = {f"train/model_{name}_loss": loss for name, loss in losses.items()}
     metrics |= {"train/model_kl": mean(kl(posterior, prior))}
-    weighted = (loss * (scales or {}).get(name, 1.0) for name, loss in losses.items())
-    total = sum(weighted) + cfg.dyn_scale * dyn + cfg.rep_scale * rep
+    total = sum(losses.values()) + cfg.dyn_scale * dyn + cfg.rep_scale * rep
     return total, (latents, metrics)
 
 

@@ -69,10 +69,9 @@ class VectorDecoder(nn.Module):
     def __call__(self, latent: Latent) -> jax.Array:
         return Head(self.size.layers, self.size.units, self.obs_size)(latent.features)
 
-    def loss(self, decoded: jax.Array, obs: jax.Array, scale: jax.Array | float = 1.0) -> jax.Array:
-        """`scale` times the squared error of what `__call__` gave, summed over the observation:
-        float [...]."""
-        return scale * vector_loss(decoded, obs)
+    def loss(self, decoded: jax.Array, obs: jax.Array) -> jax.Array:
+        """The squared error of what `__call__` gave, summed over the observation: float [...]."""
+        return vector_loss(decoded, obs)
 
 
 def vector_loss(decoded: jax.Array, obs: jax.Array) -> jax.Array:
@@ -216,13 +215,7 @@ class Decoder(nn.Module):
             vector = VectorDecoder(self.size, self.obs_size)(latent)
         return {"vision": PictureDecoder(self.size, self.shape)(latent), "vector": vector}
 
-    def loss(
-        self,
-        decoded: dict[str, jax.Array],
-        obs: dict[str, jax.Array],
-        scale: jax.Array | float = 1.0,
-    ) -> jax.Array:
-        """The squared errors of picture and, times `scale`, of the vector's symlog, summed over both:
-        float [...]."""
+    def loss(self, decoded: dict[str, jax.Array], obs: dict[str, jax.Array]) -> jax.Array:
+        """The squared errors of picture and vector, as symlog, summed over both: float [...]."""
         picture = picture_loss(decoded["vision"], obs["vision"])
-        return picture + scale * vector_loss(decoded["vector"], obs["vector"])
+        return picture + vector_loss(decoded["vector"], obs["vector"])

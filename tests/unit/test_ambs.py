@@ -253,7 +253,8 @@ class Chain:
 def test_on_a_known_chain_it_overrules_where_the_bound_says(monkeypatch, verdict):
     """With eps for the error of 512 dreams: always above delta, and never below delta - 2 eps."""
     chain = Chain()
-    cfg = dataclasses.replace(CFG, shield_horizon=15, delta=0.8, verdict=verdict)
+    known = {"imagine_steps": 15, "shield_horizon": 15, "delta": 0.8}
+    cfg = dataclasses.replace(CFG, verdict=verdict, **known)
     monkeypatch.setattr(ambs, "world_of", lambda *_: chain)
     monkeypatch.setattr(ambs, "chosen", lambda *_: jnp.zeros(2))
     monkeypatch.setattr(ambs, "safety_value", lambda params, features, cfg: jnp.zeros(len(features)))
