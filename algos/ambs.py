@@ -63,6 +63,9 @@ class AMBSConfig(dreamer.DreamerConfig):
     copies of it. They foresee its random numbers, too, and only the actions differ. It shows what a
     learned model costs. The policy then needs the simulator wherever it acts.
 
+    With `verdict=drawn` a dream has T steps and no V_i. Each of its states has a violation as likely as
+    the model says, and one is enough.
+
     What the shield guarantees: where it lets pi act, pi has a violation within T steps with a
     probability below delta. This is wrong with a probability of `confidence` at most. It needs an exact
     model, known C and V_i, and m of at least ln(1 / confidence) / (2 eps^2). But model and critics are
@@ -72,8 +75,9 @@ class AMBSConfig(dreamer.DreamerConfig):
     Learning", arXiv:2308.00707, and (2024), "Leveraging Approximate Model-based Shielding for
     Probabilistic Safety Guarantees in Continuous Environments", arXiv:2402.00816; the penalties are
     from their code.
-    Differs from it: Dreamer is the later one. An end of the episode also ends the costs that V_i
-    foresee. Time limits are no ends (`limit_ends=true` has them). Mean actions are shielded, too.
+    Differs from it: Dreamer is the later one, whose actor learns by reinforce (`actor_grad=backprop`
+    has the authors'). An end of the episode also ends the costs that V_i foresee. Time limits are no
+    ends (`limit_ends=true` has them). Mean actions are shielded, too.
     """
 
     # The undiscounted cost that an episode may have. It is only drawn in plots.

@@ -45,8 +45,9 @@ class DreamerConfig(WorldModelConfig):
     Source: Hafner et al. (2025), "Mastering Diverse Control Tasks through World Models", Nature 640,
     arXiv:2301.04104, and the authors' code.
     Differs from it: replayed sequences begin with an empty memory, k is learned without the discount,
-    and the model learns nothing from the critics. Numbers have 32 bits. The defaults are for vectors:
-    many environments, small networks, larger learning rates, and fewer gradient steps.
+    and the model learns nothing from the critics. Numbers have 32 bits. The encoder sees in which of
+    `obs_bins` steps a number lies, too. The defaults are for vectors: many environments, small networks
+    and batches, short dreams, larger learning rates, and fewer gradient steps.
     """
 
 
@@ -67,7 +68,8 @@ class DreamerLagConfig(DreamerConfig):
     Shielding for Probabilistic Safety Guarantees in Continuous Environments", arXiv:2402.00816, as in
     their code; the augmented Lagrangian is that of As et al. (2022), "Constrained Policy Optimization
     via Bayesian World Models", arXiv:2201.09802.
-    Differs from it: the head of cost gives a number, not a probability, and Dreamer is the later one.
+    Differs from it: the head of cost gives a number, not a probability, and Dreamer is the later one,
+    whose actor learns by reinforce (`actor_grad=backprop` has AMBS's).
     mu is 1 from the second step on, as in the code, so lam moves by the whole violation each time;
     `mu_least=0` is the paper's.
     """

@@ -356,7 +356,8 @@ def grid(count: int, size: tuple[float, float]) -> tuple[Figure, list[Axes]]:
 
 
 def legend(figure: Figure, panels: Iterable[Axes], names: Iterable[str] = ()) -> None:
-    """One for all panels, on the right or, of long names, below: `names` first."""
+    """One for all panels, on the right or, of long names, below, where the figure grows by it: `names`
+    first."""
     entries: dict[str, Any] = dict.fromkeys(names)
     for axes in panels:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
@@ -366,8 +367,11 @@ def legend(figure: Figure, panels: Iterable[Axes], names: Iterable[str] = ()) ->
         columns = -(-len(entries) // int(4 * figure.get_figheight()))
         place = {"loc": "outside right upper", "ncols": columns, "frameon": False}
         if (longest := max(map(len, entries))) > LONG:
-            fitting = int(figure.get_figwidth() * 10 / longest)  # ten letters take about an inch
-            place |= {"loc": "outside lower center", "ncols": max(1, fitting)}
+            figure.set_figwidth(max(figure.get_figwidth(), longest / 10))  # ten letters take an inch
+            fitting = int(figure.get_figwidth() * 10 / longest)
+            rows = -(-len(entries) // fitting)
+            figure.set_figheight(figure.get_figheight() + rows / 5)  # as do five rows
+            place |= {"loc": "outside lower center", "ncols": fitting}
         figure.legend(entries.values(), entries.keys(), **place)
 
 
