@@ -102,7 +102,8 @@ class AMBSConfig(dreamer.DreamerConfig):
     # The probability that the estimate is further off, as in the paper.
     confidence: Annotated[float, Bounds(1e-12, 1)] = 0.01
     # How a dream is found unsafe. summed: by the sum R of what its steps are expected to cost, as in
-    # the paper. drawn: each of T dreamed states has a violation as likely as the model says.
+    # the paper. drawn: each of T dreamed states has a violation, and is an end, as likely as the model
+    # says. It has no effect with shield=true_dynamics.
     verdict: Literal["summed", "drawn"] = "summed"
     # Whether the dreams begin with the proposed action. The authors' draw theirs anew.
     verify_action: bool = False
@@ -248,9 +249,9 @@ def safety_value(params: dict[str, PyTree], features: jax.Array, cfg: Any) -> ja
 
 
 class Dreamt(NamedTuple):
-    """m dreams of H states: their costs, float [H, m]; whether the episode goes on from them, bool
-    [H, m]; the cost that follows the last one, float [m]; whether a violation was drawn in them, bool
-    [H, m]."""
+    """m dreams of H states, or of T with verdict=drawn: their costs, float [H, m]; whether the episode
+    goes on from them, bool [H, m]; the cost that follows the last one, float [m]; where a violation was
+    drawn, bool [H, m]."""
 
     cost: jax.Array
     alive: jax.Array
@@ -276,13 +277,14 @@ def dreamt(env: Env, learned: Learned, latent: Latent, proposed: jax.Array, key:
 
     def step(now: Latent, x: tuple[jax.Array, jax.Array]) -> tuple[Latent, Any]:
         h, key = x
-        act_key, model_key, draw_key = jax.random.split(key, 3)
+        act_key, model_key, hit_key, end_key = jax.random.split(key, 4)
         action = chosen(env, learned, "actor", now, act_key)
         action = jnp.where((h == 0) & cfg.verify_action, proposed, action)
         after: Any = world.apply(params["model"], now, action, model_key, method="imagine")
         says = read(world, params["model"], after.features)
-        hit = jax.random.bernoulli(draw_key, 1 - says["safe"])
-        return after, (clipped(says["cost"], cfg), says["cont"] > 0.5, hit)
+        hit = jax.random.bernoulli(hit_key, 1 - says["safe"])
+        likely = 0.5 if cfg.verdict == "summed" else jax.random.uniform(end_key, hit.shape)
+        return after, (clipped(says["cost"], cfg), says["cont"] > likely, hit)
 
     found = jax.lax.scan(step, start, (jnp.arange(steps), jax.random.split(key, steps)))
     last, (cost, alive, hit) = found
@@ -294,8 +296,8 @@ def unsafe(dreams: Dreamt, cfg: Any) -> jax.Array:
     or, with verdict=summed, R > C discount^T."""
     cost, alive, value, hit = dreams
     if cfg.verdict == "drawn":
-        runs = jnp.cumprod(jnp.concatenate([jnp.ones_like(alive[:1]), alive[:-1]]), axis=0)
-        return (hit * runs).any(0)
+        runs = jnp.cumprod(alive, axis=0)[:-1] > 0  # from the second state on
+        return hit[0] | (hit[1:] & runs).any(0)
 
     def backward(later: jax.Array, x: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
         cost, alive = x

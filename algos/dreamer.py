@@ -45,9 +45,9 @@ class DreamerConfig(WorldModelConfig):
     Source: Hafner et al. (2025), "Mastering Diverse Control Tasks through World Models", Nature 640,
     arXiv:2301.04104, and the authors' code.
     Differs from it: replayed sequences begin with an empty memory, k is learned without the discount,
-    and the model learns nothing from the critics. Numbers have 32 bits. The encoder sees in which of
-    `obs_bins` steps a number lies, too. The defaults are for vectors: many environments, small networks
-    and batches, short dreams, larger learning rates, and fewer gradient steps.
+    and the model learns nothing from the critics. Numbers have 32 bits. The encoder also sees between
+    which two of `obs_bins` steps a number lies. The defaults are for vectors: many environments, small
+    networks and batches, short dreams, larger learning rates, and fewer gradient steps.
     """
 
 
@@ -196,7 +196,7 @@ def make(env: Env, axis_name: str | None = None, behaviour: Behaviour = blind) -
     return off_policy(env, dreaming_learner(env, behaviour), axis_name=axis_name)
 
 
-# what our defaults depart from
+# the authors' values of settings that have other defaults here
 PAPER: dict[str, Any] = {
     "batch_size": 1024, "n_step": 63, "imagine_steps": 15, "lr_warmup": 1000, "obs_bins": 0,
 }  # fmt: skip

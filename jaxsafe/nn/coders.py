@@ -30,8 +30,11 @@ LEAST, MOST = 3, 16  # the sides that a picture may have after its last halving,
 
 
 def shares(x: jax.Array, bins: int) -> jax.Array:
-    """The shares of the two neighbours of `x` among `bins` even steps from -1 to 1, whose mean is `x`.
-    A number beyond the last step has all of it: float [..., bins]."""
+    """How near `x` is to each of `bins` even steps from -1 to 1, float [..., bins].
+
+    Only its two neighbours are above 0. They sum to 1, and their mean is `x`. A number beyond the last
+    step counts as that step.
+    """
     steps = jnp.linspace(-1.0, 1.0, bins)
     apart = jnp.abs(jnp.clip(x, -1.0, 1.0)[..., None] - steps) * (bins - 1) / 2
     return jnp.maximum(0.0, 1.0 - apart)

@@ -356,8 +356,8 @@ def grid(count: int, size: tuple[float, float]) -> tuple[Figure, list[Axes]]:
 
 
 def legend(figure: Figure, panels: Iterable[Axes], names: Iterable[str] = ()) -> None:
-    """One for all panels, on the right or, of long names, below, where the figure grows by it: `names`
-    first."""
+    """One legend for all panels, `names` first. It stands on the right. If a name is long it stands
+    below, and the figure grows to hold it."""
     entries: dict[str, Any] = dict.fromkeys(names)
     for axes in panels:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):

@@ -136,3 +136,16 @@ def test_a_drawn_band_ends_where_its_measure_ends():
         plots.band(axes, measure, np.arange(2), values, "")
     low = [np.asarray(band.get_paths()[0].vertices)[:, 1].min() for band in axes.collections]
     assert low[0] < -1 and low[1] == 0
+
+
+def test_a_figure_grows_by_a_legend_of_many_long_names():
+    """Its panel keeps its height, and all of the legend is inside the figure."""
+    figure, panels = plots.grid(1, size=(3.0, 3.0))
+    for i in range(20):
+        panels[0].plot([0, 1], [i, i], label=f"an algorithm with option={i} and another={i}")
+    plots.legend(figure, panels)
+    figure.canvas.draw()
+    below = figure.legends[0].get_window_extent()
+    assert panels[0].get_window_extent().height > 2 * figure.dpi
+    assert below.y0 >= 0 and below.x0 >= 0 and below.y1 < panels[0].get_window_extent().y0
+    assert below.x1 <= figure.get_figwidth() * figure.dpi
