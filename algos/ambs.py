@@ -283,8 +283,8 @@ def dreamt(env: Env, learned: Learned, latent: Latent, proposed: jax.Array, key:
         after: Any = world.apply(params["model"], now, action, model_key, method="imagine")
         says = read(world, params["model"], after.features)
         hit = jax.random.bernoulli(hit_key, 1 - says["safe"])
-        likely = 0.5 if cfg.verdict == "summed" else jax.random.uniform(end_key, hit.shape)
-        return after, (clipped(says["cost"], cfg), says["cont"] > likely, hit)
+        least = jax.random.uniform(end_key, hit.shape) if cfg.verdict == "drawn" else 0.5
+        return after, (clipped(says["cost"], cfg), says["cont"] > least, hit)
 
     found = jax.lax.scan(step, start, (jnp.arange(steps), jax.random.split(key, steps)))
     last, (cost, alive, hit) = found

@@ -368,7 +368,7 @@ def legend(figure: Figure, panels: Iterable[Axes], names: Iterable[str] = ()) ->
         place = {"loc": "outside right upper", "ncols": columns, "frameon": False}
         if (longest := max(map(len, entries))) > LONG:
             figure.set_figwidth(max(figure.get_figwidth(), longest / 10))  # ten letters take an inch
-            fitting = int(figure.get_figwidth() * 10 / longest)
+            fitting = max(1, int(figure.get_figwidth() * 10 / longest))
             rows = -(-len(entries) // fitting)
             figure.set_figheight(figure.get_figheight() + rows / 5)  # as do five rows
             place |= {"loc": "outside lower center", "ncols": fitting}
