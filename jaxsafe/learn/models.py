@@ -24,8 +24,15 @@ from jaxsafe.learn.batch import device_count, device_key, pmean, psum, select_ro
 from jaxsafe.learn.next_step_rollout import Stepping, arrival_record
 from jaxsafe.learn.replay import Record, Span, held
 from jaxsafe.learn.steps import Trainable, descend
-from jaxsafe.nn.ensemble import Ensemble, Scale, ensemble_loss, init_ensemble, outputs_of, unscaled
-from jaxsafe.nn.gaussian import sample
+from jaxsafe.nn.ensemble import (
+    Ensemble,
+    Scale,
+    draw,
+    ensemble_loss,
+    init_ensemble,
+    outputs_of,
+    unscaled,
+)
 from jaxsafe.types import Env, Metrics, PyTree, Shared, State
 
 FARTHEST = 100.0  # no predicted observation is larger, as in OmniSafe
@@ -150,11 +157,9 @@ def learned_model(env: Env) -> Model:
         fitted: Fitted, latent: jax.Array, action: jax.Array, key: jax.Array, cfg: Any
     ) -> Prediction:
         inputs = jnp.concatenate([latent, jnp.clip(action, -1.0, 1.0)], -1)
-        dist = outputs_of(fitted.ensemble, fitted.scale, inputs, cfg.model_dtype)
-        out = sample(dist, key)
+        out, spread = draw(fitted.ensemble, fitted.scale, inputs, key, cfg.model_dtype)
         obs = jnp.clip(latent + out[..., -env.obs_size :], -FARTHEST, FARTHEST)
         cost = out[..., 1] if cfg.learn_cost else observed_cost(env)(obs)
-        spread = jnp.linalg.norm(jnp.exp(dist.log_std), axis=-1)
         return Prediction(obs, out[..., 0], cost, spread, jnp.zeros(cost.shape, bool))
 
     return Model(lambda cfg: (cfg.models, cfg.particles), predict, lambda latent: latent)

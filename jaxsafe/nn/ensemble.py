@@ -13,7 +13,8 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
-from jaxsafe.nn.gaussian import Gaussian
+from jaxsafe.nn import drawn
+from jaxsafe.nn.gaussian import Gaussian, sample
 
 FIRST_LOG_VAR = (-10.0, 0.5)  # low and high before training, as in the authors' code
 PRESSURE = 0.01  # on the sum of high - low, likewise
@@ -86,6 +87,22 @@ def outputs_of(
     low, high = spaced(ensemble.low), spaced(ensemble.high)
     log_var = low + jax.nn.softplus(high - jax.nn.softplus(high - v) - low)
     return Gaussian(mean, log_var / 2)
+
+
+def draw(
+    ensemble: Ensemble, scale: Scale, x: jax.Array, key: jax.Array, hidden_dtype: str = "float32"
+) -> tuple[jax.Array, jax.Array]:
+    """One draw from each model at its own inputs `x` [M, ..., I], and the length of the vector of
+    standard deviations there: [M, ..., K] and [M, ...].
+
+    In bfloat16 a Hopper GPU does it in one kernel, with random numbers of its own (`drawn`).
+    """
+    weights, biases = ([getattr(x, name) for x in ensemble.layers] for name in ("weight", "bias"))
+    if hidden_dtype == "bfloat16" and drawn.serves(weights):
+        x = (x - scale.mean) / scale.std
+        return drawn.draw(weights, biases, ensemble.low, ensemble.high, x, key)
+    dist = outputs_of(ensemble, scale, x, hidden_dtype)
+    return sample(dist, key), jnp.linalg.norm(jnp.exp(dist.log_std), axis=-1)
 
 
 def ensemble_loss(

@@ -129,7 +129,8 @@ def test_the_sdist_and_its_wheel_hold_every_module_and_asset_and_no_tests(tmp_pa
     wheel = zipfile.ZipFile(build("wheel", unpacked, out / "wheel"))
     names = set(wheel.namelist())
     marker = ROOT / "jaxsafe" / "py.typed"
-    for path in [*MODULES, marker, *(ROOT / "envs").rglob("*.xml"), *(ROOT / "envs").rglob("*.cu")]:
+    kernels = [x for part in ("envs", "jaxsafe/nn") for x in (ROOT / part).rglob("*.cu")]
+    for path in [*MODULES, marker, *(ROOT / "envs").rglob("*.xml"), *kernels]:
         inside = path.relative_to(ROOT).as_posix()
         assert (inside if inside.startswith("jaxsafe/") else f"jaxsafe/{inside}") in names
     (entries,) = (name for name in names if name.endswith("entry_points.txt"))
