@@ -253,7 +253,7 @@ def stretches(table: Mapping[str, np.ndarray], name: str, edges: np.ndarray) -> 
     """The mean of a metric of each seed over each stretch of steps (edges[i], edges[i + 1]], [S, T].
 
     A stretch without value has the one before it, NaN before the first and after the last row of the
-    seed. Cost rates are averaged from the start, so that the last one is that of all training.
+    seed. Cost rates are averaged from the first, so that the last one is that of all training.
     """
     seeds = np.unique(table["seed"])
     found = np.full((len(seeds), len(edges) - 1), np.nan)
@@ -261,7 +261,8 @@ def stretches(table: Mapping[str, np.ndarray], name: str, edges: np.ndarray) -> 
         of_seed = table["seed"] == seed
         values, steps = table[name][of_seed], table[run_folder.step_column(table)][of_seed]
         if name == "train/cost_rate":
-            values = np.cumsum(values) / np.arange(1, len(values) + 1)
+            counts = np.cumsum(np.isfinite(values))
+            values = np.nancumsum(values) / np.where(counts, counts, np.nan)
         known = np.isfinite(values)
         which = np.searchsorted(edges, steps, side="left") - 1
         count = np.bincount(which[known], minlength=len(row))

@@ -122,6 +122,10 @@ def test_stretches_of_training_are_means_carried_on_to_the_end_of_each_seed():
     np.testing.assert_array_equal(  # so far: 1, 2, 3, 4 and 2, 3
         plots.stretches(table, "train/cost_rate", edges), [[1.5, 3.5, np.nan], [2.5, np.nan, np.nan]]
     )
+    table["train/cost_rate"][[0, 2]] = np.nan  # so far: none, 3, 3, 5
+    np.testing.assert_array_equal(
+        plots.stretches(table, "train/cost_rate", edges), [[3, 4, np.nan], [2.5, np.nan, np.nan]]
+    )
 
 
 # ---- which runs are averaged -----------------------------------------------------------------
