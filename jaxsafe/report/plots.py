@@ -151,7 +151,8 @@ def trade_off(
 
     A point is the mean over seeds with its 95 % interval, each limit a dashed line: grey, or in the
     colour of the one setting it belongs to. The grey steps are the Pareto front of the means. A hollow
-    diamond is the mean that was published, by environment and name.
+    diamond is the mean that was published, by environment and name. The frame holds all seeds and
+    means. Intervals may reach beyond it.
     """
     places = sorted({(row.env, name) for row in rows for name in row.limits or [""]})
     figure, panels = grid(len(places), size=(4.6, 4))
@@ -159,11 +160,13 @@ def trade_off(
     for axes, (env, name) in zip(panels, places, strict=True):
         shown = [row for row in rows if row.env == env]
         limits = [row.limits.get(name, np.nan) for row in shown]
-        means = []
+        means, costs, returns = [], [], []  # and those of all that the frame holds
         for i, row in enumerate(shown):
             color, marker = looks[row.name]["color"], MARKERS[looks[row.name]["ls"]]
             axes.plot(row.values(cost_title(name)), row.returns, ".", color=color, ms=4, alpha=0.5)
             ret, cost = row.ret, row.estimate(cost_title(name))
+            costs += [*row.values(cost_title(name)), cost.mean, limits[i]]
+            returns += [*row.returns, ret.mean]
             means.append((cost.mean, ret.mean))
             axes.errorbar(
                 cost.mean,
@@ -176,15 +179,26 @@ def trade_off(
             )
             if not name and (known := published.get((env, row.name))) is not None:
                 axes.plot(known.cost[0], known.ret[0], "D", mfc="none", ms=7, color=color)
+                costs, returns = [*costs, known.cost[0]], [*returns, known.ret[0]]
             if (limit := limits[i]) not in limits[:i]:
                 alone = limits.count(limit) == 1 and len({x for x in limits if not np.isnan(x)}) > 1
                 line = color if alone else "0.5"
                 axes.axvline(limit, color=line, ls="--", lw=1)
         axes.plot(*front(means), color="0.6", lw=1, zorder=0)
         axes.set(title=env, xlabel=f"{name or 'cost'} of an episode", ylabel=PANELS[0][1])
+        axes.set(xlim=frame(costs), ylim=frame(returns))
     legend(figure, panels, looks)
     figure.suptitle(title + ("; hollow: published" if any(published.values()) else ""))
     return figure
+
+
+def frame(values: Sequence[float]) -> tuple[float, float] | None:
+    """Ends of an axis that holds all finite values; None leaves them as they are."""
+    finite = np.array([x for x in values if np.isfinite(x)])
+    if not len(finite) or np.ptp(finite) == 0:
+        return None
+    margin = 0.06 * np.ptp(finite)
+    return float(finite.min() - margin), float(finite.max() + margin)
 
 
 def front(points: Sequence[tuple[float, float]]) -> tuple[list[float], list[float]]:
@@ -371,7 +385,7 @@ def legend(figure: Figure, panels: Iterable[Axes], names: Iterable[str] = ()) ->
             figure.set_figwidth(max(figure.get_figwidth(), longest / 10))  # ten letters take an inch
             fitting = max(1, int(figure.get_figwidth() * 10 / longest))
             rows = -(-len(entries) // fitting)
-            figure.set_figheight(figure.get_figheight() + rows / 5)  # as do five rows
+            figure.set_figheight(figure.get_figheight() + 0.3 + 0.22 * rows)  # inches of a row
             place |= {"loc": "outside lower center", "ncols": fitting}
         figure.legend(entries.values(), entries.keys(), **place)
 

@@ -250,6 +250,19 @@ def test_the_pareto_front_leaves_out_what_costs_more_and_returns_less():
     assert plots.front(points) == ([1, 2, 2, 5, 5], [2, 2, 5, 5, 6])
 
 
+def test_the_frame_of_a_trade_off_holds_every_seed_and_cuts_wide_intervals(tmp_path):
+    write(tmp_path / "a", "point_goal1", "cpo")
+    (group,) = compared(tmp_path / "a")
+    axes = plots.trade_off([group], "").axes[0]
+    for (low, high), values, wide in (
+        (axes.get_xlim(), [*group.costs, group.cost_limit], group.estimate("cost")),
+        (axes.get_ylim(), group.returns, group.ret),
+    ):
+        assert low < min(values) <= max(values) < high
+        assert high - low < 1.13 * np.ptp(values) < wide.high - wide.low
+    assert plots.frame([3.0, np.nan, 3.0]) is None
+
+
 def test_one_command_writes_every_table_and_figure_the_same_each_time(tmp_path, capsys):
     for env in ("point_goal1", "car_goal1"):
         for algo in ("cpo", "ppo_lag"):
