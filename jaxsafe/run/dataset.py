@@ -267,7 +267,8 @@ def write_dataset(
     more: Mapping[str, np.ndarray] | None = None,
     about: Mapping[str, str | int | float] | None = None,
 ) -> None:
-    """Write a data set that `read_dataset` reads, as .hdf5 or .npz by the end of its name.
+    """Write a data set that `read_dataset` reads, as .hdf5 or .npz by the end of its name. What takes a
+    byte, such as pictures, is compressed in .hdf5. In .npz all is.
 
     Args:
         more: arrays [n] beside it, by name.
@@ -292,7 +293,8 @@ def write_dataset(
             return
         with h5py.File(part, "w") as file:
             for name, x in arrays.items():
-                file.create_dataset(name, data=x, compression="lzf")
+                bytewise = x.dtype.itemsize == 1  # pictures and truth values; floats hardly shrink
+                file.create_dataset(name, data=x, compression="lzf" if bytewise else None)
             file.attrs.update(dict(about or {}))
 
 
