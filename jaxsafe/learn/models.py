@@ -86,7 +86,7 @@ class ModelConfig(EnsembleConfig):
     learn_cost: bool = True
     # What the model's hidden layers are computed in while it predicts. It is always fitted in float32.
     # bfloat16, which has 8 bits, halves what a GPU has to move for thousands of plans. On an H100 or
-    # H200 a step of the model is one kernel then.
+    # H200 with Warp networks and draw are one kernel then, with other random numbers.
     model_dtype: Literal["float32", "bfloat16"] = "float32"
 
     @property

@@ -28,6 +28,7 @@ from jaxsafe.config import Amount, Bounds, ConfigError, Iterations, Share, Weigh
 from jaxsafe.learn.acting import Learned
 from jaxsafe.learn.batch import select
 from jaxsafe.learn.models import Model, learned_model, simulator
+from jaxsafe.nn import drawn
 from jaxsafe.types import Env, Policy, PyTree
 
 HIGHEST = jax.lax.Precision.HIGHEST
@@ -244,12 +245,14 @@ def cem(
 
 def planning_bytes(env: Env, cfg: Any) -> int:
     """The least that planning for one environment holds at once: what is kept of each step of all
-    courses of events, and two neighbouring layers of the networks that predict one step of them."""
+    courses of events, and two neighbouring layers of the networks that predict one step of them. The
+    kernel of a Hopper GPU has no layers in memory (`nn.drawn`)."""
     model = simulator(env) if cfg.true_model else learned_model(env)
     courses = cfg.plans * math.prod(model.particles(cfg))
     outputs = 2 * (1 + cfg.learn_cost + env.obs_size)  # means and variances
     layers = (env.obs_size + env.action_size, *cfg.model_hidden, outputs)
-    network = 0 if cfg.true_model else max(a + b for a, b in itertools.pairwise(layers))
+    fused = cfg.model_dtype == "bfloat16" and drawn.serves(layers[0], cfg.model_hidden, outputs // 2)
+    network = 0 if cfg.true_model or fused else max(a + b for a, b in itertools.pairwise(layers))
     size = jnp.dtype(cfg.model_dtype).itemsize
     return courses * (4 * (3 * cfg.plan_steps + env.obs_size) + size * network)
 

@@ -2,7 +2,7 @@
 
     sigma^2 = e^low + 1 / (e^-high + e^-v),   out = mu + sigma n,   n ~ N(0, 1),   spread = |sigma|
 
-where mu and v are what a network says. This is the sigma of ensemble.py without its logarithms.
+where mu and v are a network's outputs. This is the sigma of ensemble.py without its logarithms.
 
 Thousands of plans make layers of hundreds of megabytes. Here all that lies between `x` and `out` stays
 in registers, and the weights pass through the chip's own memory. The random numbers are Philox's of
@@ -18,48 +18,52 @@ Source: NVIDIA, Parallel Thread Execution ISA, "Asynchronous warpgroup level mat
 # pyright: reportGeneralTypeIssues=false, reportCallIssue=false, reportInvalidTypeForm=false
 # pyright: reportAssignmentType=false
 
+import contextlib
 import functools
 import importlib.util
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-THREADS = 512  # of a block
+THREADS = 512  # of a block of the kernel: three groups of 128 compute, one fetches weights
 SHARED_MEMORY = 200 * 1024  # bytes of a block for weights, of the 227 KiB that there are
-MOST = 13  # of each of the sizes below: more would not fit a thread's registers
+LARGEST = 13  # of inputs, width and outputs below: a few registers of a thread are spilled then
+FOR_HOPPER = {"cuda_arch_suffix": "a", "cuda_output": "cubin"}  # as warp.config calls it
 ONE = 1.2784645  # swish of it is 1
 BODY = Path(__file__).with_suffix(".cu").read_text()
-
-
 Drawn = tuple[jax.Array, jax.Array]
 
 
 class Sizes(NamedTuple):
-    """Sixteens of columns of the inputs and of the widest hidden layer, eights of columns of the
-    outputs, and how many layers lead from hidden to hidden."""
+    """What the kernel is compiled for."""
 
-    inputs: int
-    width: int
-    outputs: int
-    inner: int
-
-
-def sizes_of(weights: Sequence[jax.Array]) -> Sizes:
-    """Of layers [M, I, O], the last of which gives means and variances."""
-    wide = max(w.shape[2] for w in weights[:-1])
-    outputs = weights[-1].shape[2] // 2
-    return Sizes(weights[0].shape[1] // 16 + 1, wide // 16 + 1, -(-outputs // 8), len(weights) - 2)
+    inputs: int  # tiles of 16 columns, the one that is 1 included
+    width: int  # likewise of the widest hidden layer
+    outputs: int  # tiles of 8 columns of the means, and as many of the variances
+    inner: int  # layers that lead from hidden to hidden
 
 
-def serves(weights: Sequence[jax.Array]) -> bool:
-    """Whether the kernel runs here, and is for layers of these sizes."""
-    if jax.default_backend() != "gpu" or importlib.util.find_spec("warp") is None:
+def sizes_of(inputs: int, hidden: Sequence[int], outputs: int) -> Sizes:
+    """Of networks with so many inputs, units in each hidden layer, and means."""
+    return Sizes(inputs // 16 + 1, max(hidden) // 16 + 1, -(-outputs // 8), len(hidden) - 1)
+
+
+def serves(inputs: int, hidden: Sequence[int], outputs: int) -> bool:
+    """Whether the kernel runs here, and is for such networks: at most 207 inputs, 207 units in a layer
+    and 104 means."""
+    if jax.default_backend() != "gpu" or importlib.util.find_spec("warp") is None or not hidden:
         return False
-    hopper = getattr(jax.devices()[0], "compute_capability", "") == "9.0"
-    return hopper and len(weights) > 1 and max(sizes_of(weights)[:3]) <= MOST
+    hopper = all(getattr(x, "compute_capability", "") == "9.0" for x in jax.local_devices())
+    return hopper and max(sizes_of(inputs, hidden, outputs)[:3]) <= LARGEST
+
+
+def widths(weights: Sequence[jax.Array]) -> tuple[int, tuple[int, ...], int]:
+    """Inputs, units of the hidden layers, and means, of layers [M, I, O]."""
+    hidden = tuple(w.shape[2] for w in weights[:-1])
+    return weights[0].shape[1], hidden, weights[-1].shape[2] // 2
 
 
 # ---- what the kernel reads -----------------------------------------------------------------------
@@ -67,7 +71,7 @@ def serves(weights: Sequence[jax.Array]) -> bool:
 
 def with_biases(weights: Sequence[jax.Array], biases: Sequence[jax.Array]) -> list[jax.Array]:
     """Layers as matrices [M, I', O'] of whole tiles, in which a column that is 1 carries the biases."""
-    sizes, padded = sizes_of(weights), []
+    sizes, padded = sizes_of(*widths(weights)), []
     for index, (w, b) in enumerate(zip(weights, biases, strict=True)):
         models, deep, wide = w.shape
         last = index == len(weights) - 1
@@ -168,6 +172,19 @@ def kernel_of(sizes: Sizes) -> Any:
     return kernel
 
 
+@contextlib.contextmanager
+def changed(place: Any, values: Mapping[str, Any]) -> Iterator[None]:
+    """Attributes of `place` with these values, within a `with`."""
+    before = {name: getattr(place, name) for name in values}
+    try:
+        for name, value in values.items():
+            setattr(place, name, value)
+        yield
+    finally:
+        for name, value in before.items():
+            setattr(place, name, value)
+
+
 @functools.cache
 def launcher(sizes: Sizes) -> Callable[..., Sequence[jax.Array]]:
     import warp as wp
@@ -181,11 +198,10 @@ def launcher(sizes: Sizes) -> Callable[..., Sequence[jax.Array]]:
         spread: wp.array3d[float],
     ):
         kernel, device = kernel_of(sizes), wp.get_device()
-        before, wp.config.cuda_arch_suffix = wp.config.cuda_arch_suffix, "a"  # for wgmma
-        try:
+        if not device.is_cuda:
+            raise RuntimeError("the kernel that draws from models runs on a GPU alone")
+        with changed(wp.config, FOR_HOPPER):
             wp.load_module(kernel.module, device, block_dim=THREADS)
-        finally:
-            wp.config.cuda_arch_suffix = before
         wp.launch(
             kernel,
             dim=(device.sm_count, THREADS),
@@ -212,8 +228,8 @@ def batched(run: Callable[..., Drawn]) -> Callable[..., Drawn]:
 
     @draw.def_vmap
     def _(size: int, in_batched: Any, *args: jax.Array) -> tuple[Drawn, tuple[bool, bool]]:
-        own = in_batched[1] or in_batched[2]  # each has networks of its own
-        groups = 1 if own else len(args[2])
+        differ = in_batched[1] or in_batched[2]  # the networks
+        groups = 1 if differ else len(args[2])
 
         def merged(x: jax.Array) -> jax.Array:  # [size, groups, copies] -> [groups, size, copies]
             x = x.reshape(size, groups, -1, *x.shape[2:]).swapaxes(0, 1)
@@ -224,10 +240,10 @@ def batched(run: Callable[..., Drawn]) -> Callable[..., Drawn]:
             return x.reshape(size, -1, *x.shape[3:])
 
         seed, bounds, weights, x = (
-            x if batched else jnp.broadcast_to(x, (size, *x.shape)) if own or i in (0, 3) else x
+            x if batched else jnp.broadcast_to(x, (size, *x.shape)) if differ or i in (0, 3) else x
             for i, (x, batched) in enumerate(zip(args, in_batched, strict=True))
         )
-        if own:
+        if differ:
             bounds, weights = merged(bounds), merged(weights)
         out, spread = draw(merged(seed), bounds, weights, merged(x))
         return (apart(out), apart(spread)), (True, True)
@@ -239,8 +255,8 @@ def batched(run: Callable[..., Drawn]) -> Callable[..., Drawn]:
 def on_gpu(sizes: Sizes) -> Callable[..., Drawn]:
     def run(seed: jax.Array, bounds: jax.Array, weights: jax.Array, x: jax.Array) -> Drawn:
         shape = x.shape[:3]
-        into = {"out": (*shape, bounds.shape[-1]), "spread": shape}
-        out, spread = launcher(sizes)(seed, bounds, weights, x, output_dims=into)
+        shapes = {"out": (*shape, bounds.shape[-1]), "spread": shape}
+        out, spread = launcher(sizes)(seed, bounds, weights, x, output_dims=shapes)
         return out, spread
 
     return batched(run)
@@ -261,7 +277,7 @@ def draw(
         low, high: bounds of the log variances, float [M, K].
         x: inputs, standardised, float [M, ..., I].
     """
-    sizes, outputs = sizes_of(weights), low.shape[1]
+    sizes, outputs = sizes_of(*widths(weights)), low.shape[1]
     entries = with_one(x).reshape(1, len(x), -1, 16 * sizes.inputs)
     networks = tiles(with_biases(weights, biases))
     seed = jax.random.bits(key, (1, 2), jnp.uint32)

@@ -95,10 +95,11 @@ def draw(
     """One draw from each model at its own inputs `x` [M, ..., I], and the length of the vector of
     standard deviations there: [M, ..., K] and [M, ...].
 
-    In bfloat16 a Hopper GPU does it in one kernel, with random numbers of its own (`drawn`).
+    In bfloat16 a Hopper GPU does it in one kernel, with other random numbers for the same key
+    (`drawn`).
     """
     weights, biases = ([getattr(x, name) for x in ensemble.layers] for name in ("weight", "bias"))
-    if hidden_dtype == "bfloat16" and drawn.serves(weights):
+    if hidden_dtype == "bfloat16" and drawn.serves(*drawn.widths(weights)):
         x = (x - scale.mean) / scale.std
         return drawn.draw(weights, biases, ensemble.low, ensemble.high, x, key)
     dist = outputs_of(ensemble, scale, x, hidden_dtype)

@@ -151,8 +151,8 @@ def trade_off(
 
     A point is the mean over seeds with its 95 % interval, each limit a dashed line: grey, or in the
     colour of the one setting it belongs to. The grey steps are the Pareto front of the means. A hollow
-    diamond is the mean that was published, by environment and name. The frame holds all seeds and
-    means. Intervals may reach beyond it.
+    diamond is the mean that was published, by environment and name. The frame holds all
+    seeds, means and limits. Intervals may reach beyond it.
     """
     places = sorted({(row.env, name) for row in rows for name in row.limits or [""]})
     figure, panels = grid(len(places), size=(4.6, 4))
@@ -267,7 +267,7 @@ def stretches(table: Mapping[str, np.ndarray], name: str, edges: np.ndarray) -> 
     """The mean of a metric of each seed over each stretch of steps (edges[i], edges[i + 1]], [S, T].
 
     A stretch without value has the one before it, NaN before the first and after the last row of the
-    seed. Cost rates are averaged from the first, so that the last one is that of all training.
+    seed. A cost rate is the mean of all rates so far.
     """
     seeds = np.unique(table["seed"])
     found = np.full((len(seeds), len(edges) - 1), np.nan)
@@ -385,7 +385,7 @@ def legend(figure: Figure, panels: Iterable[Axes], names: Iterable[str] = ()) ->
             figure.set_figwidth(max(figure.get_figwidth(), longest / 10))  # ten letters take an inch
             fitting = max(1, int(figure.get_figwidth() * 10 / longest))
             rows = -(-len(entries) // fitting)
-            figure.set_figheight(figure.get_figheight() + 0.3 + 0.22 * rows)  # inches of a row
+            figure.set_figheight(figure.get_figheight() + 0.3 + 0.22 * rows)  # inches: a margin, rows
             place |= {"loc": "outside lower center", "ncols": fitting}
         figure.legend(entries.values(), entries.keys(), **place)
 
