@@ -248,6 +248,8 @@ ROWS = {
         "Dreamer with an augmented Lagrangian on the cost of its dreams",
         {"ambs": AMBS, "safe_dreamer": SAFE_DREAMER, "cpu": CPU},
         total_steps=1_000_000,
-        lever=LEVER | {"mu_least": 0.05},  # with 1 the multiplier overshoots, and costs stay near 1.4
+        # with a mu of 1 the multiplier overshoots, and costs stay near 1.4; with reinforce one of two
+        # seeds earns 9.8 of 14.4 after 160 updates, with backprop both earn 13.8
+        lever=LEVER | {"mu_least": 0.05, "actor_grad": "backprop"},
     ),
 }

@@ -181,6 +181,8 @@ def restore(
         arrays |= empty
         known = {name: (str(x.dtype), x.shape) for name, x in empty.items()}
         manifest = manifest._replace(leaves=manifest.leaves | known, since=manifest.at.iteration)
+    arrays = joined_alike({name: arrays[name] for name in manifest.leaves}, expected)
+    manifest = manifest._replace(leaves={k: (str(x.dtype), x.shape) for k, x in arrays.items()})
     for name in sorted({*expected, *manifest.leaves}):
         want = (str(expected[name].dtype), tuple(expected[name].shape)) if name in expected else None
         if (have := manifest.leaves.get(name)) != want:
@@ -189,6 +191,29 @@ def restore(
                 f"not {leaf_in_words(want)}"
             )
     return from_arrays(like, arrays), manifest
+
+
+def joined_alike(arrays: Mapping[str, Any], expected: Mapping[str, Any]) -> dict[str, Any]:
+    """`arrays`, where what `expected` has as one array is joined, and what it has apart is split: Adam
+    keeps a network's moments as one array on a GPU alone. Both are in the order of the train state."""
+
+    def parts_of(whole: str, among: Mapping[str, Any]) -> list[str]:
+        return [name for name in among if name.startswith(f"{whole}.")]
+
+    made = dict(arrays)
+    for whole in arrays.keys() - expected.keys():
+        parts, lead = parts_of(whole, expected), arrays[whole].shape[:-1]
+        shapes = [expected[x].shape for x in parts]
+        sizes = [math.prod(shape[len(lead) :]) for shape in shapes]
+        if parts and arrays[whole].shape[-1] == sum(sizes):
+            split = np.split(made.pop(whole), np.cumsum(sizes)[:-1], axis=-1)
+            for name, x, shape in zip(parts, split, shapes, strict=True):
+                made[name] = x.reshape(shape)
+    for whole in expected.keys() - arrays.keys():
+        parts, lead = parts_of(whole, arrays), expected[whole].shape[:-1]
+        if parts:
+            made[whole] = np.concatenate([made.pop(x).reshape(*lead, -1) for x in parts], -1)
+    return made
 
 
 def load(

@@ -2,6 +2,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 
 from jaxsafe.run import checkpoint
 from jaxsafe.run.checkpoint import CheckpointError, Progress, checkpoints, restore, save
@@ -49,6 +50,20 @@ def test_the_last_two_checkpoints_stay(tmp_path):
     for i in range(4):
         save(tmp_path, state(), at(i))
     assert [p.name for p in checkpoints(tmp_path)] == ["00000003", "00000002"]
+
+
+def test_moments_that_are_one_array_on_a_gpu_go_on_apart_on_a_cpu_and_back(tmp_path):
+    """Of two seeds each, of a network whose layers are not in the order of their names."""
+    layers = [{"kernel": jnp.arange(12.0).reshape(2, 3, 2), "bias": jnp.array([[1.0], [2.0]])}] * 11
+    apart = {"opt_state": {"mu": layers, "count": jnp.zeros(2)}}
+    joined = {"opt_state": apart["opt_state"] | {"mu": jax.vmap(lambda x: ravel_pytree(x)[0])(layers)}}
+    for there, here in ((joined, apart), (apart, joined)):
+        save(tmp_path, there, at(1))
+        assert_same(restore(tmp_path, jax.eval_shape(lambda x: x, here))[0], here)
+    shorter = {"opt_state": apart["opt_state"] | {"mu": layers[:10]}}
+    with pytest.raises(CheckpointError, match=r"another train state: opt_state.mu"):
+        save(tmp_path, joined, at(2))
+        restore(tmp_path, shorter)
 
 
 @pytest.mark.parametrize("damage", ["byte", "truncated", "missing", "manifest"])
