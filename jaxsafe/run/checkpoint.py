@@ -197,22 +197,24 @@ def joined_alike(arrays: Mapping[str, Any], expected: Mapping[str, Any]) -> dict
     """`arrays`, where what `expected` has as one array is joined, and what it has apart is split: Adam
     keeps a network's moments as one array on a GPU alone. Both are in the order of the train state."""
 
-    def parts_of(whole: str, among: Mapping[str, Any]) -> list[str]:
-        return [name for name in among if name.startswith(f"{whole}.")]
-
     made = dict(arrays)
+
+    def parts_of(whole: str, its: tuple[int, ...], among: Mapping[str, Any]) -> dict[str, int]:
+        """The arrays that `whole`, of shape `its`, is made of, with their sizes; none if they misfit."""
+        lead, last = its[:-1], its[-1:]
+        parts = {k: x.shape for k, x in among.items() if k.startswith(f"{whole}.")}
+        sizes = {k: math.prod(shape[len(lead) :]) for k, shape in parts.items()}
+        alike = all(shape[: len(lead)] == lead for shape in parts.values())
+        return sizes if alike and last == (sum(sizes.values()),) else {}
+
     for whole in arrays.keys() - expected.keys():
-        parts, lead = parts_of(whole, expected), arrays[whole].shape[:-1]
-        shapes = [expected[x].shape for x in parts]
-        sizes = [math.prod(shape[len(lead) :]) for shape in shapes]
-        if parts and arrays[whole].shape[-1] == sum(sizes):
-            split = np.split(made.pop(whole), np.cumsum(sizes)[:-1], axis=-1)
-            for name, x, shape in zip(parts, split, shapes, strict=True):
-                made[name] = x.reshape(shape)
+        if sizes := parts_of(whole, arrays[whole].shape, expected):
+            split = np.split(made.pop(whole), np.cumsum(list(sizes.values()))[:-1], axis=-1)
+            made |= {k: x.reshape(expected[k].shape) for k, x in zip(sizes, split, strict=True)}
     for whole in expected.keys() - arrays.keys():
-        parts, lead = parts_of(whole, arrays), expected[whole].shape[:-1]
-        if parts:
-            made[whole] = np.concatenate([made.pop(x).reshape(*lead, -1) for x in parts], -1)
+        shape = tuple(expected[whole].shape)
+        if sizes := parts_of(whole, shape, arrays):
+            made[whole] = np.concatenate([made.pop(k).reshape(*shape[:-1], -1) for k in sizes], -1)
     return made
 
 

@@ -61,9 +61,13 @@ def test_moments_that_are_one_array_on_a_gpu_go_on_apart_on_a_cpu_and_back(tmp_p
         save(tmp_path, there, at(1))
         assert_same(restore(tmp_path, jax.eval_shape(lambda x: x, here))[0], here)
     shorter = {"opt_state": apart["opt_state"] | {"mu": layers[:10]}}
-    with pytest.raises(CheckpointError, match=r"another train state: opt_state.mu"):
-        save(tmp_path, joined, at(2))
-        restore(tmp_path, shorter)
+    number = {"opt_state": apart["opt_state"] | {"mu": jnp.float32(1)}}
+    for i, (there, here) in enumerate(
+        [(joined, shorter), (shorter, joined), (number, apart), (apart, number)]
+    ):
+        save(tmp_path, there, at(i + 2))
+        with pytest.raises(CheckpointError, match=r"another train state: opt_state.mu"):
+            restore(tmp_path, here)
 
 
 @pytest.mark.parametrize("damage", ["byte", "truncated", "missing", "manifest"])
