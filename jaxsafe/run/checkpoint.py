@@ -200,7 +200,7 @@ def joined_alike(arrays: Mapping[str, Any], expected: Mapping[str, Any]) -> dict
     made = dict(arrays)
 
     def parts_of(whole: str, its: tuple[int, ...], among: Mapping[str, Any]) -> dict[str, int]:
-        """The arrays that `whole`, of shape `its`, is made of, with their sizes; none if they misfit."""
+        """Names and sizes of the arrays that make up `whole`, of shape `its`; none if they misfit."""
         lead, last = its[:-1], its[-1:]
         parts = {k: x.shape for k, x in among.items() if k.startswith(f"{whole}.")}
         sizes = {k: math.prod(shape[len(lead) :]) for k, shape in parts.items()}
