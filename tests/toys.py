@@ -26,8 +26,10 @@ def updated(algo: Algorithm) -> Callable:
 
 def momentum(nets: Trainable, name: str) -> PyTree:
     """Adam's first moment of a network, as a tree like its parameters."""
-    as_tree = ravel_pytree(nets.params[name])[1]
-    return as_tree(optax.tree_utils.tree_get(nets.opt_state[name], "mu"))
+    params, moment = nets.params[name], optax.tree_utils.tree_get(nets.opt_state[name], "mu")
+    if jax.default_backend() == "cpu":
+        return moment
+    return ravel_pytree(params)[1](moment)  # elsewhere `steps.adam` sees the parameters as one array
 
 
 def context(
