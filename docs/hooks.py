@@ -26,7 +26,7 @@ SECTIONS: list[tuple[str, list[str]]] = [
     ("Environments", ["environments/"]),
     ("Algorithms", ["algorithms/"]),
     ("Derivations", ["theory/"]),
-    ("Results", ["results/", "benchmark.md", "performance.md", "fidelity.md"]),
+    ("Results", ["results/", "benchmark.md", "performance.md", "other_libraries.md", "fidelity.md"]),
     ("Reference", ["reference/", "developing.md"]),
 ]
 LINK = re.compile(r"(\]\(|src=\")([^)\"\s]+)")

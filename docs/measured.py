@@ -94,7 +94,8 @@ def held(training: Sequence[Group], final: Sequence[Group]) -> str:
         return f"{ours} of {len(pairs)} cells, OmniSafe's in {theirs}"
 
     return (
-        f"A cost of at most 30 is a fifth over the limit. Our evaluated policies keep to it in "
+        f"A cost of at most 30 is a fifth over the limit. A cell is an algorithm with a limit on one "
+        f"task. Of the cells that OmniSafe published, our evaluated policies keep to such a cost in "
         f"{count(known)}. At the end of training ours do in {count(trained)}."
     )
 

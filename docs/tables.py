@@ -12,6 +12,7 @@ from jaxsafe.interop import migrate
 from jaxsafe.interop.migrate.on_policy import ON_POLICY
 from jaxsafe.learn.conventions import Convention, conventions
 from jaxsafe.report.tables import between_marks
+from jaxsafe.run.settings import presets
 
 HERE = Path(__file__).parent
 ROBOTS = ("point", "car", "doggo")
@@ -93,7 +94,45 @@ def omnisafe_keys() -> str:
     return "\n".join(lines)
 
 
+PRESETS = {  # all but `fast`, which has no settings of its own
+    "published": "the first of the published settings below",
+    "omnisafe": "OmniSafe's settings",
+    "omnisafe_navigation": "OmniSafe's settings of Goal and Button",
+    "omnisafe_velocity": "OmniSafe's settings of velocity tasks",
+    "frequent": "longer rollouts or more gradient steps: Walker2d, Swimmer, Humanoid",
+    "parallel": "OmniSafe's replay ratio, on a GPU",
+    "parallel_navigation": "the same with a slower price",
+    "true_model": "plans in the simulator, not in learned models",
+    "cpu": "for two cores and half an hour",
+    "proprio": "DreamerV3's settings of vectors",
+    "ambs": "AMBS's settings of vectors, with `env.wrap.action_repeat=2`",
+    "plpg": "AMBS's settings of vectors, and its penalty PLPG",
+    "penl": "the same with PENL",
+    "copt": "the same with COPT",
+    "pixels": "AMBS's settings of pictures",
+    "true_dynamics": "a shield that looks ahead in the simulator",
+    "safe_dreamer": "SafeDreamer's settings of vectors, with `env.wrap.action_repeat=4`",
+    "paper": "the authors' settings",
+}
+FEW = 6  # names fit into a cell; more are told by their family
+
+
+def preset_table() -> str:
+    """Every preset but the default, what it is for, and which algorithms have it."""
+    having = {name: [a for a, row in algos.ALGOS.items() if name in presets(row)] for name in PRESETS}
+    known = {name for row in algos.ALGOS.values() for name in presets(row)}
+    assert known == {"fast", *PRESETS}, known ^ {"fast", *PRESETS}
+    lines = ["| preset | what it has | algorithms |", "|---|---|---|"]
+    for name, what in PRESETS.items():
+        which = ", ".join(f"`{a}`" for a in having[name])
+        lines.append(
+            f"| `{name}` | {what} | {which if len(having[name]) <= FEW else len(having[name])} |"
+        )
+    return "\n".join(lines)
+
+
 TABLES = {
+    HERE / "choosing.md": {"presets": preset_table},
     HERE / "howto" / "migrate.md": {
         "omnisafe algorithms": omnisafe_algorithms,
         "omnisafe conventions": omnisafe_conventions,

@@ -16,10 +16,11 @@ from jaxsafe.run.devices import use_compilation_cache
 use_compilation_cache()
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
-# Whoever starts the tests in the background may have them ignore Ctrl-C, and with them the programs
-# that they start and interrupt.
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+# In the background the tests are told to ignore these. The programs that they start would inherit
+# that, but not a handler.
+for number in (signal.SIGINT, signal.SIGHUP):
+    if signal.getsignal(number) is signal.SIG_IGN:
+        signal.signal(number, lambda *_: None)
 
 MAPS = Path("/proc/self/maps")
 MOST_MAPS = 40_000  # Linux lets a process have 65,530

@@ -79,7 +79,7 @@ class TrainConfig:
     coordinator: str | None = None
     num_processes: Devices | None = None  # how many processes there are
     process_index: Period | None = None  # which of them this is, from 0
-    preset: str = "fast"  # the algorithm's defaults: fast, published, or another of its presets
+    preset: str = "fast"  # the algorithm's defaults: fast, published, or another of docs/choosing.md
     compat: str = "none"  # whose departures from the papers to follow: none, or omnisafe
     run_dir: str | None = None  # the run folder; null: runs/ENV-ALGO/TIME-seedN
     # true: go on in run_dir or, without it, with the newest unfinished run of these settings; or the

@@ -127,8 +127,10 @@ ON_POLICY: dict[str, Rule] = {
     "control_cfgs.ki": Rule("algo.simmer_ki"),
     "control_cfgs.kd": Rule("algo.simmer_kaw", "it acts against wind-up"),
     "control_cfgs.polyak": Rule("algo.simmer_smoothing"),
-    "logger_cfgs.use_wandb": always(False, note="metrics.csv and TensorBoard files"),
-    "logger_cfgs.wandb_project": ignored("metrics.csv and TensorBoard files"),
+    "logger_cfgs.use_wandb": computed(
+        "logger", lambda on, facts: {"logger": "wandb"} if on else {}, "true is wandb"
+    ),
+    "logger_cfgs.wandb_project": ignored("the project is jaxsafe"),
     "logger_cfgs.use_tensorboard": always(True, note="always written"),
     "logger_cfgs.save_model_freq": ignored("a run is saved each minute, whole, for resume"),
     "logger_cfgs.log_dir": ignored("run_dir names a run's folder; default runs/ENV-ALGO/"),
