@@ -104,7 +104,8 @@ Adam's, such as `ppo_lag` and `focops`. They go best with `reward_normalize` and
 
 The pages of model-free algorithms use the same letters, unless one says otherwise. The code has the
 same names. An iteration of an on-policy algorithm collects a batch with the policy
-pi_old and then improves it. Off-policy algorithms have values of actions, Q_r and Q_c, where on-policy ones have advantages.
+pi_old and then improves it. Off-policy algorithms have values of actions, Q_r and Q_c, where
+on-policy ones have advantages.
 
 | letter | what it is | setting or metric |
 |---|---|---|
