@@ -55,9 +55,10 @@ class AMBSConfig(dreamer.DreamerConfig):
         none    w = 1, and no A_pen
 
     A_pen is the advantage of -c under pi, scaled as Dreamer's. A violation i steps ahead costs
-    discount^(i-1) C, so R tells whether there is one within T steps. The dreams have only H steps. V_i
-    stand for the rest. The shield acts in training, evaluation and films. What is dreamed begins with
-    actions of pi that are drawn anew, unless `verify_action` has the proposed one dreamed first.
+    discount^(i-1) C, so R tells whether there is one within T steps. The shield's dreams have only
+    H = `shield_steps` steps. V_i stand for the rest. The shield acts in training, evaluation and films.
+    What is dreamed begins with actions of pi that are drawn anew, unless `verify_action` has the
+    proposed one dreamed first.
 
     With `shield=true_dynamics` the simulator takes the place of the dreams: pi goes on for T steps in m
     copies of it. They foresee its random numbers, too, and only the actions differ. It shows what a
@@ -66,10 +67,12 @@ class AMBSConfig(dreamer.DreamerConfig):
     With `verdict=drawn` a dream has T steps and no V_i. Each of its states has a violation as likely as
     the model says, and one is enough.
 
-    What the shield guarantees: where it lets pi act, pi has a violation within T steps with a
-    probability below delta. This is wrong with a probability of `confidence` at most. It needs an exact
-    model, known C and V_i, and m of at least ln(1 / confidence) / (2 eps^2). But model and critics are
-    learned, and the bound says nothing of the safe policy.
+    What the shield guarantees with `verdict=drawn` or in the simulator: where it lets pi act, pi has a
+    violation within T steps with a probability below delta. This is wrong with a probability of
+    `confidence` at most. It needs an exact model and m of at least ln(1 / confidence) / (2 eps^2). But
+    the model is learned, and the bound says nothing of the safe policy. With `verdict=summed` it also
+    needs dreams that end in a violation or in none, for which V_i is C or 0. A mean in between makes R
+    no longer tell the two apart: then nothing is guaranteed.
 
     Source: Goodall and Belardinelli (2023), "Approximate Model-Based Shielding for Safe Reinforcement
     Learning", arXiv:2308.00707, and (2024), "Leveraging Approximate Model-based Shielding for
@@ -79,6 +82,12 @@ class AMBSConfig(dreamer.DreamerConfig):
     has the authors'). An end of the episode also ends the costs that V_i foresee. Time limits are no
     ends (`limit_ends=true` has them). Mean actions are shielded, too.
     """
+
+    # The discount of costs in evaluations alone. V_i and the shield have `discount`.
+    cost_discount: Share = 0.997
+    # The weight of the critic's loss on replayed rewards. They are partly those of the safe policy, so
+    # it is 0, as in AMBS's code.
+    replay_value: Weight = 0.0
 
     # The undiscounted cost that an episode may have. It is only drawn in plots.
     cost_limit: Weight = 0.0
@@ -95,6 +104,9 @@ class AMBSConfig(dreamer.DreamerConfig):
     rule: Literal["hoeffding", "binomial"] = "hoeffding"
     shield_rollouts: Amount = 512  # m, dreams of the shield at each step, as in the paper.
     shield_horizon: Iterations = 30  # T, steps within which a violation counts, as in the paper.
+    shield_steps: Iterations = (
+        15  # H, steps of the shield's dreams with verdict=summed, as in the paper.
+    )
     # Delta, the probability of a violation that is still let through, as in the paper.
     delta: Share = 0.1
     # The error of the estimate that `hoeffding` allows for, as in the paper.
@@ -270,7 +282,7 @@ def dreamt(env: Env, learned: Learned, latent: Latent, proposed: jax.Array, key:
     proposed: float [A], with which they begin where `verify_action` is set.
     """
     cfg, params = learned.config, learned.params
-    steps = cfg.shield_horizon if cfg.verdict == "drawn" else cfg.imagine_steps
+    steps = cfg.shield_horizon if cfg.verdict == "drawn" else cfg.shield_steps
     world = world_of(env, shielded_behaviour.all_heads, cfg)
     rollouts = (cfg.shield_rollouts,)
     start = jax.tree.map(lambda x: jnp.broadcast_to(x, (*rollouts, *x.shape)), latent)
@@ -414,18 +426,46 @@ def required_rollouts(
     return math.ceil(math.log((1 if one_sided else 2) / confidence) / (2 * (share * eps) ** 2))
 
 
+def overruled_from(cfg: Any) -> int | None:
+    """The least number of unsafe dreams where the shield acts; None if it never does."""
+    m = cfg.shield_rollouts
+    decides = np.asarray(overrules(jnp.arange(m + 1) / m, cfg))
+    return int(decides.argmax()) if decides.any() else None
+
+
+def check(cfg: Any, data: Any = None) -> None:
+    """Raise ConfigError for a shield that would always act, or never."""
+    if cfg.shield == "dreams" and cfg.verdict == "summed" and cfg.discount == 1:
+        raise ConfigError(
+            "discount=1: expected less, as verdict=summed tells steps within shield_horizon by it"
+        )
+    delta, confidence = float(cfg.delta), float(cfg.confidence)
+    if (least := overruled_from(cfg)) is None:
+        raise ConfigError(f"confidence={confidence:g}: expected less, or the shield never acts")
+    if least == 0 and cfg.rule == "hoeffding":
+        least_delta = f"expected at least eps={float(cfg.eps):g}"
+        raise ConfigError(f"delta={delta:g}: {least_delta}, or the shield always acts")
+    if least == 0:
+        raise ConfigError(
+            f"shield_rollouts={cfg.shield_rollouts}: expected more, or the shield always acts with "
+            f"delta={delta:g} and confidence={confidence:g}"
+        )
+
+
 def note(cfg: Any) -> str:
     """What the shield guarantees with these settings, in one line."""
     m, eps, confidence = cfg.shield_rollouts, float(cfg.eps), float(cfg.confidence)
-    counts = np.arange(m + 1)
-    decides = np.asarray(overrules(jnp.asarray(counts / m, jnp.float32), cfg))
     what = "dreams" if cfg.shield == "dreams" else "copies of the simulator"
-    least = int(counts[decides][0])
-    half = (least - 1 / 3) / (m + 1 / 3) if least else 0.0  # the median of Beta(least, m - least + 1)
+    least = overruled_from(cfg) or 1  # `check` refuses others
+    half = (least - 1 / 3) / (m + 1 / 3)  # the median of Beta(least, m - least + 1)
     line = f"shield: overrules from {least} of {m} {what} with a violation"
     line += f" within {cfg.shield_horizon} steps, half the time where that has P = {half:.2g}"
     goal = f"P < {float(cfg.delta):g} with confidence {1 - confidence:g}"
-    unknown = "; how wrong the learned model is, nobody knows" if cfg.shield == "dreams" else ""
+    unknown = ""
+    if cfg.shield == "dreams":
+        unknown = "; how wrong the learned model is, nobody knows"
+        if cfg.verdict == "summed":
+            unknown += "; and verdict=summed takes means for violations, for which none of this holds"
     if cfg.rule == "binomial":
         return f"{line}: {goal}, if the model is exact{unknown}"
     exact = required_rollouts(eps, confidence, one_sided=True)
@@ -543,7 +583,8 @@ TRUE: dict[str, Any] = {"shield": "true_dynamics", "rule": "binomial", "shield_r
 CPU: dict[str, Any] = dreamer.CPU | {"rule": "binomial", "shield_rollouts": 64}
 # for a problem of a ledge, some steps away
 LEDGE: dict[str, Any] = dreamer.LEVER | {
-    "discount": 0.9, "imagine_steps": 6, "shield_rollouts": 32, "shield_horizon": 4, "eps": 0.05,
+    "discount": 0.9, "imagine_steps": 6, "shield_rollouts": 32, "shield_steps": 6, "shield_horizon": 4,
+    "eps": 0.05,
 }  # fmt: skip
 
 ROWS = {
@@ -555,6 +596,7 @@ ROWS = {
         | {"pixels": PIXELS, "cpu": CPU, "true_dynamics": TRUE},
         total_steps=1_000_000,
         holds="nothing",
+        check=check,
         note=note,
         examine=examine,
     ),

@@ -183,7 +183,7 @@ def learner(env: Env) -> Learner:
     return Learner(init=init, act=act, step=step)
 
 
-def check(cfg: Any, data: DataSet) -> None:
+def check(cfg: Any, data: DataSet | None) -> None:
     need_episodes(data, "coptidice learns from the first observations of episodes")
 
 

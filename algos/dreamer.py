@@ -74,6 +74,8 @@ class DreamerLagConfig(DreamerConfig):
     `mu_least=0` is the paper's.
     """
 
+    # The discount of costs.
+    cost_discount: Annotated[float, Bounds(0, 0.9999)] = 0.997
     # The undiscounted cost that an episode may have. In 1,000 steps it is d = 1, as in AMBS's code.
     cost_limit: Weight = 3.0
     lam_init: Weight = 0.01  # The multiplier at first, as in AMBS's code.
@@ -148,7 +150,7 @@ class Augmented(NamedTuple):
 
 def discounted_limit(env: Env, cfg: Any) -> jax.Array:
     """d, the discounted cost of a steady stream of `cost_limit` an episode, float []."""
-    return cfg.cost_limit / (env.episode_length * jnp.maximum(1 - cfg.cost_discount, 1e-6))
+    return cfg.cost_limit / (env.episode_length * (1 - cfg.cost_discount))
 
 
 def learn_cost(
@@ -212,8 +214,8 @@ AMBS: dict[str, Any] = PAPER | {
     "learning_starts": 1024, "model_lr": 1e-4, "lr": 3e-5, "critic_lr": 3e-5, "dyn_scale": 0.5,
     "replay_value": 0.0, "limit_ends": True, "actor_grad": "backprop", "size": "12m",
 }  # fmt: skip
-# PKU-Alignment/SafeDreamer @529221f: on vectors, for env.wrap.action_repeat=4; the size is the nearest
-# to its own
+# PKU-Alignment/SafeDreamer @529221f: on vectors, for env.wrap.action_repeat=4, and 5 for osrp; the
+# size is the nearest to its own
 VECTORS: dict[str, Any] = PAPER | {
     "num_envs": 8, "horizon": 128, "learn_every": 2, "stagger": False, "replay_ratio": 512,
     "learning_starts": 1024, "model_lr": 1e-4, "lr": 3e-5, "critic_lr": 3e-5, "dyn_scale": 0.5,
@@ -246,7 +248,8 @@ ROWS = {
         DreamerLagConfig,
         partial(make, behaviour=priced),
         "Dreamer with an augmented Lagrangian on the cost of its dreams",
-        {"ambs": AMBS, "safe_dreamer": SAFE_DREAMER, "cpu": CPU},
+        # d = 1 in the 500 steps of an episode
+        {"ambs": AMBS | {"cost_limit": 1.5}, "safe_dreamer": SAFE_DREAMER, "cpu": CPU},
         total_steps=1_000_000,
         # with a mu of 1 the multiplier overshoots, and costs stay near 1.4; with reinforce one of two
         # seeds earns 9.8 of 14.4 after 160 updates, with backprop both earn 13.8

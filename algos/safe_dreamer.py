@@ -46,11 +46,16 @@ class OSRPConfig(PlanConfig, dreamer.DreamerConfig):
     Differs from it: the model and the actor are those of Dreamer's later version. The authors weigh the
     loss of cost's head by 10 on steps that cost; here its weight is 1. They scale C by 1000 / H even
     where actions are repeated; here T counts the policy's steps. C = cost_limit is allowed here, not
-    there. The actor proposes no plans, as in the authors' settings; the paper mixes some in.
+    there. The actor proposes no plans, as in the authors' settings; the paper mixes some in. On vectors
+    the authors observe positions in place of lidars, weigh the loss of vectors by 5, and compute costs
+    from decoded positions.
     """
 
     # The undiscounted cost that an episode may have, as in the authors' code.
     cost_limit: Weight = 2.0
+    # The weight of the critic's loss on replayed rewards. They are those of the planner, so it is 0, as
+    # in the authors' code.
+    replay_value: Weight = 0.0
     plan_steps: Iterations = 15  # H, steps that are planned ahead, as in the paper.
     cem_iterations: Iterations = 6  # Times that the plans are improved, as in the paper.
     plans: Amount = 500  # S, plans that are tried each time, as in the paper.

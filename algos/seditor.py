@@ -335,7 +335,9 @@ def seditor_learner(env: Env) -> Learner:
         next_q, next_c = with_reduced_cost(targets, rows.obs, found.action, names, cfg)
 
         def returns(earned: jax.Array, value: jax.Array, discount: jax.Array) -> jax.Array:
-            return lambda_returns(batch, earned, value, discount=discount, decay=cfg.td_lambda)
+            return lambda_returns(
+                batch, earned, value, rows.terminated, discount=discount, decay=cfg.td_lambda
+            )
 
         y_r = returns(reward, smallest(next_q), cfg.discount)
         y_c = each(partial(returns, discount=cfg.cost_discount), names)(cost, next_c)

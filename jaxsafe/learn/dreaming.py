@@ -168,7 +168,8 @@ class Scene(NamedTuple):
         """
         later = fixed(returns[0].reshape(reward.shape))
         discounts = {"discount": discount, "decay": self.cfg.td_lambda}
-        of_rows = lambda_returns(self.batch, reward, later, **discounts)
+        ended = goes_on(self.batch.rows, self.cfg) == 0
+        of_rows = lambda_returns(self.batch, reward, later, ended, **discounts)
         on_rows = self.over_rows(self._loss(trained, name, self.latents.features[:-1], of_rows))
         return self.critic_loss(trained, name, dreams, returns) + self.cfg.replay_value * on_rows
 
@@ -277,6 +278,8 @@ def dreaming_learner(env: Env, behaviour: Behaviour, policy: Policy | None = Non
                 f"batch_size={cfg.batch_size}: expected a multiple of n_step + 1 = {cfg.n_step + 1}, "
                 "the rows of a sequence"
             )
+        if cfg.obs_bins == 1:
+            raise ConfigError("obs_bins=1: expected 2 or more, or 0 for none")
         size = SIZES[cfg.size]
         obs, action = blank(observation_like(env)), jnp.zeros(action_size)
         features = jnp.zeros(size.deter + size.latents * size.classes)

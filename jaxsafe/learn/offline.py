@@ -420,12 +420,17 @@ def check_costs(names: Names, data: DataSet) -> None:
             raise ConfigError(f"cost_limits: the data set has no cost {name!r}{hint}")
 
 
-def need_episodes(data: DataSet, why: str) -> Episodes:
+NO_DATA = "an offline algorithm learns from a data set: give dataset=PATH"
+
+
+def need_episodes(data: DataSet | None, why: str) -> Episodes:
     """The episodes of the data set.
 
     Raises:
-        ConfigError: they are not known. `why` says what they are needed for.
+        ConfigError: they are not known, or there is no data set. `why` says what they are needed for.
     """
+    if data is None:
+        raise ConfigError(NO_DATA)
     if not data.episodes:
         raise ConfigError(f"{why}: the data set has no timeouts, which say where episodes end")
     return data.episodes
@@ -439,7 +444,7 @@ def data_of(shared: Shared, env: Env) -> DataSet:
     """
     data = shared.data
     if not isinstance(data, DataSet):
-        raise ConfigError("an offline algorithm learns from a data set: give dataset=PATH")
+        raise ConfigError(NO_DATA)
     for name, x, size in (
         ("observations", vector_of(data.obs), env.obs_size),
         ("next_observations", vector_of(data.next_obs), env.obs_size),

@@ -28,7 +28,8 @@ class Row(NamedTuple):
     note: note(cfg), a line to print before training: what its settings promise; '' for nothing.
     examine: examine(algo, learned, episodes, seed), what else evaluation measures: name -> float
         [S, N], of N fresh episodes of each of the S policies in `learned`.
-    check: check(cfg, data) raises ConfigError for a data set that cannot serve these settings.
+    check: check(cfg, data) raises ConfigError for settings, or a data set, that cannot serve. `data` is
+        None where there is none.
     """
 
     config: type[Any]

@@ -55,6 +55,7 @@ def lambda_returns(
     batch: SequenceBatch,
     reward: jax.Array,
     value: jax.Array,
+    ended: jax.Array,
     *,
     discount: jax.Array | float,
     decay: jax.Array | float,
@@ -64,11 +65,12 @@ def lambda_returns(
         G_t = r_{t+1} + discount ((1 - decay) V_{t+1} + decay G_{t+1})
 
     where G_{t+1} is V_{t+1} if row t + 1 is the last of its episode or of the sequence, and both are 0
-    if it terminated. What stands where `follows` does not hold means nothing.
+    if it ended for good. What stands where `follows` does not hold means nothing.
 
     Args:
         reward, value: float [T, B], of each row; `value` is that of its observation.
+        ended: bool [T, B], whether nothing is to come after a row.
     """
     ends = jnp.concatenate([~batch.follows[1:], jnp.ones_like(batch.follows[:1])])
-    steps = ValuedSteps(reward[1:], value[:-1], value[1:], batch.rows.terminated[1:], ends)
+    steps = ValuedSteps(reward[1:], value[:-1], value[1:], ended[1:], ends)
     return value[:-1] + gae(steps, discount, decay)

@@ -48,7 +48,7 @@ class WorldModelConfig(EncoderConfig, RoundConfig):
     learning_starts: Amount = 5_000
     # The discount of rewards: 1 - 1/333, as in the paper.
     discount: Share = 0.997
-    cost_discount: Share = 0.997  # The discount of costs.
+    cost_discount: Share = 0.997  # The discount of costs where one is limited, and in evaluations.
     # The networks' size: about the number of parameters, if pictures are observed. The paper's is 200m.
     size: Literal["tiny", "300k", "1m", "12m", "25m", "50m", "100m", "200m"] = "300k"
     model_lr: Rate = 1e-3  # The model's learning rate, by LaProp. The authors have 4e-5.
@@ -58,8 +58,8 @@ class WorldModelConfig(EncoderConfig, RoundConfig):
     lr_warmup: Iterations = 500
     # The longest gradient of an array, as a share of the array's own length, as in the authors' code.
     clip: Norm = 0.3
-    # Steps from -1 to 1 between which the model reads each number of a vector, beside its symlog.
-    # 0: none, as in the paper.
+    # Steps from -1 to 1 between which the model reads each number of a vector, beside its symlog, at
+    # least 2. 0: none, as in the paper.
     obs_bins: Annotated[int, Bounds(0, 1000)] = 21
     dyn_scale: Weight = 1.0  # The weight of the prior's loss, as in the paper.
     rep_scale: Weight = 0.1  # The weight of the posterior's loss, as in the paper.

@@ -43,6 +43,8 @@ def test_one_side_takes_fewer_dreams_and_a_learned_model_four_times_as_many():
     assert "from 6 of 512 dreams" in line and "half the time where that has P = 0.011" in line
     assert "285 with an exact model (512 are enough)" in line
     assert "and 1138 with" in line
+    assert "none of this holds" in line
+    assert "none of" not in ambs.note(dataclasses.replace(CFG, verdict="drawn"))
     assert "too few" in ambs.note(dataclasses.replace(CFG, shield_rollouts=200))
 
 
@@ -70,6 +72,33 @@ def test_a_chain_that_is_a_little_off_is_at_most_as_much_off_as_the_bound_says()
         near = chain + shares * (other - chain)
         safe = [np.linalg.matrix_power(p[:5, :5], steps).sum(1) for p in (chain, near)]
         assert np.abs(safe[0] - safe[1]).max() <= alpha * steps / 2
+
+
+@pytest.mark.parametrize(
+    "options, told",
+    [({"delta": 0.05}, "delta=0.05: expected at least eps=0.09"),
+     ({"rule": "binomial", "shield_rollouts": 43}, "shield_rollouts=43: expected more"),
+     ({"rule": "binomial", "confidence": 1.0}, "confidence=1: expected less"),
+     ({"discount": 1.0}, "discount=1: expected less")],
+)  # fmt: skip
+def test_a_shield_that_always_or_never_acts_is_refused(options, told):
+    ambs.check(CFG)
+    with pytest.raises(ConfigError, match=told):
+        ambs.check(dataclasses.replace(CFG, **options))
+
+
+@pytest.mark.parametrize("hazard, share, summed", [(0.01, 0.26, False), (0.03, 0.6, True)])
+def test_means_that_are_summed_tell_no_probability_and_drawn_violations_do(hazard, share, summed):
+    """Where each step has a violation with the same probability, R of the means is always the same."""
+    steps, c, discount = CFG.shield_steps, CFG.violation_cost, CFG.discount
+    value = c * hazard / (1 - discount * (1 - hazard))
+    alive = jnp.ones((CFG.shield_horizon, 4096), bool)
+    hit = jax.random.bernoulli(jax.random.key(0), hazard, alive.shape)
+    dreams = ambs.Dreamt(c * hazard * alive, alive, value * jnp.ones(4096), hit)
+    short = ambs.Dreamt(dreams.cost[:steps], alive[:steps], dreams.value, hit[:steps])
+    assert (ambs.unsafe(short, CFG) == summed).all()
+    drawn = ambs.unsafe(dreams, dataclasses.replace(CFG, verdict="drawn"))
+    np.testing.assert_allclose(drawn.mean(), share, atol=0.02)
 
 
 # ---- what a dream counts for -------------------------------------------------------------------
@@ -253,7 +282,7 @@ class Chain:
 def test_on_a_known_chain_it_overrules_where_the_bound_says(monkeypatch, verdict):
     """With eps for the error of 512 dreams: always above delta, and never below delta - 2 eps."""
     chain = Chain()
-    known = {"imagine_steps": 15, "shield_horizon": 15, "delta": 0.8}
+    known = {"shield_steps": 15, "shield_horizon": 15, "delta": 0.8}
     cfg = dataclasses.replace(CFG, verdict=verdict, **known)
     monkeypatch.setattr(ambs, "world_of", lambda *_: chain)
     monkeypatch.setattr(ambs, "chosen", lambda *_: jnp.zeros(2))

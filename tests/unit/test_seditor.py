@@ -261,7 +261,9 @@ def test_lambda_returns_by_hand():
     found = rows([r] * 4, **flags)
     batch = SequenceBatch(jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), found), jnp.full(4, 0.25))
     value = jnp.float32(np.stack([v] * 4, axis=1))
-    returns = lambda_returns(batch, batch.rows.reward, value, discount=0.5, decay=0.25)
+    returns = lambda_returns(
+        batch, batch.rows.reward, value, batch.rows.terminated, discount=0.5, decay=0.25
+    )
     g2 = 4 + 0.5 * 80
     whole = 2 + 0.5 * (0.75 * 40 + 0.25 * g2)
     np.testing.assert_allclose(
@@ -273,7 +275,9 @@ def test_lambda_returns_by_hand():
     np.testing.assert_allclose(returns[jnp.array([0, 2]), 3], [1 + 0.5 * 20, g2], rtol=1e-6)
     follows = np.asarray(batch.follows).T
     np.testing.assert_array_equal(follows, [[1, 1, 1], [1, 1, 0], [1, 1, 0], [1, 0, 1]])
-    one_step = lambda_returns(batch, batch.rows.reward, value, discount=0.5, decay=0.0)
+    one_step = lambda_returns(
+        batch, batch.rows.reward, value, batch.rows.terminated, discount=0.5, decay=0.0
+    )
     np.testing.assert_allclose(one_step[:, 0], r[1:] + 0.5 * v[1:], rtol=1e-6)
 
 
