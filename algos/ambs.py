@@ -71,8 +71,7 @@ class AMBSConfig(dreamer.DreamerConfig):
     violation within T steps with a probability below delta. This is wrong with a probability of
     `confidence` at most. It needs an exact model and m of at least ln(1 / confidence) / (2 eps^2). But
     the model is learned, and the bound says nothing of the safe policy. With `verdict=summed` it also
-    needs dreams that end in a violation or in none, for which V_i is C or 0. A mean in between makes R
-    no longer tell the two apart: then nothing is guaranteed.
+    needs a V_i that is C or 0 at the end of a dream. V_i is a mean, so nothing is guaranteed there.
 
     Source: Goodall and Belardinelli (2023), "Approximate Model-Based Shielding for Safe Reinforcement
     Learning", arXiv:2308.00707, and (2024), "Leveraging Approximate Model-based Shielding for
@@ -104,9 +103,8 @@ class AMBSConfig(dreamer.DreamerConfig):
     rule: Literal["hoeffding", "binomial"] = "hoeffding"
     shield_rollouts: Amount = 512  # m, dreams of the shield at each step, as in the paper.
     shield_horizon: Iterations = 30  # T, steps within which a violation counts, as in the paper.
-    shield_steps: Iterations = (
-        15  # H, steps of the shield's dreams with verdict=summed, as in the paper.
-    )
+    # H, steps of the shield's dreams with verdict=summed, as in the paper.
+    shield_steps: Iterations = 15
     # Delta, the probability of a violation that is still let through, as in the paper.
     delta: Share = 0.1
     # The error of the estimate that `hoeffding` allows for, as in the paper.
@@ -426,37 +424,32 @@ def required_rollouts(
     return math.ceil(math.log((1 if one_sided else 2) / confidence) / (2 * (share * eps) ** 2))
 
 
-def overruled_from(cfg: Any) -> int | None:
-    """The least number of unsafe dreams where the shield acts; None if it never does."""
+def overruled_from(cfg: Any) -> int:
+    """The least number of unsafe dreams where the shield acts; one more than all if it never does."""
     m = cfg.shield_rollouts
     decides = np.asarray(overrules(jnp.arange(m + 1) / m, cfg))
-    return int(decides.argmax()) if decides.any() else None
+    return int(np.append(decides, True).argmax())
 
 
-def check(cfg: Any, data: Any = None) -> None:
+def check(cfg: Any, data: Any = ()) -> None:
     """Raise ConfigError for a shield that would always act, or never."""
     if cfg.shield == "dreams" and cfg.verdict == "summed" and cfg.discount == 1:
         raise ConfigError(
             "discount=1: expected less, as verdict=summed tells steps within shield_horizon by it"
         )
-    delta, confidence = float(cfg.delta), float(cfg.confidence)
-    if (least := overruled_from(cfg)) is None:
+    least, delta, confidence = overruled_from(cfg), float(cfg.delta), float(cfg.confidence)
+    if least > cfg.shield_rollouts:
         raise ConfigError(f"confidence={confidence:g}: expected less, or the shield never acts")
-    if least == 0 and cfg.rule == "hoeffding":
-        least_delta = f"expected at least eps={float(cfg.eps):g}"
-        raise ConfigError(f"delta={delta:g}: {least_delta}, or the shield always acts")
     if least == 0:
-        raise ConfigError(
-            f"shield_rollouts={cfg.shield_rollouts}: expected more, or the shield always acts with "
-            f"delta={delta:g} and confidence={confidence:g}"
-        )
+        more = f"eps={float(cfg.eps):g}" if cfg.rule == "hoeffding" else "that, or more shield_rollouts"
+        raise ConfigError(f"delta={delta:g}: expected at least {more}, or the shield always acts")
 
 
 def note(cfg: Any) -> str:
     """What the shield guarantees with these settings, in one line."""
     m, eps, confidence = cfg.shield_rollouts, float(cfg.eps), float(cfg.confidence)
     what = "dreams" if cfg.shield == "dreams" else "copies of the simulator"
-    least = overruled_from(cfg) or 1  # `check` refuses others
+    least = overruled_from(cfg)
     half = (least - 1 / 3) / (m + 1 / 3)  # the median of Beta(least, m - least + 1)
     line = f"shield: overrules from {least} of {m} {what} with a violation"
     line += f" within {cfg.shield_horizon} steps, half the time where that has P = {half:.2g}"

@@ -12,7 +12,6 @@ from jaxsafe.learn.constraints import each
 from jaxsafe.learn.critics import while_it_lasts
 from jaxsafe.learn.learner import GradientStep, Learner
 from jaxsafe.learn.offline import (
-    DataSet,
     OfflinePriceConfig,
     OfflineValueConfig,
     constrained,
@@ -183,7 +182,7 @@ def learner(env: Env) -> Learner:
     return Learner(init=init, act=act, step=step)
 
 
-def check(cfg: Any, data: DataSet | None) -> None:
+def check(cfg: Any, data: Any) -> None:
     need_episodes(data, "coptidice learns from the first observations of episodes")
 
 

@@ -95,7 +95,7 @@ def held(training: Sequence[Group], final: Sequence[Group]) -> str:
 
     return (
         f"A cost of at most 30 is a fifth over the limit. A cell is an algorithm with a limit on one "
-        f"task. Of the cells that OmniSafe published, our evaluated policies keep to such a cost in "
+        f"task. Counted are those that OmniSafe published. Our evaluated policies keep to 30 in "
         f"{count(known)}. At the end of training ours do in {count(trained)}."
     )
 

@@ -28,6 +28,7 @@ from jaxsafe.learn.world_model import (
     critic_of,
     dream,
     dream_returns,
+    ended,
     goes_on,
     laprop,
     model_loss,
@@ -168,8 +169,8 @@ class Scene(NamedTuple):
         """
         later = fixed(returns[0].reshape(reward.shape))
         discounts = {"discount": discount, "decay": self.cfg.td_lambda}
-        ended = goes_on(self.batch.rows, self.cfg) == 0
-        of_rows = lambda_returns(self.batch, reward, later, ended, **discounts)
+        ends = ended(self.batch.rows, self.cfg)
+        of_rows = lambda_returns(self.batch, reward, later, ends, **discounts)
         on_rows = self.over_rows(self._loss(trained, name, self.latents.features[:-1], of_rows))
         return self.critic_loss(trained, name, dreams, returns) + self.cfg.replay_value * on_rows
 

@@ -420,20 +420,26 @@ def check_costs(names: Names, data: DataSet) -> None:
             raise ConfigError(f"cost_limits: the data set has no cost {name!r}{hint}")
 
 
-NO_DATA = "an offline algorithm learns from a data set: give dataset=PATH"
+def given(data: Any) -> DataSet:
+    """`data`, which must be a data set.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    if not isinstance(data, DataSet):
+        raise ConfigError("an offline algorithm learns from a data set: give dataset=PATH")
+    return data
 
 
-def need_episodes(data: DataSet | None, why: str) -> Episodes:
+def need_episodes(data: Any, why: str) -> Episodes:
     """The episodes of the data set.
 
     Raises:
         ConfigError: they are not known, or there is no data set. `why` says what they are needed for.
     """
-    if data is None:
-        raise ConfigError(NO_DATA)
-    if not data.episodes:
+    if not (episodes := given(data).episodes):
         raise ConfigError(f"{why}: the data set has no timeouts, which say where episodes end")
-    return data.episodes
+    return episodes
 
 
 def data_of(shared: Shared, env: Env) -> DataSet:
@@ -442,9 +448,7 @@ def data_of(shared: Shared, env: Env) -> DataSet:
     Raises:
         ConfigError: there is none, or its arrays have other sizes.
     """
-    data = shared.data
-    if not isinstance(data, DataSet):
-        raise ConfigError(NO_DATA)
+    data = given(shared.data)
     for name, x, size in (
         ("observations", vector_of(data.obs), env.obs_size),
         ("next_observations", vector_of(data.next_obs), env.obs_size),

@@ -29,7 +29,7 @@ class Row(NamedTuple):
     examine: examine(algo, learned, episodes, seed), what else evaluation measures: name -> float
         [S, N], of N fresh episodes of each of the S policies in `learned`.
     check: check(cfg, data) raises ConfigError for settings, or a data set, that cannot serve. `data` is
-        None where there is none.
+        () where there is none.
     """
 
     config: type[Any]

@@ -228,9 +228,14 @@ def read(world: WorldModel, params: PyTree, features: jax.Array) -> dict[str, ja
     }
 
 
+def ended(rows: Record, cfg: Any) -> jax.Array:
+    """Where nothing is to come after a row, bool [T, B]."""
+    return rows.last if cfg.limit_ends else rows.terminated
+
+
 def goes_on(rows: Record, cfg: Any) -> jax.Array:
     """The target of the head `cont`: 1 where an episode goes on, float [T, B]."""
-    return 1.0 - (rows.last if cfg.limit_ends else rows.terminated)
+    return 1.0 - ended(rows, cfg)
 
 
 # ---- dreams ------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ import json
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -144,12 +144,12 @@ def prepare(settings: Settings) -> tuple[Env, Program]:
     check_logger(train.logger)
     env = make_env(settings)
     check_memory(env, settings)
-    data = None
+    data: Any = ()
     if train.dataset is not None:
         data = dataset.read_dataset(train.dataset, env.episode_length)
     for cfg in settings.configs:
         settings.row.check(cfg, data)
-    program = build(env, settings.row.make, settings.configs, train, () if data is None else data)
+    program = build(env, settings.row.make, settings.configs, train, data)
     check_state_memory(program, train)
     return env, program
 

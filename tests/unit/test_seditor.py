@@ -273,6 +273,8 @@ def test_lambda_returns_by_hand():
     np.testing.assert_allclose(returns[:2, 1], [1 + 0.5 * (0.75 * 20 + 0.25 * cut), cut], rtol=1e-6)
     np.testing.assert_allclose(returns[:2, 2], [1 + 0.5 * (0.75 * 20 + 0.25 * 2), 2], rtol=1e-6)
     np.testing.assert_allclose(returns[jnp.array([0, 2]), 3], [1 + 0.5 * 20, g2], rtol=1e-6)
+    bounded = lambda_returns(batch, batch.rows.reward, value, batch.rows.last, discount=0.5, decay=0.25)
+    np.testing.assert_array_equal(bounded[:2, 1], returns[:2, 2])  # running out of time is an end
     follows = np.asarray(batch.follows).T
     np.testing.assert_array_equal(follows, [[1, 1, 1], [1, 1, 0], [1, 1, 0], [1, 0, 1]])
     one_step = lambda_returns(
