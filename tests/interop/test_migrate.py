@@ -14,6 +14,7 @@ from jaxsafe.interop import migrate
 from jaxsafe.interop.migrate.model_based import REPEAT
 from jaxsafe.interop.migrate.on_policy import ON_POLICY
 from jaxsafe.run import arguments, hydra_jobs
+from jaxsafe.run.settings import TrainConfig
 
 # What OmniSafe 0.5.0 and later takes where nothing is said: PPOLag, and what is other of TRPO.
 PPO_LAG: dict[str, Any] = {
@@ -405,6 +406,13 @@ def test_two_keys_of_one_option_say_which_counts():
     assert "algo.hidden=[32] in place of algo.hidden=[64]" in migrate.report(found.lines)
 
 
+@pytest.mark.parametrize("on, argv", [(True, ["logger=wandb"]), (False, [])])
+def test_weights_and_biases_go_on_if_they_were_asked_for(on, argv):
+    logger = PPO_LAG["logger_cfgs"] | {"use_wandb": on}
+    found = migrated({"defaults": PPO_LAG | {"logger_cfgs": logger}}, "PPOLag")
+    assert [x for x in found.argv if x.startswith("logger")] == argv
+
+
 def test_sections_of_environments_count_for_theirs():
     config = {"defaults": PPO_LAG, "SafetyPointGoal1-v0": {"algo_cfgs": {"gamma": 0.9}}, "Other": {}}
     assert migrated(config, "PPOLag").argv[5:] == ["algo.discount=0.9", "algo.cost_discount=0.9"]
@@ -426,8 +434,8 @@ def test_every_option_that_a_key_becomes_exists_in_its_family():
     for name, family in migrate.FAMILIES.items():
         rows = [row for row in algos.ALGOS.values() if migrate.family_of(row) == name]
         fields = {f"algo.{f.name}" for row in rows for f in dataclasses.fields(row.config)}
-        fields |= {"algo", "env", "env.rules", "seed", "total_steps", "num_envs", REPEAT}
-        fields |= {"dataset", "total_updates", "eval_episodes", "eval_every"}
+        fields |= {"algo", "env", "env.rules", REPEAT}
+        fields |= {f.name for f in dataclasses.fields(TrainConfig)}
         own = {k: r for k, r in family.rules.items() if r != ON_POLICY.get(k)} or family.rules
         assert {o for rule in own.values() for o in rule.ours.split()} <= fields
 

@@ -89,8 +89,8 @@ def options_of(row: Row, preset: str) -> dict[str, Any]:
     options = {f"algo.{k}": v for k, v in algo_options(row, preset, "omnisafe").items()}
     if "algo.num_envs" in options:
         options["num_envs"] = options["algo.num_envs"]
-    of_all = {"seed": 0, "eval_episodes": TrainConfig.eval_episodes, "total_steps": row.total_steps}
-    return options | of_all | {**FAMILIES[family_of(row)].run}
+    of_all = {name: getattr(TrainConfig, name) for name in ("seed", "eval_episodes", "logger")}
+    return options | of_all | {"total_steps": row.total_steps} | {**FAMILIES[family_of(row)].run}
 
 
 class Became(NamedTuple):
@@ -129,6 +129,6 @@ def checked(found: dict[str, Any], row: Row) -> dict[str, Any]:
     def typed(key: str, value: Any) -> Any:
         if key.startswith("algo."):
             return getattr(cfg, key.removeprefix("algo."))
-        return convert(value, str if key == "dataset" else int, key)
+        return convert(value, str if key in ("dataset", "logger") else int, key)
 
     return {key: typed(key, value) for key, value in found.items()}
