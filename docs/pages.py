@@ -26,6 +26,7 @@ from jaxsafe.envs.racing import picture as racing_picture
 from jaxsafe.envs.racing import task as racing
 from jaxsafe.envs.racing import track as racing_track
 from jaxsafe.envs.safety_gym import suite
+from jaxsafe.envs.safety_gym.config import SafetyGymConfig
 from jaxsafe.envs.velocity import config as velocity_config
 from jaxsafe.envs.velocity import suite as velocities
 from jaxsafe.learn.certificate import CertificateConfig
@@ -39,6 +40,7 @@ from jaxsafe.report import tables as report
 from jaxsafe.report.published import read_published
 from jaxsafe.report.read import SettingRun, read
 from jaxsafe.run import compat, help
+from jaxsafe.run.plain import as_text
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
@@ -130,6 +132,21 @@ on-policy ones have advantages.
 | | |
 |---|---|
 """
+OPTIONS = """# Options of Safety Gym's tasks
+
+Each is `env.OPTION` on the command line, and an argument of `jaxsafe.make`. Names and defaults are
+those of Safety Gym's Engine, except where it says *ours*. A task changes some:
+`python scripts/train.py env=point_goal1 --help` shows its values. Lengths are in m, angles in rad.
+
+```sh
+python scripts/train.py env=point_goal1 env.hazards_num=12 env.hazards_size=0.3 env.lidar_num_bins=32
+```
+
+`env.engine`, `env.wrap.action_repeat` and their like are options of
+[every environment](../start.md#the-options).
+
+{tables}
+"""
 ENVIRONMENTS = """# Environments
 
 A name is a robot and a task: `point_goal1`, `car_push2`, `doggo_button1`. Safety Gym's ids, as in
@@ -142,7 +159,7 @@ its like are [SEditor's tasks](../howto/seditor.md). So are `car_racing0` and `c
 [stand-ins](racing.md) for car racing in Box2D. The four [pendulums](pendulum.md), such as
 `pendulum_upright`, are those of CRABS.
 
-Every other option of Safety Gym's Engine is `env.OPTION`.
+Every [option of Safety Gym's Engine](options.md) is `env.OPTION`.
 [`env.rules`](../howto/safety_gymnasium.md) takes Safety-Gymnasium's rules where they differ.
 `env.observation=coordinates` shows Goal as positions instead of lidars, 29 numbers in `point_goal1`
 ([what for](../concepts.md#planning-with-a-model)). How close the physics is to the original:
@@ -407,7 +424,7 @@ def settings(config: type, head: str = "algo", without: Collection[str] = ()) ->
         if field.name in without:
             continue
         note = comments[field.name].replace("|", "\\|")
-        default = "" if field.default is dataclasses.MISSING else f"`{field.default}`"
+        default = "" if field.default is dataclasses.MISSING else f"`{as_text(field.default)}`"
         rows.append(f"| `{head}.{field.name}` | {default} | {values(hints[field.name])} | {note} |")
     return "\n".join(rows)
 
@@ -628,6 +645,23 @@ of boxes, vases and gremlins; those of Point's task. An episode has {env.episode
 """.replace("\n\n\n", "\n\n")
 
 
+def options_page() -> str:
+    """Safety Gym's options under the headings that divide them in the code."""
+    config = SafetyGymConfig
+    names = [field.name for field in dataclasses.fields(config)]
+    parts: dict[str, list[str]] = {"rules": []}
+    for line in inspect.getsource(config).splitlines():
+        if found := re.match(r"    # ---- (.+)", line):
+            parts[found[1]] = []
+        elif (found := re.match(r"    (\w+): ", line)) and found[1] in names:
+            parts[[*parts][-1]].append(found[1])
+    found = []
+    for title, those in parts.items():
+        rows = settings(config, "env", without={*names} - {*those})
+        found.append(f"## {title.capitalize()}\n\n{rows}")
+    return OPTIONS.format(tables="\n\n".join(found))
+
+
 def velocity_page() -> str:
     made = {name: make(name, engine="c") for name in velocities.suite()}
     names = [f"`{name}`" for name in made]
@@ -741,6 +775,7 @@ def pages() -> dict[Path, str]:
         cells = [f"[`{task}`]({task}.md)", about, *(str(env.obs_size) for env in made)]
         lines.append(f"| {' | '.join(cells)} | {', '.join(made[0].cost_names) or 'none'} |")
     text = ENVIRONMENTS + "\n".join(lines) + "\n"
+    found[HERE / "environments" / "options.md"] = options_page()
     found[HERE / "environments" / "velocity.md"] = velocity_page()
     found[HERE / "environments" / "racing.md"] = racing_page()
     found[HERE / "environments" / "pendulum.md"] = pendulum_page()

@@ -62,6 +62,7 @@ class VelocityConfig:
     have Gymnasium's names where it has them.
     """
 
+    # which robot
     robot: Literal["ant", "halfcheetah", "hopper", "walker2d", "swimmer", "humanoid"]
     # of Safety-Gymnasium's ids: v1, or v0 with older thresholds, where Swimmer's speed in y counts, too
     thresholds: Literal["v1", "v0"] = "v1"
@@ -72,7 +73,7 @@ class VelocityConfig:
     forward_reward_weight: Real = 1.0  # reward for a speed of 1 m/s along x
     ctrl_cost_weight: Weight = 0.1  # reward less for the sum of squared controls
     healthy_reward: Real = 0.0  # of a step that ends healthy, and of one that ends the episode
-    terminate_when_unhealthy: bool = True
+    terminate_when_unhealthy: bool = True  # whether being unhealthy ends the episode
     healthy_z_range: Range | None = None  # of the height, m; null: any
     healthy_angle_range: Range | None = None  # of the pitch, rad
     healthy_state_range: Range | None = None  # of qvel, and of qpos but its first two

@@ -108,10 +108,12 @@ def comments(config: type) -> dict[str, str]:
 
 
 def comments_of(cls: type) -> dict[str, str]:
-    """Field -> its comment: the lines of comment above the field and the one after its default."""
+    """Field -> its comment: the lines of comment above the field and the one after its default. Lines
+    that divide fields, `# ---- reward`, are none of them."""
     source = textwrap.dedent(inspect.getsource(cls))
     tokens = [*tokenize.generate_tokens(io.StringIO(source).readline)]
     notes = {t.start[0]: t.string.lstrip("# ") for t in tokens if t.type == tokenize.COMMENT}
+    notes = {line: note for line, note in notes.items() if not note.startswith("----")}
     alone = {line for line in notes if source.splitlines()[line - 1].startswith("    #")}
     (tree,) = ast.parse(source).body
     found = {}

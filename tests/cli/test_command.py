@@ -4,6 +4,7 @@ A new process is there where one is killed, interrupted or has other devices, an
 real environment.
 """
 
+import dataclasses
 import resource
 import shutil
 import signal
@@ -32,10 +33,12 @@ from toys import START
 
 from jaxsafe import algos, envs
 from jaxsafe.config import ConfigError, flat
+from jaxsafe.envs.wrap import WrapConfig
 from jaxsafe.learn.conventions import conventions
 from jaxsafe.run import (
     arguments,
     checkpoint,
+    help,
     hydra_jobs,
     loop,
     policies,
@@ -130,6 +133,15 @@ def test_help_and_cfg_show_every_option_with_its_default(capsys):
     assert shown["env"]["name"] == "car_push1" and shown["algo"]["name"] == "cpo"
     assert shown["env"]["placements_extents"] == [-1, -1, 1, 1]
     assert shown["env"].keys() - {"name"} == envs.env_defaults("car_push1").keys()
+
+
+def test_every_option_says_what_it_is():
+    tasks = [envs.SafetyGymConfig, envs.VelocityConfig, envs.CarRacing]
+    tasks += [envs.Pendulum, envs.CartPendulum, WrapConfig]
+    for config in (settings.TrainConfig, *tasks, *(row.config for row in algos.ALGOS.values())):
+        notes = help.comments(config)
+        assert all(notes[field.name] for field in dataclasses.fields(config)), config
+    assert help.comments(envs.SafetyGymConfig)["num_steps"] == "time limit", "without the divider above"
 
 
 def test_published_settings_are_defaults_that_the_command_line_overrides():
