@@ -1,12 +1,11 @@
 """An engine by its name, or by the device."""
 
-import importlib.util
-
 import jax
 
 from jaxsafe.config import ConfigError, nearest
 from jaxsafe.envs.engines import c
 from jaxsafe.envs.engines.simulation import Engine, Simulation
+from jaxsafe.nvidia import warp_problem
 
 ENGINES = ("c", "warp", "jax")
 
@@ -16,11 +15,7 @@ def default_engine() -> str:
     platform = jax.default_backend()
     if platform == "cpu":
         return "c"
-    return "warp" if platform in ("gpu", "cuda") and warp_available() else "jax"
-
-
-def warp_available() -> bool:
-    return importlib.util.find_spec("warp") is not None
+    return "warp" if platform in ("gpu", "cuda") and not warp_problem() else "jax"
 
 
 def make_engine(name: str, simulation: Simulation) -> Engine:
@@ -33,10 +28,8 @@ def make_engine(name: str, simulation: Simulation) -> Engine:
     if name == "c":
         return c.make(simulation)
     if name == "warp":
-        if not warp_available():
-            raise ConfigError(
-                "env.engine='warp': warp-lang is not installed; pip install 'jaxsafe[gpu]'"
-            )
+        if problem := warp_problem():
+            raise ConfigError(f"env.engine='warp': {problem}")
         from jaxsafe.envs.engines.warp import engine  # late: it needs Warp
 
         return engine.make(simulation)

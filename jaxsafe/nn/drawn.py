@@ -20,13 +20,14 @@ Source: NVIDIA, Parallel Thread Execution ISA, "Asynchronous warpgroup level mat
 
 import contextlib
 import functools
-import importlib.util
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+
+from jaxsafe.nvidia import warp_problem
 
 THREADS = 512  # of a block of the kernel: three groups of 128 compute, one fetches weights
 SHARED_MEMORY = 200 * 1024  # bytes of a block for weights, of the 227 KiB that there are
@@ -54,10 +55,11 @@ def sizes_of(inputs: int, hidden: Sequence[int], outputs: int) -> Sizes:
 def serves(inputs: int, hidden: Sequence[int], outputs: int) -> bool:
     """Whether the kernel runs here, and is for such networks: at most 207 inputs, 207 units in a layer
     and 104 means."""
-    if jax.default_backend() != "gpu" or importlib.util.find_spec("warp") is None or not hidden:
+    if jax.default_backend() != "gpu" or not hidden:
         return False
     hopper = all(getattr(x, "compute_capability", "") == "9.0" for x in jax.local_devices())
-    return hopper and max(sizes_of(inputs, hidden, outputs)[:3]) <= LARGEST
+    fits = max(sizes_of(inputs, hidden, outputs)[:3]) <= LARGEST
+    return hopper and fits and not warp_problem()
 
 
 def widths(weights: Sequence[jax.Array]) -> tuple[int, tuple[int, ...], int]:

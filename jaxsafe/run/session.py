@@ -13,6 +13,7 @@ import numpy as np
 import jaxsafe
 from jaxsafe.config import ConfigError, flat
 from jaxsafe.envs.wrap import innermost
+from jaxsafe.nvidia import warp_problem
 from jaxsafe.run import checkpoint, clock, dataset, distributed, files, loop, run_folder
 from jaxsafe.run.devices import check_devices, device_name, use_compilation_cache
 from jaxsafe.run.evaluate import make_training_evaluation
@@ -255,6 +256,8 @@ def greeting(session: Session) -> str:
         "warp": ", and a minute of Warp's kernels the first time",
         "c": ", about a minute at every start of engine c",
     }.get(engine or "", "")
+    if engine == "jax" and "NVIDIA" in device_name() and (problem := warp_problem()):
+        where += f" (warp would be faster, but {problem})"
     return (
         f"jaxsafe {jaxsafe.__version__} | {settings.env_name} | {settings.algo_name} | "
         f"{several}{seeds} | {where} | compiling rollout and update{kernels} ..."

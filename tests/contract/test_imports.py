@@ -16,7 +16,7 @@ ROOT = Path(__file__).parent.parent.parent
 SOURCES = ("jaxsafe", "envs", "algos")
 # Rooms from the lowest to the highest; one may import those below it and its own.
 ROOMS = (
-    {"jaxsafe.types", "jaxsafe.config"},
+    {"jaxsafe.types", "jaxsafe.config", "jaxsafe.nvidia"},
     {"jaxsafe.nn"},
     {"jaxsafe.learn"},
     {"jaxsafe.envs", "jaxsafe.algos"},

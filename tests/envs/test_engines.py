@@ -47,6 +47,20 @@ def test_the_warp_engine_says_what_to_install(monkeypatch):
         envs.make("point_goal0", engine="warp")
 
 
+def test_on_a_gpu_whose_driver_is_too_old_for_warp_the_engine_is_jax_and_warp_says_why(monkeypatch):
+    wp = pytest.importorskip("warp")
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(wp, "get_cuda_toolkit_version", lambda: (13, 4))
+    monkeypatch.setattr(wp, "get_cuda_driver_version", lambda: (12, 4))
+    monkeypatch.setattr(wp, "is_cuda_available", lambda: False)
+    env = envs.make("point_goal0", engine="c")
+    assert engines.default_engine() == "jax"
+    with pytest.raises(ConfigError, match=r"built for CUDA 13\.4, and the driver is for CUDA 12\.4"):
+        engines.make_engine("warp", env.scene.simulation(env.config))
+    monkeypatch.setattr(wp, "is_cuda_available", lambda: True)
+    assert engines.default_engine() == "warp"
+
+
 def test_an_engine_that_nobody_knows_is_refused_by_the_maker():
     env = envs.make("point_goal0", engine="c")
     with pytest.raises(ConfigError, match=r"valid: auto, c, jax, warp|did you mean"):
