@@ -48,17 +48,17 @@ class AMBSConfig(dreamer.DreamerConfig):
         k     = 1 if the episode goes on from a state, else 0
         R     = c_1 + discount k_1 (c_2 + .. c_H + discount k_H min_i V_i(s_H)),   H < T
         V_i   : returns of c under pi, cut at the first violation, discount k y
-        pi_safe climbs -c,   pi climbs Dreamer's A, with  w A + penalty_coef A_pen
+        pi_safe climbs -c, discounted by cost_discount;   pi climbs  w A + penalty_coef A_pen
         penl    w = 1
         plpg    w = exp(min(0, -c_{t+1} + V_safe(s_{t+1}) - V_safe(s_t))), at least 1e-6
         copt    w = 1 - sigmoid(kappa (R_t - C discount^T)), without gradient
         none    w = 1, and no A_pen
 
-    A_pen is the advantage of -c under pi, scaled as Dreamer's. A violation i steps ahead costs
-    discount^(i-1) C, so R tells whether there is one within T steps. The shield's dreams have only
-    H = `shield_steps` steps. V_i stand for the rest. The shield acts in training, evaluation and films.
-    What is dreamed begins with actions of pi that are drawn anew, unless `verify_action` has the
-    proposed one dreamed first.
+    A is Dreamer's advantage. A_pen is that of -c under pi, discounted by `cost_discount` and scaled as
+    Dreamer's. A violation i steps ahead costs discount^(i-1) C, so R tells whether there is one within
+    T steps. The shield's dreams have only H = `shield_steps` steps. V_i stand for the rest. The shield
+    acts in training, evaluation and films. What is dreamed begins with actions of pi that are drawn
+    anew, unless `verify_action` has the proposed one dreamed first.
 
     With `shield=true_dynamics` the simulator takes the place of the dreams: pi goes on for T steps in m
     copies of it. They foresee its random numbers, too, and only the actions differ. It shows what a
@@ -82,7 +82,8 @@ class AMBSConfig(dreamer.DreamerConfig):
     ends (`limit_ends=true` has them). Mean actions are shielded, too.
     """
 
-    # The discount of costs in evaluations alone. V_i and the shield have `discount`.
+    # The discount of what both policies avoid, and of costs in evaluations. V_i and the shield have
+    # `discount`, and so has everything in AMBS's code.
     cost_discount: Share = 0.997
     # The weight of the critic's loss on replayed rewards. They are partly those of the safe policy, so
     # it is 0, as in AMBS's code.
@@ -195,7 +196,7 @@ def learn(trained: dict[str, PyTree], memory: PyTree, scene: Scene, key: jax.Arr
     # the safe policy
     dreams = safe_dreams
     cost = clipped(dreams.read["cost"], cfg)
-    judged = scene.judge("critic_safe", dreams, -cost, discount)
+    judged = scene.judge("critic_safe", dreams, -cost, cfg.cost_discount)
     range_safe = moved(memory["safe"], judged.returns, axis_name)
     loss = scene.actor_loss(dreams, judged.advantage / range_safe.scale(least))
     loss += scene.critic_loss(trained, "critic_safe", dreams, judged.returns)
@@ -205,7 +206,7 @@ def learn(trained: dict[str, PyTree], memory: PyTree, scene: Scene, key: jax.Arr
     dreams = task_dreams
     cost = clipped(dreams.read["cost"], cfg)
     earned = scene.judge("critic_r", dreams, dreams.read["reward"], discount)
-    paid = scene.judge("critic_p", dreams, -cost, discount)
+    paid = scene.judge("critic_p", dreams, -cost, cfg.cost_discount)
     range_r = moved(memory["reward"], earned.returns, axis_name)
     range_p = moved(memory["penalty"], paid.returns, axis_name)
     value_c = safety_value(scene.params, dreams.features, cfg)
@@ -234,6 +235,7 @@ def learn(trained: dict[str, PyTree], memory: PyTree, scene: Scene, key: jax.Arr
         "train/value": scene.over_dreams(earned.value[:-1]),
         "train/value_c": scene.over_dreams(value_c[:-1]),
         "train/return_scale": range_r.scale(least),
+        "train/penalty_scale": range_p.scale(least),
     }
     return Outcome(loss, {"reward": range_r, "penalty": range_p, "safe": range_safe}, metrics)
 

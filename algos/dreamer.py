@@ -61,7 +61,7 @@ class DreamerLagConfig(DreamerConfig):
 
     at each gradient step. R_c are TD(lambda) returns of the predicted cost, which has a critic of its
     own. T is the time limit, so d is the discounted cost of a steady stream of `cost_limit` an episode.
-    With `actor_grad=reinforce` the term is max(0, lam + mu g) (R_c - V_c) log pi, and only log pi has a
+    With `actor_grad=reinforce` the term is (psi(R_c - d) - psi(V_c - d)) log pi, and only log pi has a
     gradient. The rest is as in Dreamer.
 
     Source: the baseline of Goodall and Belardinelli (2024), "Leveraging Approximate Model-based
@@ -139,6 +139,11 @@ class Augmented(NamedTuple):
         least = -(self.lam**2) / (2 * self.mu)
         return jnp.where(self.price(g) > 0, self.lam * g + self.mu * g**2 / 2, least)
 
+    def advantage(self, costs: Judged, limit: jax.Array) -> jax.Array:
+        """How much more the returns of dreams are penalised than the values where they begin, float
+        [H, S]."""
+        return self.psi(costs.returns - limit) - self.psi(costs.value[:-1] - limit)
+
     def price(self, g: jax.Array) -> jax.Array:
         return jnp.maximum(0.0, self.lam + self.mu * g)
 
@@ -171,10 +176,11 @@ def learn_priced(trained: dict[str, PyTree], memory: PyTree, scene: Scene, key: 
     found = learn_reward(trained, memory["range"], scene, key)
     dreams = found.dreams
     costs, critic_loss, of_cost = learn_cost(trained, dreams, scene)
-    violation = costs.returns - discounted_limit(scene.env, cfg)
+    limit = discounted_limit(scene.env, cfg)
+    violation = costs.returns - limit
     penalty = dual.psi(violation)
     if cfg.actor_grad == "reinforce":
-        penalty = fixed(dual.price(violation) * costs.advantage) * dreams.log_prob
+        penalty = fixed(dual.advantage(costs, limit)) * dreams.log_prob
     mean_violation = fixed(scene.over_dreams(violation))
     metrics = of_cost | {"train/dream_violation": mean_violation, "train/lam": dual.lam}
     dual = dual.raised(pmean(mean_violation, scene.axis_name), cfg)

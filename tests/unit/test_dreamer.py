@@ -8,6 +8,7 @@ import numpy as np
 from toys import Corridor
 
 from jaxsafe.algos import dreamer
+from jaxsafe.learn.dreaming import Judged
 
 CFG = dreamer.DreamerLagConfig()
 
@@ -36,6 +37,18 @@ def test_the_penalty_is_smooth_where_it_ends():
     np.testing.assert_allclose(slope, [0, 0, 0.2, 0.6, 2.6], atol=1e-6)
     none = dreamer.Augmented(jnp.float32(0.0), jnp.float32(1.0))
     assert jax.grad(none.psi)(-1e-3) == 0
+
+
+def test_by_reinforce_the_actor_descends_the_expected_penalty():
+    """Of returns R ~ N(m, 1): d/dm E[psi(R - d)], where psi is quadratic above -0.3, whatever V is."""
+    dual = dreamer.Augmented(jnp.float32(0.6), jnp.float32(2.0))
+    noise = jax.random.normal(jax.random.key(0), (1, 400_000))
+    for mean, limit, value in ((2.0, 0.5, 0.0), (0.2, 0.5, 1.5)):
+        returns, limit = mean + noise, jnp.float32(limit)
+        costs = Judged(returns, jnp.full((2, 400_000), value))
+        found = (dual.advantage(costs, limit) * noise).mean()  # the score of m is R - m
+        slope = jax.vmap(jax.grad(dual.psi))(returns[0] - limit).mean()
+        np.testing.assert_allclose(found, slope, rtol=0.03)
 
 
 def test_the_limit_of_an_episode_is_that_of_a_steady_stream_of_cost():
