@@ -50,7 +50,7 @@ class WorldModelConfig(EncoderConfig, RoundConfig):
     discount: Share = 0.997
     cost_discount: Share = 0.997  # The discount of costs where one is limited, and in evaluations.
     # The networks' size: about the number of parameters, if pictures are observed. The paper's is 200m.
-    size: Literal["tiny", "300k", "1m", "12m", "25m", "50m", "100m", "200m"] = "300k"
+    size: Literal["tiny", "300k", "500k", "1m", "12m", "25m", "50m", "100m", "200m"] = "300k"
     model_lr: Rate = 1e-3  # The model's learning rate, by LaProp. The authors have 4e-5.
     lr: Rate = 5e-4  # The actor's learning rate, by LaProp. The authors have 4e-5.
     critic_lr: Rate = 1e-3  # The critics' learning rate, by LaProp. The authors have 4e-5.

@@ -42,11 +42,12 @@ def layers_of(depth: int) -> tuple[int, ...]:
     return 2 * depth, 3 * depth, 4 * depth, 4 * depth
 
 
-# by the number of parameters, about, that they have with a picture for observation. `300k` is ours, for
-# CPUs, and `tiny` is for tests
+# by the number of parameters, about, that they have with a picture for observation. `300k` and, with
+# more latents, `500k` are ours, for CPUs and vectors, and `tiny` is for tests
 SIZES = {
     "tiny": Size(32, 16, classes=4, units=16, channels=(8,), latents=4, layers=1, blocks=2),
     "300k": Size(128, 64, classes=8, units=64, channels=layers_of(4), latents=8, layers=2, blocks=4),
+    "500k": Size(128, 64, classes=8, units=64, channels=layers_of(4), layers=2, blocks=4),
     "1m": Size(512, 64, classes=4, units=64, channels=layers_of(4)),
     "12m": Size(2048, 256, classes=16, units=256, channels=layers_of(16)),
     "25m": Size(3072, 384, classes=24, units=384, channels=layers_of(24)),
