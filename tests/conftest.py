@@ -1,6 +1,5 @@
 import signal
 import sys
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -53,8 +52,9 @@ def few_memory_maps(request: pytest.FixtureRequest) -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True)
-def forgotten_code() -> Iterator[None]:
+def forgotten_code(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Forget the environments, algorithms and modules that a test brought with it."""
+    folder = str(tmp_path_factory.getbasetemp())
     registries = [(registry, dict(registry)) for registry in (envs.ENVS, algos.ALGOS)]
     modules, path = {*sys.modules}, [*sys.path]
     yield
@@ -63,9 +63,7 @@ def forgotten_code() -> Iterator[None]:
             registry.clear()
             registry.update(before)
     for name in {*sys.modules} - modules:
-        file = str(getattr(sys.modules[name], "__file__", None))
-        # a virtual environment may lie there, too
-        if file.startswith(tempfile.gettempdir()) and "site-packages" not in file:
+        if str(getattr(sys.modules[name], "__file__", None)).startswith(folder):
             del sys.modules[name]
     sys.path[:] = path
 

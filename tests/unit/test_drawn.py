@@ -34,14 +34,15 @@ def test_a_column_of_ones_carries_the_biases(shape):
     x = jax.random.normal(jax.random.key(2), (3, 50, inputs)).astype(jnp.bfloat16)
     h = drawn.with_one(x).astype(jnp.float32)
     padded = drawn.with_biases(*parts(ensemble))
-    for w in padded[:-1]:
-        h = jax.nn.swish(h @ w)
-    mean, raw = jnp.split(h @ padded[-1], 2, -1)
+    with jax.default_matmul_precision("float32"):
+        for w in padded[:-1]:
+            h = jax.nn.swish(h @ w)
+        mean, raw = jnp.split(h @ padded[-1], 2, -1)
+        expected = outputs_of(ensemble, unscaled(inputs), x.astype(jnp.float32))
     assert all(n % 16 == 0 for w in padded for n in w.shape[1:])
     variance = jnp.exp(ensemble.low)[:, None] + 1 / (
         jnp.exp(-ensemble.high)[:, None] + jnp.exp(-raw[..., :outputs])
     )
-    expected = outputs_of(ensemble, unscaled(inputs), x.astype(jnp.float32))
     np.testing.assert_allclose(mean[..., :outputs], expected.mean, rtol=1e-3, atol=1e-4)
     np.testing.assert_allclose(jnp.log(variance) / 2, expected.log_std, rtol=1e-3, atol=1e-4)
     assert not mean[..., outputs:].any() and not raw[..., outputs:].any()
