@@ -531,13 +531,12 @@ def brier_score(found: Course, horizon: int) -> jax.Array:
     return jnp.where(counts.any(), total / jnp.maximum(counts.sum(), 1), jnp.nan)
 
 
-def examine(algo: Algorithm, learned: PyTree, episodes: int, seed: int) -> dict[str, np.ndarray]:
-    """What the shield does in fresh episodes of sampled actions, and what they are without it: float
-    [S, N] by name, of N episodes of each of the S policies in `learned`."""
-    keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), 0x736869), episodes)
-    horizon = learned.config.shield_horizon
+def examine(algo: Algorithm, learned: PyTree, keys: jax.Array) -> dict[str, np.ndarray]:
+    """What the shield does in episodes of sampled actions, and what they are without it: float [S, N]
+    by name, of the episodes of `keys` [S, N], by the S policies in `learned`."""
+    delta, horizon = learned.config.delta, learned.config.shield_horizon
 
-    def of_one(learned: PyTree, delta: jax.Array) -> dict[str, jax.Array]:
+    def of_one(learned: PyTree, keys: jax.Array, delta: jax.Array) -> dict[str, jax.Array]:
         learned = dataclasses.replace(learned, config=dataclasses.replace(learned.config, delta=delta))
         player = Player(algo.policy, learned, algo.task(learned))
         found = jax.vmap(lambda key: course(player, key))(keys)
@@ -550,9 +549,8 @@ def examine(algo: Algorithm, learned: PyTree, episodes: int, seed: int) -> dict[
         }
 
     play = jax.jit(jax.vmap(of_one))
-    delta = learned.config.delta
     shielded, bare = (
-        jax.tree.map(np.asarray, play(learned, x)) for x in (delta, jnp.full_like(delta, jnp.inf))
+        jax.tree.map(np.asarray, play(learned, keys, x)) for x in (delta, jnp.full_like(delta, jnp.inf))
     )
     return {
         "override rate": shielded["override rate"],

@@ -20,7 +20,7 @@ from jaxsafe.learn.dreaming import (
     seen,
 )
 from jaxsafe.learn.off_policy import off_policy
-from jaxsafe.learn.planning import PlanConfig, cem, elites, particles_of
+from jaxsafe.learn.planning import PlanConfig, cem, elites, key_of_step, moved_on, particles_of
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.treatments import Treatment, no_treatment
 from jaxsafe.learn.world_model import dream_returns, read, value_of, world_of
@@ -148,11 +148,13 @@ controller = Treatment(
 
 
 class PlanMemory(NamedTuple):
-    """What the policy remembers: where it was, what it did there, and the mean of its plan, [H, A]."""
+    """What the policy remembers: where it was, what it did there, the mean of its plan, [H, A], and how
+    many steps it has acted, []."""
 
     latent: Latent
     action: jax.Array
     mean: jax.Array
+    step: jax.Array
 
 
 def scores(
@@ -201,17 +203,18 @@ def dream_planning_policy(env: Env, behaviour: Behaviour, treatment: Treatment) 
 
     def init(learned: Learned) -> PlanMemory:
         latent, action = acting.init(learned)
-        return PlanMemory(latent, action, jnp.zeros((learned.config.plan_steps, env.action_size)))
+        mean = jnp.zeros((learned.config.plan_steps, env.action_size))
+        return PlanMemory(latent, action, mean, jnp.int32(0))
 
     def act(
         learned: Learned, carry: PlanMemory, obs: PyTree, key: jax.Array | None
     ) -> tuple[jax.Array, PlanMemory, Metrics]:
-        latent_key, plan_key = (None, jax.random.key(0)) if key is None else jax.random.split(key)
+        latent_key, plan_key = (None, key_of_step(carry.step)) if key is None else jax.random.split(key)
         memory = Memory(carry.latent, carry.action)
         latent = seen(env, behaviour, learned, memory, obs, latent_key)
         score = partial(scores, env, behaviour, treatment, learned, latent)
         mean = cem(score, elites, carry.mean, (), plan_key, learned.config)
-        return mean[0], PlanMemory(latent, mean[0], jnp.concatenate([mean[1:], mean[-1:]])), {}
+        return mean[0], PlanMemory(latent, mean[0], moved_on(mean), carry.step + 1), {}
 
     return Policy(init=init, act=act)
 

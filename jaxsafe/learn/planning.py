@@ -243,6 +243,17 @@ def cem(
     return jax.lax.scan(improve, start, jax.random.split(key, cfg.cem_iterations))[0].mean
 
 
+def moved_on(mean: jax.Array) -> jax.Array:
+    """The mean of the plan one step later, [H, A]: the last action comes twice."""
+    return jnp.concatenate([mean[1:], mean[-1:]])
+
+
+def key_of_step(step: jax.Array) -> jax.Array:
+    """The draws of a plan whose actions are to be the same each time. They differ from step to step:
+    one that errs to the left does so once."""
+    return jax.random.fold_in(jax.random.key(0), step)
+
+
 def planning_bytes(env: Env, cfg: Any) -> int:
     """The least that planning for one environment holds at once: what is kept of each step of all
     courses of events, and two neighbouring layers of the networks that predict one step of them. The
@@ -257,20 +268,26 @@ def planning_bytes(env: Env, cfg: Any) -> int:
     return courses * (4 * (3 * cfg.plan_steps + env.obs_size) + size * network)
 
 
+class Plan(NamedTuple):
+    """What the policy remembers: the mean of its plan, [H, A], and how many steps it has acted, []."""
+
+    mean: jax.Array
+    step: jax.Array
+
+
 def planning_policy(env: Env, planner: Planner) -> Policy:
-    """The policy that plans anew at each step. Its carry is the mean of the plan, [H, A]."""
+    """The policy that plans anew at each step."""
     simulated, ensemble = simulator(env), learned_model(env)
 
-    def init(learned: Learned) -> jax.Array:
-        return jnp.zeros((learned.config.plan_steps, env.action_size))
+    def init(learned: Learned) -> Plan:
+        return Plan(jnp.zeros((learned.config.plan_steps, env.action_size)), jnp.int32(0))
 
     def act(
-        learned: Learned, carry: jax.Array, seen: PyTree, key: jax.Array | None
-    ) -> tuple[jax.Array, jax.Array, dict[str, Any]]:
+        learned: Learned, carry: Plan, seen: PyTree, key: jax.Array | None
+    ) -> tuple[jax.Array, Plan, dict[str, Any]]:
         cfg = learned.config
         model = simulated if cfg.true_model else ensemble
-        key = jax.random.key(0) if key is None else key  # the same draws at every step
-        plan_key, propose_key = jax.random.split(key)
+        plan_key, propose_key = jax.random.split(key_of_step(carry.step) if key is None else key)
         per_episode = env.episode_length / cfg.plan_steps
 
         def score(plans: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -280,7 +297,7 @@ def planning_policy(env: Env, planner: Planner) -> Policy:
             return ret, per_episode * planner.cost(imagined, learned)
 
         proposals = planner.propose(model, learned, seen, propose_key)
-        mean = cem(score, planner.weigh, carry, proposals, plan_key, cfg)
-        return mean[0], jnp.concatenate([mean[1:], mean[-1:]]), {}
+        mean = cem(score, planner.weigh, carry.mean, proposals, plan_key, cfg)
+        return mean[0], Plan(moved_on(mean), carry.step + 1), {}
 
     return Policy(init, act, privileged=lambda learned: learned.config.true_model)

@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
+import jax
 import numpy as np
 
 from jaxsafe.types import Algorithm, PyTree
@@ -26,8 +27,8 @@ class Row(NamedTuple):
     lever: options with which it learns Lever, the small exact problem of tests/toys.py, if its
         defaults do not.
     note: note(cfg), a line to print before training: what its settings promise; '' for nothing.
-    examine: examine(algo, learned, episodes, seed), what else evaluation measures: name -> float
-        [S, N], of N fresh episodes of each of the S policies in `learned`.
+    examine: examine(algo, learned, keys), what else evaluation measures: name -> float [S, N], of the
+        episodes of `keys` [S, N], by the S policies in `learned`.
     check: check(cfg, data) raises ConfigError for settings, or a data set, that cannot serve. `data` is
         () where there is none.
     """
@@ -42,4 +43,4 @@ class Row(NamedTuple):
     lever: Mapping[str, Any] = NOTHING
     check: Callable[[Any, Any], None] = lambda cfg, data: None
     note: Callable[[Any], str] = lambda cfg: ""
-    examine: Callable[[Algorithm, PyTree, int, int], dict[str, np.ndarray]] = lambda *_: {}
+    examine: Callable[[Algorithm, PyTree, jax.Array], dict[str, np.ndarray]] = lambda *_: {}

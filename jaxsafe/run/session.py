@@ -213,7 +213,9 @@ def hooks_of(session: Session, report: Reporter) -> loop.Hooks:
     )
     if train.eval_every:
         algo = settings.row.make(session.env, None)
-        hooks = hooks._replace(evaluate=make_training_evaluation(algo, train.eval_episodes, train.seed))
+        many = len(settings.configs)
+        evaluation = make_training_evaluation(algo, train.eval_episodes, train.seed, many)
+        hooks = hooks._replace(evaluate=evaluation)
     begun = run_folder.newest_progress(session.folder) is not None
     if train.init_from is not None and not distributed.from_process_0(np.array(begun)):
         hooks = hooks._replace(adapt=warm_start(settings, session.program, report.line))

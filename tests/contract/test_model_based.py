@@ -121,14 +121,14 @@ def test_the_model_is_fitted_when_the_warm_up_ends_and_then_by_the_clock(name):
         assert all(differ(models.ensemble, ts.params["model"].ensemble)) == fitted
         assert (jnp.isnan(metrics["train/model_error"]) == (not fitted)).all()
         assert (metrics["train/nonfinite"] == 0).all()
-        carry = ts.stepping.rollout.carry
-        assert (carry == 0).all() == (iteration < 2)  # actions are random at first
-    assert carry.shape == (2, 4, 3, 2)
+        plan = ts.stepping.rollout.carry.mean
+        assert (plan == 0).all() == (iteration < 2)  # actions are random at first
+    assert plan.shape == (2, 4, 3, 2)
     assert all(jnp.isfinite(x).all() for x in jax.tree.leaves((ts.params, ts.opt_state, ts.replay)))
     later = copy(ts)
     again, metrics = update(ts, at(40, since=40))  # resumed without its replay: it acts by its plans
     assert not any(differ(later.params["model"], again.params["model"]))
-    assert (again.stepping.rollout.carry != 0).any()
+    assert (again.stepping.rollout.carry.mean != 0).any()
     again, metrics = update(again, at(41, since=40))
     assert any(differ(later.params["model"], again.params["model"]))
     assert jnp.isfinite(metrics["train/model_error"]).all()
@@ -186,9 +186,11 @@ def test_a_plan_is_carried_along_and_needs_no_key():
     state = Corridor().reset(jax.random.key(0))
     act = jax.jit(lambda carry: player.act(carry, state), compiler_options=FAST)
     action, carry = act(player.begin())
-    assert action.shape == (2,) and carry.shape == (3, 2) and (jnp.abs(action) <= 1).all()
+    assert action.shape == (2,) and carry.mean.shape == (3, 2) and (jnp.abs(action) <= 1).all()
     np.testing.assert_array_equal(action, act(player.begin())[0])
     assert (act(carry)[0] != action).any()
+    elsewhere = player.begin()._replace(step=jnp.int32(7))  # other draws, and nothing else
+    assert (act(elsewhere)[0] != action).any()
 
 
 # ---- learning ------------------------------------------------------------------------------------

@@ -96,29 +96,29 @@ def walk(name: str):
             state, carry = now
             action, carry, _ = policy.act(learned, carry, state, key)
             state = env.step(state, action)
-            return (state, carry), (state.physics, carry)
+            return (state, carry), (state.physics, carry.mean)
 
         start = env.at(x), policy.init(learned)
         return jax.lax.scan(step, start, jax.random.split(jax.random.key(0), 8))[1]
 
-    x, carry = jax.jit(jax.vmap(play), compiler_options=FAST)(jnp.array([0.0, 0.95]))
-    assert policy.privileged(learned) and carry.shape == (2, 8, 4, 1)
-    return np.asarray(x), np.asarray(carry)
+    x, plans = jax.jit(jax.vmap(play), compiler_options=FAST)(jnp.array([0.0, 0.95]))
+    assert policy.privileged(learned) and plans.shape == (2, 8, 4, 1)
+    return np.asarray(x), np.asarray(plans)
 
 
 @pytest.mark.parametrize("name", ["cce_pets", "rce_pets", "cap_pets"])
 def test_constrained_planners_stop_at_the_shore_and_leave_the_water_the_shortest_way(name):
-    x, carry = walk(name)
-    ahead = x[0] + carry[0, :, :-1, 0].sum(-1) / 5  # where the plan ends
+    x, plans = walk(name)
+    ahead = x[0] + plans[0, :, :-1, 0].sum(-1) / 5  # where the plan ends
     assert x[0].max() <= 0.5 and ahead.min() > 0.45 and ahead.max() <= 0.5
     assert (x[1] > 0.5).sum() == 2  # no plan leaves it in fewer steps, and none is allowed
     assert x[1, 2:].max() <= 0.5
 
 
 def test_a_planner_without_a_constraint_walks_on_and_its_plan_moves_along_with_it():
-    x, carry = walk("pets")
+    x, plans = walk("pets")
     assert x[0, -1] > 1.4
-    np.testing.assert_array_equal(carry[:, :, -1], carry[:, :, -2])  # moved on, the last one twice
+    np.testing.assert_array_equal(plans[:, :, -1], plans[:, :, -2])  # moved on, the last one twice
 
 
 # ---- particles -----------------------------------------------------------------------------------
