@@ -89,8 +89,7 @@ class SafetyGym:
             _, readings = self._engine.forward(world.bodies, ctrl)
             return observe.components(self.arena, world, readings, ctrl)
 
-        with jax.ensure_compile_time_eval():
-            parts = jax.eval_shape(shown, jax.random.key(0))
+        parts = jax.eval_shape(shown, jax.random.key(0))
         self.observation_spec: dict[str, tuple[int, ...]] = {
             name: parts[name].shape for name in observe.in_order(self.arena, parts)
         }

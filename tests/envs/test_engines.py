@@ -362,7 +362,7 @@ def test_jax_solves_contacts_as_c_does():
     ctrl = np.clip(record["step.action"], *model.actuator_ctrlrange.T)
     m, d = mjx.put_model(mjx_model, impl="jax"), mjx.make_data(mjx_model, impl="jax")
 
-    @jax.jit
+    @partial(jax.jit, compiler_options=FAST)
     @jax.vmap
     def step(state, ctrl):
         return forward.euler(m, jax_engine.forward_pass(m, d.replace(ctrl=ctrl, **state))).qvel
@@ -404,7 +404,8 @@ def test_dry_friction_that_turns_round_is_not_taken_for_one_piece_of_the_cost():
         smooth=jnp.zeros(2),
         guess=jnp.array([0.0, 0.05]),
     )
-    end = jax_solver.minimise(bounds, jax.tree.map(lambda x: x[None], problem))
+    solve = jax.jit(partial(jax_solver.minimise, bounds), compiler_options=FAST)
+    end = solve(jax.tree.map(lambda x: x[None], problem))
     np.testing.assert_allclose(end.x[0], [1000 * 1e4 / (1e4 + 1), 0], rtol=1e-5, atol=1e-6)
 
 
@@ -447,6 +448,7 @@ def test_jax_solves_equalities_dry_friction_limits_and_contacts_as_c_does():
     model.opt.tolerance = 1e-8
     m, d = mjx.put_model(model, impl="jax"), mjx.make_data(model, impl="jax")
     batch = jax.tree.map(lambda *x: np.stack(x), *states)
-    solved = jax.jit(jax.vmap(lambda state: jax_engine.forward_pass(m, d.replace(**state))))(batch)
+    forward_pass = jax.vmap(lambda state: jax_engine.forward_pass(m, d.replace(**state)))
+    solved = jax.jit(forward_pass, compiler_options=FAST)(batch)
     size = np.abs(accelerations).max(1, keepdims=True)
     np.testing.assert_allclose(solved.qacc / size, accelerations / size, rtol=0, atol=1e-4)

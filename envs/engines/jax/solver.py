@@ -153,8 +153,9 @@ def step(
     """How far to go along d: to where the cost stops to fall, by Newton's method kept within bounds."""
     rise0, bent0 = d.dot(at.inertial), d.dot(Md)
     flat = rows.tolerance * rows.ls_tolerance * jnp.linalg.norm(d) * jnp.trace(problem.M)
-    low, high, alpha, found = jnp.zeros(()), jnp.array(jnp.inf), jnp.ones(()), jnp.bool(False)
-    for _ in range(rows.trials):
+
+    def trial(_: Any, now: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+        low, high, alpha, found = now
         force, curvature = rows.pull(problem.D, at.residual + alpha * slope)
         rise = rise0 + alpha * bent0 - force.dot(slope)
         bent = bent0 + curvature.dot(slope**2)
@@ -164,4 +165,8 @@ def step(
         low, high = jnp.where(rise < 0, alpha, low), jnp.where(rise < 0, high, alpha)
         inside = (low < newton) & (newton < high)
         alpha = jnp.where(found, alpha, jnp.where(inside, newton, (low + high) / 2))
-    return alpha
+        return low, high, alpha, found
+
+    first = jnp.zeros(()), jnp.array(jnp.inf), jnp.ones(()), jnp.bool(False)
+    # few trials are quickest without a loop, and many would take half a minute to compile
+    return jax.lax.fori_loop(0, rows.trials, trial, first, unroll=min(rows.trials, TRIALS))[2]
