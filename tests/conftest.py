@@ -5,15 +5,12 @@ from pathlib import Path
 
 import jax
 import pytest
+from compiling import keep_programs
 
 from jaxsafe import algos, envs
 from jaxsafe.envs.view import backend
-from jaxsafe.run.devices import use_compilation_cache
 
-# What a first run of the tests compiles, the next one reads: small programs too, of which there are
-# thousands.
-use_compilation_cache()
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+keep_programs()
 
 # In the background the tests are told to ignore these. The programs that they start would inherit
 # that, but not a handler.

@@ -257,11 +257,12 @@ DEVICES = """
 import sys; sys.path.insert(0, sys.argv[1])
 import jax, jax.numpy as jnp, numpy as np
 from jax.sharding import AxisType, PartitionSpec as P
-from compiling import FAST
+from compiling import FAST, keep_programs
 from toys import Corridor
 sys.path.insert(0, sys.argv[1] + "/contract")
 from test_dreaming import ALGOS, START, at, settings_of
 
+keep_programs()
 mesh = jax.make_mesh((2,), ("devices",), axis_types=(AxisType.Auto,))
 def split(fn):
     def one(x, iteration):

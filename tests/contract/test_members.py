@@ -40,11 +40,12 @@ SHARDED = """
 import sys; sys.path.insert(0, sys.argv[1])
 import jax, jax.numpy as jnp, numpy as np
 from jax.sharding import AxisType, PartitionSpec as P
-from compiling import FAST
+from compiling import FAST, keep_programs
 from toys import START, Corridor, updated
 from jaxsafe.algos import ALGOS
 from jaxsafe.learn.estimates import Signals, scaled
 
+keep_programs()
 mesh = jax.make_mesh((2,), ("devices",), axis_types=(AxisType.Auto,))
 def split(fn):
     def one(x):

@@ -406,11 +406,12 @@ DEVICES = """
 import sys; sys.path.insert(0, sys.argv[1])
 import jax, jax.numpy as jnp, numpy as np
 from jax.sharding import AxisType, PartitionSpec as P
-from compiling import FAST
+from compiling import FAST, keep_programs
 from toys import START, Lever
 from jaxsafe.algos import ALGOS
 from jaxsafe.types import Shared
 
+keep_programs()
 UPDATES = 40
 
 def split(fn, devices=2):
