@@ -168,5 +168,5 @@ def step(
         return low, high, alpha, found
 
     first = jnp.zeros(()), jnp.array(jnp.inf), jnp.ones(()), jnp.bool(False)
-    # few trials are quickest without a loop, and many would take half a minute to compile
+    # fifty without a loop took half a minute to compile
     return jax.lax.fori_loop(0, rows.trials, trial, first, unroll=min(rows.trials, TRIALS))[2]
