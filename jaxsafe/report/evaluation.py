@@ -11,7 +11,7 @@ from jaxsafe.learn.constraints import limits_of
 from jaxsafe.report import scores, stats
 from jaxsafe.report.stats import Estimate
 from jaxsafe.run import memory, run_folder
-from jaxsafe.run.evaluate import Episodes, keys_of_episodes, measures, run_episodes
+from jaxsafe.run.evaluate import Episodes, keys_of_episodes, make_evaluation, measures
 from jaxsafe.run.policies import RunPolicies
 from jaxsafe.run.programs import members
 from jaxsafe.types import PyTree
@@ -36,10 +36,9 @@ def evaluate(run: RunPolicies, num: int, seed: int, data: PyTree = ()) -> list[S
     Of a run on a data set there are DSRL's scores too and, with `data`, the data's own episodes.
     """
     settings = run.settings
-    many = len(settings.configs)
-    memory.check_episodes(run.env, num, many * settings.train.num_seeds)
-    keys = keys_of_episodes(seed, num, many * settings.train.num_seeds, many)
-    episodes = run_episodes(run.algo, run.learned, num, seed, settings=many)
+    keys = keys_of_episodes(seed, num, settings.train.num_seeds, len(settings.configs))
+    memory.check_episodes(run.env, num, len(keys))
+    episodes = make_evaluation(run.algo, keys)(run.learned)
     examined = settings.row.examine(run.algo, run.learned, keys)
     tables = list(run_folder.by_setting(run_folder.read_metrics(run.folder)).values())
     cost_names = run.algo.task(jax.tree.map(lambda x: x[0], run.learned)).cost_names

@@ -60,23 +60,23 @@ def episode(
     return jax.tree.map(lambda x: x.sum(0), sums)
 
 
-def keys_of_episodes(seed: int, num_episodes: int, policies: int, settings: int) -> jax.Array:
-    """Keys [S, N] of N episodes of each of S policies, which are `settings` times their seeds.
+def keys_of_episodes(seed: int, num_episodes: int, num_seeds: int, settings: int = 1) -> jax.Array:
+    """Keys [S, N] of N episodes of each of S policies: `settings` times `num_seeds`.
 
     Seeds meet episodes of their own, so that an interval over seeds is one over layouts, too. Settings
     meet the same ones, and so do other algorithms, so that they differ by their policies alone.
     """
     key = jax.random.fold_in(jax.random.key(seed), 0x6576616C)
-    seeds = jnp.arange(policies) % (policies // settings)
+    seeds = jnp.arange(settings * num_seeds) % num_seeds
     return jax.vmap(lambda i: jax.random.split(jax.random.fold_in(key, i), num_episodes))(seeds)
 
 
 def make_evaluation(
-    algo: Algorithm, num_episodes: int, seed: int, sampled: bool = False, settings: int = 1
+    algo: Algorithm, keys: jax.Array, sampled: bool = False
 ) -> Callable[[PyTree], Episodes]:
-    """What plays `num_episodes` fresh episodes with each of S policies: learned [S, ...] -> Episodes.
+    """What plays the episodes of `keys` [S, N] with S policies: learned [S, ...] -> Episodes.
 
-    Which ones, `keys_of_episodes` says. It compiles once.
+    It compiles once.
     """
 
     def one_seed(learned: PyTree, keys: jax.Array) -> Episodes:
@@ -84,41 +84,32 @@ def make_evaluation(
         discounts = learned.config.discount, learned.config.cost_discount
         return jax.vmap(lambda key: episode(player, key, *discounts, sampled))(keys)
 
-    @jax.jit
-    def play(learned: PyTree) -> Episodes:
-        policies = len(jax.tree.leaves(learned)[0])
-        keys = keys_of_episodes(seed, num_episodes, policies, settings)
-        return jax.vmap(one_seed)(learned, keys)
-
-    return lambda learned: jax.tree.map(np.asarray, play(learned))
+    play = jax.jit(jax.vmap(one_seed))
+    return lambda learned: jax.tree.map(np.asarray, play(learned, keys))
 
 
 def run_episodes(
-    algo: Algorithm,
-    learned: PyTree,
-    num_episodes: int,
-    seed: int,
-    sampled: bool = False,
-    settings: int = 1,
+    algo: Algorithm, learned: PyTree, num_episodes: int, seed: int, sampled: bool = False
 ) -> Episodes:
-    """`num_episodes` fresh episodes for each of the S policies in `learned` (leading axis).
+    """`num_episodes` fresh episodes for each of the S policies in `learned` (leading axis), which are the
+    seeds of one setting.
 
-    Actions are the mean ones, or `sampled`. See `make_evaluation`.
+    Actions are the mean ones, or `sampled`.
     """
-    return make_evaluation(algo, num_episodes, seed, sampled, settings)(learned)
+    keys = keys_of_episodes(seed, num_episodes, len(jax.tree.leaves(learned)[0]))
+    return make_evaluation(algo, keys, sampled)(learned)
 
 
 def make_training_evaluation(
-    algo: Algorithm, num_episodes: int, seed: int, settings: int = 1
+    algo: Algorithm, keys: jax.Array
 ) -> Callable[[PyTree], dict[str, np.ndarray]]:
-    """What evaluates S policies during training: learned [S, ...] -> {name of a column: means [S]}.
+    """What evaluates S policies during training in the episodes of `keys` [S, N]: learned [S, ...] ->
+    {name of a column: means [S]}.
 
     The programs with mean and with sampled actions run one after the other, as two that call the host
     at once can wait for each other.
     """
-    players = [
-        make_evaluation(algo, num_episodes, seed, sampled, settings) for sampled in (False, True)
-    ]
+    players = [make_evaluation(algo, keys, sampled) for sampled in (False, True)]
 
     def evaluate(learned: PyTree) -> dict[str, np.ndarray]:
         played = [play(learned) for play in players]

@@ -11,8 +11,8 @@ def keys(*args):
 
 
 def test_seeds_meet_episodes_of_their_own_and_settings_the_same_ones():
-    three_seeds = keys(0, 4, 3, 1)
+    three_seeds = keys(0, 4, 3)
     assert len(np.unique(three_seeds.reshape(12, -1), axis=0)) == 12
-    np.testing.assert_array_equal(keys(0, 4, 6, 2), np.concatenate([three_seeds, three_seeds]))
-    np.testing.assert_array_equal(keys(0, 4, 5, 1)[:3], three_seeds)  # more seeds are more, no others
-    assert (keys(1, 4, 3, 1) != three_seeds).any(-1).all()
+    np.testing.assert_array_equal(keys(0, 4, 3, 2), np.concatenate([three_seeds, three_seeds]))
+    np.testing.assert_array_equal(keys(0, 4, 5)[:3], three_seeds)  # more seeds are more, no others
+    assert (keys(1, 4, 3) != three_seeds).any(-1).all()
