@@ -91,8 +91,8 @@ def make_evaluation(
 def run_episodes(
     algo: Algorithm, learned: PyTree, num_episodes: int, seed: int, sampled: bool = False
 ) -> Episodes:
-    """`num_episodes` fresh episodes for each of the S policies in `learned` (leading axis), which are the
-    seeds of one setting.
+    """`num_episodes` fresh episodes for each of the S policies in `learned` (leading axis), which are
+    the seeds of one setting.
 
     Actions are the mean ones, or `sampled`.
     """
