@@ -7,6 +7,7 @@ and `find_algo`.
 """
 
 import dataclasses
+import difflib
 import functools
 import math
 from collections.abc import Callable, Collection, Mapping
@@ -401,8 +402,10 @@ def check_option(name: str, known: dict[str, Any]) -> None:
     head, _, option = name.partition(".")
     if not option:
         if name not in known:
-            inside = [f"{kind}.{name}" for kind, group in groups.items() if name in group]
-            hint = f"; did you mean {inside[0]!r}?" if inside else nearest(name, known)
+            whole = {n: f"{kind}.{n}" for kind in ("algo", "env") for n in groups[kind]}
+            whole |= {n: n for n in known}
+            close = difflib.get_close_matches(name, whole, 1, cutoff=0.8)
+            hint = f"; did you mean {whole[close[0]]!r}?" if close else nearest(name, known)
             raise ConfigError(f"unknown option {name}{hint}")
         return
     if head not in groups:
