@@ -21,11 +21,10 @@ from jaxsafe.learn.offline import (
     decaying_adam,
     need_episodes,
     offline,
-    offline_adam,
 )
 from jaxsafe.learn.replay import Transitions
 from jaxsafe.learn.row import Row
-from jaxsafe.learn.steps import Trainable, descend_each
+from jaxsafe.learn.steps import Trainable, descend_each, skipping_adam
 from jaxsafe.nn.networks import coarse_mlp
 from jaxsafe.nn.vae import decode, draw_latent, init_vae, vae_losses
 from jaxsafe.types import Algorithm, Env, Metrics, PyTree
@@ -104,7 +103,7 @@ def learner(env: Env) -> Learner:
     def init(key: jax.Array, obs_size: int, action_size: int, cfg: Any) -> Trainable:
         obs = blank(observation_like(env)) if cfg.encoder == "cnn" else jnp.zeros(obs_size)
         actor = coarse_mlp(cfg, action_size).init(key, obs)
-        return Trainable({"actor": actor}, {"actor": offline_adam(cfg.lr, cfg).init(actor)})
+        return Trainable({"actor": actor}, {"actor": skipping_adam(cfg.lr, cfg).init(actor)})
 
     def mu(actor: PyTree, obs: PyTree, cfg: Any) -> jax.Array:
         out: Any = coarse_mlp(cfg, env.action_size).apply(actor, obs)
@@ -154,7 +153,7 @@ def check_safe(cfg: Any, data: Any) -> None:
 
 def init_autoencoder(key: jax.Array, obs_size: int, action_size: int, cfg: Any) -> Trainable:
     vae = init_vae(key, obs_size, action_size, cfg)
-    return Trainable({"vae": vae}, {"vae": offline_adam(cfg.lr, cfg).init(vae)})
+    return Trainable({"vae": vae}, {"vae": skipping_adam(cfg.lr, cfg).init(vae)})
 
 
 def vae_loss(vae: PyTree, batch: Transitions, key: jax.Array, cfg: Any) -> tuple[jax.Array, Metrics]:

@@ -28,11 +28,10 @@ from jaxsafe.learn.offline import (
     decaying_adam,
     episode_cost,
     offline,
-    offline_adam,
 )
 from jaxsafe.learn.replay import Transitions
 from jaxsafe.learn.row import Row
-from jaxsafe.learn.steps import Trainable, descend_each, follow
+from jaxsafe.learn.steps import Trainable, descend_each, follow, skipping_adam
 from jaxsafe.learn.treatments import Treatment, lagrangian, no_treatment
 from jaxsafe.nn.networks import coarse_mlp
 from jaxsafe.nn.vae import decode, draw_latent, init_vae
@@ -134,7 +133,7 @@ def learner(env: Env, treatment: Treatment = no_treatment) -> Learner:
             **init_all_critics(critic_key, (obs_size, action_size), 2, treatment, cfg),
         }
         params = trained | {"vae": init_vae(vae_key, obs_size, action_size, cfg)}
-        opt_state = {name: offline_adam(cfg.lr, cfg).init(x) for name, x in params.items()}
+        opt_state = {name: skipping_adam(cfg.lr, cfg).init(x) for name, x in params.items()}
         return Trainable(params | {"targets": trained}, opt_state)
 
     def xi(actor: PyTree, obs: jax.Array, action: jax.Array, cfg: Any) -> jax.Array:

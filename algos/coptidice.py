@@ -18,11 +18,10 @@ from jaxsafe.learn.offline import (
     decaying_adam,
     need_episodes,
     offline,
-    offline_adam,
 )
 from jaxsafe.learn.replay import Transitions
 from jaxsafe.learn.row import Row
-from jaxsafe.learn.steps import Trainable, descend_each
+from jaxsafe.learn.steps import Trainable, descend_each, skipping_adam
 from jaxsafe.learn.treatments import lagrangian
 from jaxsafe.nn.bounded import bounded_action, bounded_policy, init_bounded
 from jaxsafe.nn.gaussian import log_prob
@@ -112,7 +111,7 @@ def learner(env: Env) -> Learner:
             "tau": jnp.full((count,) if count else (), cfg.tau_init, jnp.float32),
         }
         return Trainable(
-            params, {name: offline_adam(cfg.lr, cfg).init(x) for name, x in params.items()}
+            params, {name: skipping_adam(cfg.lr, cfg).init(x) for name, x in params.items()}
         )
 
     def act(learned: Learned, obs: jax.Array, key: jax.Array | None) -> jax.Array:
@@ -174,7 +173,7 @@ def learner(env: Env) -> Learner:
             loss = net["tau"] * (cfg.cost_divergence - of_chi["train/cost_divergence"])
             return loss.sum(), {"train/tau": net["tau"]}
 
-        nets, of_tau = descend_each(tau_loss, nets, {"tau": offline_adam(cfg.tau_lr, cfg)})
+        nets, of_tau = descend_each(tau_loss, nets, {"tau": skipping_adam(cfg.tau_lr, cfg)})
         tau = jnp.maximum(nets.params["tau"], TAU_MIN)
         nets = nets._replace(params=nets.params | {"tau": tau})
         return nets, of_nu | of_chi | of_policy | of_tau

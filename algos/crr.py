@@ -26,11 +26,10 @@ from jaxsafe.learn.offline import (
     decaying_adam,
     episode_cost,
     offline,
-    offline_adam,
 )
 from jaxsafe.learn.replay import Transitions
 from jaxsafe.learn.row import Row
-from jaxsafe.learn.steps import Trainable, descend_each, follow
+from jaxsafe.learn.steps import Trainable, descend_each, follow, skipping_adam
 from jaxsafe.learn.treatments import Treatment, lagrangian, no_treatment
 from jaxsafe.nn.bounded import bounded_action, bounded_policy, init_bounded
 from jaxsafe.nn.gaussian import log_prob
@@ -96,7 +95,7 @@ def learner(env: Env, treatment: Treatment = no_treatment) -> Learner:
             "actor": init_bounded(actor_key, obs_size, action_size, cfg),
             **init_all_critics(critic_key, (obs_size, action_size), 2, treatment, cfg),
         }
-        opt_state = {name: offline_adam(cfg.lr, cfg).init(x) for name, x in params.items()}
+        opt_state = {name: skipping_adam(cfg.lr, cfg).init(x) for name, x in params.items()}
         return Trainable(params | {"targets": params}, opt_state)
 
     def act(learned: Learned, obs: jax.Array, key: jax.Array | None) -> jax.Array:

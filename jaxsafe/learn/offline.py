@@ -46,7 +46,7 @@ from jaxsafe.learn.observations import (
     with_vector,
 )
 from jaxsafe.learn.replay import Transitions
-from jaxsafe.learn.steps import Trainable, adam, remaining, skip_nonfinite, skipped_steps
+from jaxsafe.learn.steps import Trainable, remaining, skipped_steps, skipping_adam
 from jaxsafe.learn.treatments import LagrangianConfig, Treatment, no_treatment
 from jaxsafe.types import Algorithm, Clocks, Env, Metrics, PyTree, Shared
 
@@ -402,14 +402,9 @@ def episode_cost(q_c: jax.Array, cfg: Any, env: Env) -> jax.Array:
     return (1 - cfg.cost_discount) * env.episode_length * q_c
 
 
-def offline_adam(lr: jax.Array, cfg: Any) -> optax.GradientTransformation:
-    """Adam that leaves out a gradient that is not finite."""
-    return skip_nonfinite(adam(lr, cfg))
-
-
 def decaying_adam(lr: jax.Array, at: GradientStep, cfg: Any) -> optax.GradientTransformation:
-    """`offline_adam` at this moment, whose step has decayed if `cfg.lr_decay`."""
-    return offline_adam(lr * at.remaining if cfg.lr_decay else lr, cfg)
+    """`skipping_adam` at this moment, whose step has decayed if `cfg.lr_decay`."""
+    return skipping_adam(lr * at.remaining if cfg.lr_decay else lr, cfg)
 
 
 def check_costs(names: Names, data: DataSet) -> None:

@@ -100,7 +100,20 @@ def adam(lr: jax.Array | float, cfg: Any, eps: float = 1e-8) -> optax.GradientTr
     On a GPU a network's parameters are one array to it, so that a step has a few kernels, not a few for
     the weights of each layer. On a CPU to join them would take longer than it saves.
     """
-    steps = optax.chain(optax.clip_by_global_norm(cfg.max_grad_norm), optax.adam(lr, eps=eps))
+    return as_one_array(clipped_adam(lr, cfg, eps))
+
+
+def skipping_adam(lr: jax.Array | float, cfg: Any) -> optax.GradientTransformation:
+    """`adam` that leaves out a gradient that is not finite."""
+    return as_one_array(skip_nonfinite(clipped_adam(lr, cfg)))
+
+
+def clipped_adam(lr: jax.Array | float, cfg: Any, eps: float = 1e-8) -> optax.GradientTransformation:
+    return optax.chain(optax.clip_by_global_norm(cfg.max_grad_norm), optax.adam(lr, eps=eps))
+
+
+def as_one_array(steps: optax.GradientTransformation) -> optax.GradientTransformation:
+    """`steps` of all parameters joined, where that is faster."""
     return steps if jax.default_backend() == "cpu" else optax.flatten(steps)
 
 
