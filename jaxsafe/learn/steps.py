@@ -24,6 +24,8 @@ from jaxsafe.types import Count, Metrics, PyTree
 # (actor, batch) -> (this device's mean of what to maximise, metrics)
 Objective = Callable[[PyTree, Any], tuple[jax.Array, Metrics]]
 
+MOST_JOINED = 2**19  # parameters of a network that are one array to Adam on a GPU
+
 
 class Pair(NamedTuple):
     """Two objectives, for steps that weigh reward against cost themselves."""
@@ -97,8 +99,9 @@ class AdamConfig:
 def adam(lr: jax.Array | float, cfg: Any, eps: float = 1e-8) -> optax.GradientTransformation:
     """Adam on gradients no longer than `max_grad_norm`.
 
-    On a GPU a network's parameters are one array to it, so that a step has a few kernels, not a few for
-    the weights of each layer. On a CPU to join them would take longer than it saves.
+    On a GPU the parameters of a small network are one array to it, so that a step has a few kernels,
+    not a few for the weights of each layer. To join those of a large one, or any on a CPU, would take
+    longer than it saves.
     """
     return as_one_array(clipped_adam(lr, cfg, eps))
 
@@ -114,7 +117,19 @@ def clipped_adam(lr: jax.Array | float, cfg: Any, eps: float = 1e-8) -> optax.Gr
 
 def as_one_array(steps: optax.GradientTransformation) -> optax.GradientTransformation:
     """`steps` of all parameters joined, where that is faster."""
-    return steps if jax.default_backend() == "cpu" else optax.flatten(steps)
+    joined = optax.flatten(steps)
+
+    def faster(params: PyTree) -> optax.GradientTransformation:
+        few = optax.tree.size(params) <= MOST_JOINED
+        return joined if few and jax.default_backend() != "cpu" else steps
+
+    def init(params: PyTree) -> PyTree:
+        return faster(params).init(params)
+
+    def update(updates: PyTree, state: Any, params: PyTree | None = None) -> tuple[PyTree, Any]:
+        return faster(updates).update(updates, state, params)
+
+    return optax.GradientTransformation(init, update)
 
 
 class Skipping(NamedTuple):

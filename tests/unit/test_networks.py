@@ -8,7 +8,7 @@ from jaxsafe.algos.sac import SACConfig
 from jaxsafe.nn.cnn import patches
 from jaxsafe.nn.critics import init_critics, largest, q_values, smallest
 from jaxsafe.nn.gaussian import log_prob
-from jaxsafe.nn.networks import LOG_STD, action_dist, init_params, value
+from jaxsafe.nn.networks import LOG_STD, action_dist, aligned_dot, init_params, value
 
 
 def params(**settings):
@@ -120,3 +120,27 @@ def test_patches_times_a_matrix_are_a_convolution(side, stride):
     expected = jax.lax.conv_general_dilated(x, kernel, (stride, stride), "SAME", **exact)
     found = jnp.matmul(patches(x, side, stride), kernel.reshape(-1, 5), precision="highest")
     np.testing.assert_allclose(found, expected, atol=1e-4)
+
+
+def test_products_filled_up_with_zeros_are_the_same_products():
+    x_key, w_key = jax.random.split(jax.random.key(0))
+    dims = (((2,), (0,)), ((), ()))
+    for inputs, outputs in ((750, 750), (750, 2), (68, 750), (256, 256)):
+        x = jax.random.normal(x_key, (2, 3, inputs))
+        weight = jax.random.normal(w_key, (inputs, outputs))
+        filled = jax.value_and_grad(lambda x, w: (aligned_dot(x, w, dims) ** 2).sum(), (0, 1))
+        plain = jax.value_and_grad(lambda x, w: ((x @ w) ** 2).sum(), (0, 1))
+        for a, b in zip(*map(jax.tree.leaves, (filled(x, weight), plain(x, weight))), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-2)
+
+
+def test_a_gpu_s_products_have_whole_rows_of_16_bytes():
+    def shapes(inputs, outputs):
+        args = jnp.zeros((4, inputs)), jnp.zeros((inputs, outputs)), (((1,), (0,)), ((), ()))
+        jaxpr = jax.make_jaxpr(lambda x, w: aligned_dot(x, w, args[2]))(*args[:2])
+        [dot] = [e for e in jaxpr.eqns if e.primitive.name == "dot_general"]
+        return [x.aval.shape for x in dot.invars]
+
+    assert shapes(750, 750) == [(4, 752), (752, 752)]
+    assert shapes(750, 2) == [(4, 752), (752, 2)]
+    assert shapes(68, 256) == [(4, 68), (68, 256)]

@@ -114,6 +114,29 @@ def test_two_devices_take_the_step_of_one():
         np.testing.assert_allclose(a, b[0], rtol=1e-3, atol=1e-5)
 
 
+@pytest.mark.parametrize("joined", [True, False])
+def test_on_a_gpu_small_networks_are_one_array_to_adam_and_take_the_same_step(joined, monkeypatch):
+    if not joined:
+        monkeypatch.setattr("jaxsafe.learn.steps.MOST_JOINED", 10)
+    params, cfg = {"a": jnp.ones((3, 4)), "b": jnp.arange(5.0)}, PPOConfig(max_grad_norm=0.5)
+    grads = {"a": jnp.full((3, 4), 0.3), "b": -jnp.arange(5.0)}
+
+    def moved(optimiser):
+        state = optimiser.init(params)
+        for _ in range(3):
+            change, state = optimiser.update(grads, state)
+        return change, state
+
+    here = moved(adam(1e-2, cfg))[0]
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    there, state = moved(adam(1e-2, cfg))
+    jax.tree.map(np.testing.assert_allclose, here, there)
+    [mu] = [
+        x.mu for x in jax.tree.leaves(state, is_leaf=lambda x: hasattr(x, "mu")) if hasattr(x, "mu")
+    ]
+    assert (isinstance(mu, jax.Array) and mu.shape == (17,)) == joined
+
+
 fit_jitted = jax.jit(fit_critic, static_argnums=5, compiler_options=FAST)
 
 
