@@ -281,6 +281,10 @@ def dreaming_learner(env: Env, behaviour: Behaviour, policy: Policy | None = Non
             )
         if cfg.obs_bins == 1:
             raise ConfigError("obs_bins=1: expected 2 or more, or 0 for none")
+        if cfg.overshoot > cfg.n_step:
+            raise ConfigError(
+                f"overshoot={cfg.overshoot}: expected at most n_step={cfg.n_step}, a sequence's steps"
+            )
         size = SIZES[cfg.size]
         obs, action = blank(observation_like(env)), jnp.zeros(action_size)
         features = jnp.zeros(size.deter + size.latents * size.classes)

@@ -64,6 +64,9 @@ class WorldModelConfig(EncoderConfig, RoundConfig):
     dyn_scale: Weight = 1.0  # The weight of the prior's loss, as in the paper.
     rep_scale: Weight = 0.1  # The weight of the posterior's loss, as in the paper.
     free_nats: Weight = 1.0  # Nats below which neither loss is lowered further, as in the paper.
+    # Steps ahead, at most `n_step`, for which the heads learn in dreams that take the replayed actions.
+    # 0: none, as in the paper.
+    overshoot: Annotated[int, Bounds(0, 1000)] = 0
     # Whether running out of time is learned as an end, as the code of AMBS does. A time limit that is
     # not observed is no end, so the default is not to.
     limit_ends: bool = False
@@ -192,6 +195,8 @@ def model_loss(
 
         L = -log p(x, targets | h, z) + dyn max(free, KL(sg q || p)) + rep max(free, KL(q || sg p))
 
+    and, if `overshoot`, what the heads say in dreams.
+
     targets: for each head, float [T, B].
     """
     latents, (prior, posterior) = filtered(world, params, batch.rows, key)
@@ -209,7 +214,52 @@ def model_loss(
     metrics = {f"train/model_{name}_loss": loss for name, loss in losses.items()}
     metrics |= {"train/model_kl": mean(kl(posterior, prior))}
     total = sum(losses.values()) + cfg.dyn_scale * dyn + cfg.rep_scale * rep
+    if cfg.overshoot:
+        ahead = overshoot_loss(world, params, batch, latents, targets, jax.random.fold_in(key, 1), cfg)
+        total, metrics = total + ahead, metrics | {"train/model_overshoot_loss": ahead}
     return total, (latents, metrics)
+
+
+def overshoot_loss(
+    world: WorldModel,
+    params: PyTree,
+    batch: SequenceBatch,
+    latents: Latent,
+    targets: dict[str, jax.Array],
+    key: jax.Array,
+    cfg: Any,
+) -> jax.Array:
+    """This device's share of the heads' losses in dreams from the rows, along the replayed actions.
+
+        L = 1/K sum_k E_t[-log p(targets_{t+k} | h_{t+k}, z_{t+k})],   k = 1 .. K,   z from the prior
+
+    The dreams begin at all rows that have K = `overshoot` rows after them. What comes after the end of
+    an episode counts 0.
+
+    Args:
+        latents: of the rows [T, B].
+        targets: for each head, float [T, B].
+
+    Source: after Hafner et al. (2019), "Learning Latent Dynamics for Planning from Pixels",
+        arXiv:1811.04551, equation 7, where the latents are compared and not what the heads read.
+    """
+    starts = len(batch.rows.reward) - cfg.overshoot
+
+    def windows(x: jax.Array, first: int) -> jax.Array:
+        """[K, starts, ...]: rows `first` + k of each start."""
+        return jnp.stack([x[first + k : first + k + starts] for k in range(cfg.overshoot)])
+
+    def step(latent: Latent, x: tuple[jax.Array, jax.Array]) -> tuple[Latent, jax.Array]:
+        after: Any = world.apply(params, latent, *x, method="imagine")
+        return after, after.features
+
+    begin = jax.tree.map(lambda x: x[:starts], latents)
+    keys = jax.random.split(key, cfg.overshoot)
+    features = jax.lax.scan(step, begin, (windows(batch.rows.action, 0), keys))[1]
+    outputs: Any = world.apply(params, features, method="read")
+    counts = jnp.cumprod(windows(batch.follows, 0), axis=0)
+    losses = sum(head_loss(outputs[name], windows(x, 1)) for name, x in targets.items())
+    return (batch.weight * (counts * losses).mean((0, 1))).sum()
 
 
 def head_loss(outputs: jax.Array, target: jax.Array) -> jax.Array:

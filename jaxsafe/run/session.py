@@ -120,8 +120,8 @@ def check_same_run(settings: Settings, folder: Path) -> None:
     for name, (here, there) in differences(flat(settings.plain()), saved).items():
         if name not in free:
             raise ConfigError(
-                f"{name}={here} but {folder} was trained with {there}; "
-                f"for a new run from its policy use init_from={folder}"
+                f"{name}={here} but {folder} was trained with {there}; resume={folder} goes on with "
+                f"its settings, and init_from={folder} begins a new run with its policy"
             )
 
 

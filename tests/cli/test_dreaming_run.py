@@ -1,14 +1,17 @@
 """A run under a shield: resumed, evaluated, and played for a film."""
 
 import json
+import runpy
 import shutil
 
 import jax
 import numpy as np
 import pytest
-from shell import TOY, assert_same_run, typed
+from shell import SCRIPTS, TOY, assert_same_run, typed
 
+from jaxsafe.algos import ambs
 from jaxsafe.envs.view import render
+from jaxsafe.report.dreams import play
 from jaxsafe.run import checkpoint
 from jaxsafe.run.policies import open_run
 
@@ -19,6 +22,7 @@ AMBS = (
     "algo.labels=[wall]", "eval_episodes=2", "video=false",
 )  # fmt: skip
 STEPS = 32  # of an update
+foresight = runpy.run_path(str(SCRIPTS / "foresight.py"))
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +55,33 @@ def test_evaluation_says_what_the_shield_does_and_a_film_has_where(trained):
     run = open_run(trained, (TOY,))
     states, said = render.run_episode(run.one(0).player, jax.random.key(0), 20)
     assert np.isfinite(states.obs).all() and said["overruled"].shape == (20,)
+
+
+@pytest.mark.slow
+def test_foresight_compares_dreams_with_what_came(trained):
+    player = open_run(trained, (TOY,)).one(0).player
+    episodes = jax.vmap(lambda key: play(player, key))(jax.random.split(jax.random.key(0), 3))
+    cost = np.asarray(episodes.state.cost)
+    found = foresight["costs_ahead"](player, ambs.shielded_behaviour, episodes, 4, jax.random.key(1))
+    starts = np.arange(20, cost.shape[1] - 4, 3)
+    for k in range(4):
+        np.testing.assert_array_equal(found.paid[k].reshape(3, -1), cost[:, starts + k + 1])
+    assert found.predicted.shape == found.paid.shape and np.isfinite(found.predicted).all()
+
+
+def test_an_area_of_1_sorts_all_and_a_half_is_a_coin_s():
+    area, true = foresight["roc_area"], np.array([True, False, True, False])
+    assert area(np.array([3.0, 1.0, 2.0, 0.0]), true) == 1.0
+    assert area(np.array([0.0, 1.0, 0.0, 1.0]), true) == 0.0
+    assert area(np.zeros(4), true) == 0.5
+    assert area(np.array([2.0, 1.0, 0.0, 0.0]), true) == 0.625  # 2 > 1, 2 > 0, 0 < 1, 0 = 0
+    assert np.isnan(area(np.zeros(2), np.ones(2, bool)))
+
+
+def test_the_mean_explains_nothing_and_the_truth_explains_all():
+    explained, paid = foresight["explained"], np.array([0.0, 1.0, 2.0])
+    assert explained(paid, paid) == 1.0 and explained(np.ones(3), paid) == 0.0
+    np.testing.assert_allclose(explained(paid[::-1], paid), -3.0)
 
 
 def test_a_label_that_the_environment_does_not_have_is_refused_in_a_line(capsys, tmp_path):

@@ -101,6 +101,7 @@ def test_published_settings_build(name):
     [
         ({"n_step": 4}, r"batch_size=32: expected a multiple of n_step \+ 1 = 5"),
         ({"obs_bins": 1}, "obs_bins=1: expected 2 or more, or 0 for none"),
+        ({"overshoot": 16}, "overshoot=16: expected at most n_step="),
         ({"batch_size": 24}, "replay_ratio=2.*replay_ratio=3 or batch_size=32"),
         ({"batch_size": 128, "replay_ratio": 4}, "replay_size=96 holds 24 steps of 4 environments"),
     ],

@@ -287,6 +287,54 @@ def test_divergences_below_a_nat_are_left_alone():
     assert any((x != 0).any() for x in jax.tree.leaves(paid))
 
 
+def test_overshooting_reads_dreams_of_the_replayed_actions_until_an_episode_ends():
+    """Against a loop over starts and steps, with sequences that begin anew."""
+    rows = recorded(Ticker(episode_length=5), 12)
+    world, params = tiny()
+    params = jax.tree.map(lambda x: x + 0.01, params)  # the heads are 0 at first
+    cfg, ahead = dreamer.DreamerConfig(size="tiny", n_step=11, overshoot=4), 4
+    weight, key = jnp.array([0.5, 0.25, 0.25]), jax.random.key(3)
+    batch = SequenceBatch(rows, weight)
+    latents, _ = world_model.filtered(world, params, rows, None)
+    targets = {"reward": rows.reward, "cont": world_model.goes_on(rows, cfg)}
+    loss = jax.jit(lambda p: world_model.overshoot_loss(world, p, batch, latents, targets, key, cfg))
+
+    starts, total = 12 - ahead, np.zeros(3)
+    now, counts = jax.tree.map(lambda x: x[:starts], latents), np.ones((starts, 3), bool)
+    for k, step_key in enumerate(jax.random.split(key, ahead)):
+        action = rows.action[k : k + starts]
+        now: Any = world.apply(params, now, action, step_key, method="imagine")
+        says: Any = world.apply(params, now.features, method="read")
+        for i in range(starts):
+            ended, begun = rows.last[i + k], rows.first[i + k + 1]
+            counts[i] &= ~np.asarray(ended | begun)
+            for name, target in targets.items():
+                of = world_model.head_loss(says[name][i], target[i + k + 1])
+                total += np.where(counts[i], of, 0.0) / (starts * ahead)
+    assert 0 < counts.sum() < counts.size  # some dreams go over an end
+    np.testing.assert_allclose(loss(params), (weight * total).sum(), rtol=1e-4)
+    grads = jax.jit(jax.grad(lambda p: loss(p)))(params)["params"]
+    assert all((x == 0).all() for x in jax.tree.leaves(grads["encoder"]))  # the rows are given
+    assert any((x != 0).any() for x in jax.tree.leaves(grads["before"]))
+
+
+def test_the_model_s_loss_has_what_heads_say_in_dreams_only_if_told_to():
+    rows, (world, params) = recorded(Ticker(episode_length=5), 12), tiny()
+    batch, key = SequenceBatch(rows, jnp.full(3, 1 / 3)), jax.random.key(1)
+
+    @partial(jax.jit, static_argnums=0)
+    def found(overshoot, params):
+        cfg = dreamer.DreamerConfig(size="tiny", n_step=11, overshoot=overshoot)
+        total, (_, metrics) = world_model.model_loss(
+            world, params, batch, {"reward": rows.reward}, key, cfg
+        )
+        return total, metrics
+
+    (without, plain), (whole, metrics) = found(0, params), found(3, params)
+    assert "train/model_overshoot_loss" not in plain
+    np.testing.assert_allclose(whole - without, metrics["train/model_overshoot_loss"], rtol=1e-3)
+
+
 @pytest.mark.slow
 def test_the_model_foresees_a_deterministic_toy():
     """A point mass: ten steps ahead, unseen, within a quarter of the error of standing still."""
