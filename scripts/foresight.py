@@ -96,6 +96,12 @@ def main() -> int:
             raise ConfigError(f"algo={name}: expected one whose model predicts cost: {[*BEHAVIOURS]}")
         play_key, dream_key = jax.random.split(jax.random.key(args.seed))
         player = run.player()
+        most = player.task.episode_length - FIRST - 1
+        if not (1 <= args.depth <= most and args.episodes >= 1):
+            raise ConfigError(
+                f"--episodes {args.episodes} --depth {args.depth}: expected at least one episode, and "
+                f"a depth from 1 to {most}"
+            )
     except ConfigError as error:
         print(error, file=sys.stderr)
         return 2
