@@ -1,13 +1,14 @@
-"""DreamerV3, which learns in the dreams of a world model; and with a multiplier on cost."""
+"""DreamerV3, which learns in the dreams of a world model; and with a price on cost."""
 
 from functools import partial
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from jaxsafe.config import Bounds, Weight, config
+from jaxsafe.config import Amount, Bounds, Cap, Share, Weight, config
 from jaxsafe.learn.batch import pmean
+from jaxsafe.learn.bill import PriceClockConfig
 from jaxsafe.learn.dreaming import (
     Behaviour,
     Judged,
@@ -21,6 +22,7 @@ from jaxsafe.learn.dreaming import (
 )
 from jaxsafe.learn.off_policy import off_policy
 from jaxsafe.learn.row import Row
+from jaxsafe.learn.treatments import CappedPIDConfig, Treatment, capped_pid, no_treatment
 from jaxsafe.learn.world_model import Dreams, WorldModelConfig
 from jaxsafe.nn.two_hot import BINS
 from jaxsafe.types import Algorithm, Env, Metrics, PyTree
@@ -83,6 +85,49 @@ class DreamerLagConfig(DreamerConfig):
     mu_growth: Weight = 1e-6  # The growth of mu at each gradient step, as in AMBS's code.
     # mu is at least this from the second step on, as in AMBS's code.
     mu_least: Weight = 1.0
+
+
+@config
+class DreamerPIDConfig(CappedPIDConfig, PriceClockConfig, DreamerConfig):
+    """Dreamer-PID: Dreamer whose actor pays for cost in its dreams, at a price that real episodes set.
+
+        L_actor <- L_actor + E[u_t lam sg (R_c_t - V_c_t) log pi(a_t)]
+        I   <- clip(I + pid_ki e, 0, price_max),   e = J_c - cost_limit,   every `dual_every` steps
+        lam  = clip(pid_kp e + I + pid_kd max(0, J_c - J_c'), 0, price_max)
+
+    R_c are TD(lambda) returns of the predicted cost, and V_c is a critic of them. With
+    `actor_grad=backprop` the term is E[u_t lam R_c_t]. J_c is the smoothed cost of real episodes, and
+    J_c' what it was before. So the limit holds where a dream tells less of cost than there is. The rest
+    is as in Dreamer.
+
+    Source: ours, after Huang et al. (2024), "SafeDreamer: Safe Reinforcement Learning with World
+    Models", arXiv:2307.07176, whose planner has such a price; Stooke, Achiam and Abbeel (2020),
+    "Responsive Safety in Reinforcement Learning by PID Lagrangian Methods", arXiv:2007.03964.
+    Differs from Dreamer as it is here: networks and batches are larger, there are fewer environments,
+    and the heads also learn in dreams, so that the model foresees cost. There are as many gradient
+    steps as in Dreamer.
+    """
+
+    # The discount of costs: 33 steps ahead.
+    cost_discount: Annotated[float, Bounds(0, 0.9999)] = 0.97
+    cost_limit: Weight = 25.0  # The undiscounted cost that an episode may have.
+    # Environment steps between two moves of the price.
+    dual_every: Annotated[int, Bounds(1, 2**30)] = 2_000
+    pid_kp: Weight = 0.001  # Price for each unit of violation.
+    pid_ki: Weight = 1e-4  # Price that each unit of violation adds at each move.
+    pid_kd: Weight = 0.0  # Price for each unit that the cost rose.
+    # Share of the past in the smoothed cost of an episode.
+    pid_smoothing: Share = 0.9
+    price_max: Cap = float("inf")  # The highest price.
+    num_envs: Amount = 16  # Environments side by side, of all devices together.
+    replay_ratio: Amount = 128  # Rows replayed for each environment step.
+    batch_size: Amount = 1024  # Rows of a gradient step, of all devices together.
+    # Environment steps with random actions and without learning.
+    learning_starts: Amount = 1_024
+    # The networks' size: about the number of parameters, if pictures are observed.
+    size: Literal["tiny", "300k", "500k", "1m", "12m", "25m", "50m", "100m", "200m"] = "500k"
+    # Steps ahead, at most `n_step`, for which the heads learn in dreams that take the replayed actions.
+    overshoot: Annotated[int, Bounds(0, 1000)] = 8
 
 
 # ---- without constraint ------------------------------------------------------------------------
@@ -197,11 +242,34 @@ priced = Behaviour(
 )
 
 
+# ---- at a price that real episodes set ---------------------------------------------------------
+
+
+def learn_at_a_price(
+    trained: dict[str, PyTree], memory: PyTree, scene: Scene, key: jax.Array
+) -> Outcome:
+    found = learn_reward(trained, memory["range"], scene, key)
+    costs, critic_loss, metrics = learn_cost(trained, found.dreams, scene)
+    paid = costs.advantage
+    if scene.cfg.actor_grad == "reinforce":
+        paid = fixed(paid) * found.dreams.log_prob
+    bill = scene.over_dreams(found.dreams.weight[:-1] * scene.dual.lam * paid)
+    return Outcome(found.loss + bill + critic_loss, {"range": found.range}, found.metrics | metrics)
+
+
+billed = priced._replace(learn=learn_at_a_price, memory=blind.memory)
+
+
 # ---- rows --------------------------------------------------------------------------------------
 
 
-def make(env: Env, axis_name: str | None = None, behaviour: Behaviour = blind) -> Algorithm:
-    return off_policy(env, dreaming_learner(env, behaviour), axis_name=axis_name)
+def make(
+    env: Env,
+    axis_name: str | None = None,
+    behaviour: Behaviour = blind,
+    treatment: Treatment = no_treatment,
+) -> Algorithm:
+    return off_policy(env, dreaming_learner(env, behaviour), treatment, axis_name)
 
 
 # the authors' values of settings that have other defaults here
@@ -260,5 +328,13 @@ ROWS = {
         # with a mu of 1 the multiplier overshoots, and costs stay near 1.4; with reinforce one of two
         # seeds earns 9.8 of 14.4 after 160 updates, with backprop both earn 13.8
         lever=LEVER | {"mu_least": 0.05, "actor_grad": "backprop"},
+    ),
+    "dreamer_pid": Row(
+        DreamerPIDConfig,
+        partial(make, behaviour=billed, treatment=capped_pid),
+        "Dreamer whose dreams pay for cost, at a price that a controller sets by real episodes",
+        {"cpu": CPU | {"batch_size": 256, "replay_ratio": 32}},
+        total_steps=1_000_000,
+        lever=LEVER | {"overshoot": 0, "dual_every": 256, "dual_starts": 512},
     ),
 }

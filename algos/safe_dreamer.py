@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxsafe.algos import dreamer
-from jaxsafe.config import Amount, Bounds, Cap, Iterations, Share, Weight, config
+from jaxsafe.config import Amount, Bounds, Iterations, Share, Weight, config
 from jaxsafe.learn.acting import Learned
 from jaxsafe.learn.bill import PriceClockConfig
 from jaxsafe.learn.dreaming import (
@@ -22,10 +22,10 @@ from jaxsafe.learn.dreaming import (
 from jaxsafe.learn.off_policy import off_policy
 from jaxsafe.learn.planning import PlanConfig, cem, elites, key_of_step, moved_on, particles_of
 from jaxsafe.learn.row import Row
-from jaxsafe.learn.treatments import Treatment, no_treatment
+from jaxsafe.learn.treatments import CappedPIDConfig, Treatment, capped_pid, no_treatment
 from jaxsafe.learn.world_model import dream_returns, read, value_of, world_of
 from jaxsafe.nn.rssm import Latent
-from jaxsafe.types import Algorithm, Count, Env, Metrics, Policy, PyTree
+from jaxsafe.types import Algorithm, Env, Metrics, Policy, PyTree
 
 
 @config
@@ -68,7 +68,7 @@ class OSRPConfig(PlanConfig, dreamer.DreamerConfig):
 
 
 @config
-class OSRPLagConfig(PriceClockConfig, OSRPConfig):
+class OSRPLagConfig(CappedPIDConfig, PriceClockConfig, OSRPConfig):
     """OSRP-Lag: OSRP whose plans also pay for cost, at the price of a PID controller.
 
         elites: the largest R - lam R_c, among the same plans as in OSRP
@@ -89,13 +89,6 @@ class OSRPLagConfig(PriceClockConfig, OSRPConfig):
     dual_every: Annotated[int, Bounds(1, 2**30)] = 1_000
     # Environment steps before the price first moves, as in the authors' code.
     dual_starts: Annotated[int, Bounds(0, 2**31 - 1)] = 5_000
-    pid_kp: Weight = 0.1  # Price for each unit of violation, as in the authors' code.
-    # Price that each unit of violation adds at each move, as in the authors' code.
-    pid_ki: Weight = 0.01
-    pid_kd: Weight = 0.01  # Price for each unit that the cost rose, as in the authors' code.
-    # Share of the past in the smoothed cost of an episode, as in the authors' code.
-    pid_smoothing: Share = 0.99
-    price_max: Cap = 0.1  # The highest price, as in the authors' code.
 
 
 # ---- learning ----------------------------------------------------------------------------------
@@ -112,36 +105,6 @@ def learn_with_cost_critic(
 
 planned = dreamer.blind._replace(heads=dreamer.priced.heads, targets=dreamer.priced.targets)
 planned_at_a_price = planned._replace(learn=learn_with_cost_critic, critics=("critic_r", "critic_c"))
-
-
-class Price(NamedTuple):
-    """What the controller remembers, float [] each.
-
-    lam: the price.
-    integral: `pid_ki` times the sum of violations, within [0, price_max].
-    cost: the smoothed cost of an episode, 0 at first.
-    """
-
-    lam: jax.Array
-    integral: jax.Array
-    cost: jax.Array
-
-
-def move_price(price: Price, episode_cost: jax.Array, cfg: Any, iteration: Count) -> Price:
-    cost = cfg.pid_smoothing * price.cost + (1 - cfg.pid_smoothing) * episode_cost
-    error = cost - cfg.cost_limit
-    integral = jnp.clip(price.integral + cfg.pid_ki * error, 0.0, cfg.price_max)
-    rise = jnp.maximum(0.0, cost - price.cost)
-    lam = jnp.clip(cfg.pid_kp * error + integral + cfg.pid_kd * rise, 0.0, cfg.price_max)
-    return Price(lam, integral, cost)
-
-
-controller = Treatment(
-    init=lambda cfg: Price(*jnp.zeros(3)),
-    update=move_price,
-    advantage=lambda price, adv_r, adv_c: adv_r - price.lam * adv_c,
-    metrics=lambda price: {"train/lam": price.lam},
-)
 
 
 # ---- planning ----------------------------------------------------------------------------------
@@ -247,7 +210,7 @@ ROWS = {
     ),
     "osrp_lag": Row(
         OSRPLagConfig,
-        partial(make, behaviour=planned_at_a_price, treatment=controller),
+        partial(make, behaviour=planned_at_a_price, treatment=capped_pid),
         "OSRP whose plans also pay for cost, at the price of a PID controller",
         {"safe_dreamer": dreamer.VECTORS},
         total_steps=1_000_000,

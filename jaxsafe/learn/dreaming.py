@@ -87,7 +87,7 @@ class Scene(NamedTuple):
     """What a behaviour learns from.
 
     world: the model. params: all networks by name, without gradient. latents: of the rows [T, B] of
-    `batch`, without gradient.
+    `batch`, without gradient. dual: the state of the treatment of the constraint, () without one.
     """
 
     env: Env
@@ -95,6 +95,7 @@ class Scene(NamedTuple):
     params: dict[str, PyTree]
     batch: SequenceBatch
     latents: Latent
+    dual: PyTree
     cfg: Any
     axis_name: str | None
 
@@ -319,7 +320,7 @@ def dreaming_learner(env: Env, behaviour: Behaviour, policy: Policy | None = Non
                 world, trained["model"], batch, targets, model_key, cfg
             )
             params = nets.params | fixed(trained)
-            scene = Scene(env, world, params, batch, fixed(latents), cfg, axis_name)
+            scene = Scene(env, world, params, batch, fixed(latents), at.dual, cfg, axis_name)
             found = behaviour.learn(trained, nets.opt_state["memory"], scene, dream_key)
             return of_model + found.loss, {"found": fixed((metrics | found.metrics, found.memory))}
 

@@ -195,6 +195,51 @@ pid = Treatment(
 
 
 @config
+class CappedPIDConfig:
+    """For `capped_pid`."""
+
+    pid_kp: Weight = 0.1  # Price for each unit of violation, as in SafeDreamer's code.
+    # Price that each unit of violation adds at each move, as in SafeDreamer's code.
+    pid_ki: Weight = 0.01
+    pid_kd: Weight = 0.01  # Price for each unit that the cost rose, as in SafeDreamer's code.
+    # Share of the past in the smoothed cost of an episode, as in SafeDreamer's code.
+    pid_smoothing: Share = 0.99
+    price_max: Cap = 0.1  # The highest price, as in SafeDreamer's code.
+
+
+class CappedPID(NamedTuple):
+    """What the controller remembers, float [] each.
+
+    lam: the price.
+    integral: `pid_ki` times the sum of violations, within [0, price_max].
+    cost: the smoothed cost of an episode, 0 at first.
+    """
+
+    lam: jax.Array
+    integral: jax.Array
+    cost: jax.Array
+
+
+def control_capped(price: CappedPID, episode_cost: jax.Array, cfg: Any, iteration: Count) -> CappedPID:
+    cost = cfg.pid_smoothing * price.cost + (1 - cfg.pid_smoothing) * episode_cost
+    error = cost - cfg.cost_limit
+    integral = jnp.clip(price.integral + cfg.pid_ki * error, 0.0, cfg.price_max)
+    rise = jnp.maximum(0.0, cost - price.cost)
+    lam = jnp.clip(cfg.pid_kp * error + integral + cfg.pid_kd * rise, 0.0, cfg.price_max)
+    return CappedPID(lam, integral, cost)
+
+
+# Huang et al. (2024), "SafeDreamer: Safe Reinforcement Learning with World Models", arXiv:2307.07176,
+# from their code
+capped_pid = Treatment(
+    init=lambda cfg: CappedPID(*jnp.zeros(3)),
+    update=control_capped,
+    advantage=lambda price, adv_r, adv_c: adv_r - price.lam * adv_c,
+    metrics=lambda price: {"train/lam": price.lam},
+)
+
+
+@config
 class BarrierConfig:
     """For `barrier`."""
 
