@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxsafe.config import Amount, Bounds, Cap, Share, Weight, config
+from jaxsafe.config import Amount, Bounds, Cap, Iterations, Share, Weight, config
 from jaxsafe.learn.batch import pmean
 from jaxsafe.learn.bill import PriceClockConfig
 from jaxsafe.learn.dreaming import (
@@ -103,9 +103,9 @@ class DreamerPIDConfig(CappedPIDConfig, PriceClockConfig, DreamerConfig):
     Source: ours, after Huang et al. (2024), "SafeDreamer: Safe Reinforcement Learning with World
     Models", arXiv:2307.07176, whose planner has such a price; Stooke, Achiam and Abbeel (2020),
     "Responsive Safety in Reinforcement Learning by PID Lagrangian Methods", arXiv:2007.03964.
-    Differs from Dreamer as it is here: networks and batches are larger, there are fewer environments,
-    and the heads also learn in dreams, so that the model foresees cost. There are as many gradient
-    steps as in Dreamer.
+    Differs from Dreamer as it is here: networks and batches are larger, dreams are longer, there are
+    fewer environments, and the heads also learn in dreams, so that the model foresees cost. There are
+    as many gradient steps as in Dreamer.
     """
 
     # The discount of costs: 33 steps ahead.
@@ -127,7 +127,8 @@ class DreamerPIDConfig(CappedPIDConfig, PriceClockConfig, DreamerConfig):
     # The networks' size: about the number of parameters, if pictures are observed.
     size: Literal["tiny", "300k", "500k", "1m", "12m", "25m", "50m", "100m", "200m"] = "500k"
     # Steps ahead, at most `n_step`, for which the heads learn in dreams that take the replayed actions.
-    overshoot: Annotated[int, Bounds(0, 1000)] = 8
+    overshoot: Annotated[int, Bounds(0, 1000)] = 15
+    imagine_steps: Iterations = 15  # Steps of a dream, as in the paper.
 
 
 # ---- without constraint ------------------------------------------------------------------------
@@ -301,6 +302,10 @@ SAFE_DREAMER: dict[str, Any] = VECTORS | {
 }  # fmt: skip
 # for two cores and half an hour
 CPU: dict[str, Any] = {"num_envs": 16, "replay_size": 200_000, "learning_starts": 1024}
+# Dreamer's batches and dreams, where Dreamer-PID has larger ones
+SMALL: dict[str, Any] = {
+    "batch_size": 256, "replay_ratio": 32, "overshoot": 8, "imagine_steps": 10,
+}  # fmt: skip
 # for a problem of two levers, whose next signs nobody can foresee
 LEVER: dict[str, Any] = {
     "num_envs": 16, "horizon": 16, "learn_every": 8, "replay_ratio": 8, "batch_size": 128, "n_step": 7,
@@ -333,8 +338,8 @@ ROWS = {
         DreamerPIDConfig,
         partial(make, behaviour=billed, treatment=capped_pid),
         "Dreamer whose dreams pay for cost, at a price that a controller sets by real episodes",
-        {"cpu": CPU | {"batch_size": 256, "replay_ratio": 32}},
+        {"cpu": CPU | SMALL},
         total_steps=1_000_000,
-        lever=LEVER | {"overshoot": 0, "dual_every": 256, "dual_starts": 512},
+        lever=LEVER | {"overshoot": 0, "dual_every": 256, "pid_kp": 0.05, "pid_ki": 0.02},
     ),
 }

@@ -64,7 +64,7 @@ FAMILIES = {  # the pages of docs/theory
     "recorded_data": ("bcq", "bcq_lag", "crr", "ccrr", "coptidice"),
     "planning": ("pets", "cce_pets", "rce_pets", "cap_pets", "loop", "safe_loop"),
     "certificates": ("crabs",),
-    "world_models": ("dreamer", "dreamer_lag", "osrp", "osrp_lag", "ambs"),
+    "world_models": ("dreamer", "dreamer_lag", "dreamer_pid", "osrp", "osrp_lag", "ambs"),
 }
 PLANNING = " env.observation=coordinates env.wrap.action_repeat=5 algo.learn_cost=false"
 LOOPS = {  # the first that an algorithm's config is one of

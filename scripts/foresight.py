@@ -24,6 +24,7 @@ from jaxsafe.report.dreams import Episode, foreseen, play
 
 BEHAVIOURS: dict[str, Behaviour] = {
     "dreamer_lag": dreamer.priced,
+    "dreamer_pid": dreamer.billed,
     "osrp": safe_dreamer.planned,
     "osrp_lag": safe_dreamer.planned_at_a_price,
     "ambs": ambs.shielded_behaviour,

@@ -1,6 +1,8 @@
 """Dreamer's losses by hand, and the augmented Lagrangian."""
 
 import dataclasses
+from types import SimpleNamespace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +10,8 @@ import numpy as np
 from toys import Corridor
 
 from jaxsafe.algos import dreamer
-from jaxsafe.learn.dreaming import Judged
+from jaxsafe.learn.dreaming import Judged, no_range
+from jaxsafe.learn.treatments import CappedPID
 
 CFG = dreamer.DreamerLagConfig()
 
@@ -57,3 +60,35 @@ def test_the_limit_of_an_episode_is_that_of_a_steady_stream_of_cost():
     np.testing.assert_allclose(dreamer.discounted_limit(Corridor(), cfg), 0.4)
     env = Corridor(episode_length=1000)
     np.testing.assert_allclose(dreamer.discounted_limit(env, CFG), 1.0, rtol=1e-4)
+
+
+def test_at_a_price_the_actor_pays_for_what_its_dreams_cost_beyond_the_mean(monkeypatch):
+    """Two dreams of two steps at a price of 0.5: by reinforce (R - V) log pi, by backprop R - V."""
+    returns, value = (
+        jnp.array([[1.0, 4.0], [2.0, 0.0]]),
+        jnp.array([[3.0, 1.0], [2.0, 1.0], [9.0, 9.0]]),
+    )
+    weight = jnp.array([[1.0, 1.0], [0.5, 0.5], [0.25, 0.25]])
+
+    def loss(actor_grad: str, log_prob: jax.Array, returns: jax.Array) -> jax.Array:
+        dreams = SimpleNamespace(weight=weight, log_prob=log_prob)
+        wishes: Any = dreamer.Wishes(dreams, no_range(), jnp.float32(7), {"a": 1})  # type: ignore[arg-type]
+        scene: Any = SimpleNamespace(
+            cfg=SimpleNamespace(actor_grad=actor_grad),
+            dual=CappedPID(*(jnp.float32(x) for x in (0.5, 0, 0))),
+            over_dreams=lambda x: x.mean(),
+        )
+        monkeypatch.setattr(dreamer, "learn_reward", lambda *args: wishes)
+        found = Judged(returns, value), jnp.float32(2), {"b": 2}
+        monkeypatch.setattr(dreamer, "learn_cost", lambda *args: found)
+        outcome = dreamer.learn_at_a_price({}, {"range": no_range()}, scene, jax.random.key(0))
+        assert outcome.metrics == {"a": 1, "b": 2}
+        return outcome.loss
+
+    log_prob = jnp.array([[-1.0, -2.0], [-3.0, -4.0]])
+    pays = 0.5 * weight[:2] * (returns - value[:2])  # [[-1, 1.5], [0, -0.25]]
+    np.testing.assert_allclose(loss("reinforce", log_prob, returns), 9 + (pays * log_prob).mean())
+    slopes = jax.grad(loss, argnums=(1, 2))("reinforce", log_prob, returns)
+    np.testing.assert_allclose(slopes, [pays / 4, jnp.zeros((2, 2))])
+    slopes = jax.grad(loss, argnums=(1, 2))("backprop", log_prob, returns)
+    np.testing.assert_allclose(slopes, [jnp.zeros((2, 2)), 0.5 * weight[:2] / 4])

@@ -12,14 +12,14 @@ from toys import Corridor
 
 from jaxsafe.algos import safe_dreamer
 from jaxsafe.learn.acting import Learned
-from jaxsafe.learn.treatments import no_treatment
+from jaxsafe.learn.treatments import CappedPID, capped_pid, control_capped, no_treatment
 from jaxsafe.nn.rssm import Latent
 
 CFG = safe_dreamer.OSRPLagConfig(
     discount=0.5, cost_discount=0.5, td_lambda=1.0, plan_steps=2, plans=200, elites=20
 )
 NOWHERE = Latent(jnp.zeros(1), jnp.zeros(1))
-PRICE = safe_dreamer.Price(jnp.float32(0.1), jnp.float32(0), jnp.float32(0))
+PRICE = CappedPID(jnp.float32(0.1), jnp.float32(0), jnp.float32(0))
 
 
 class Line:
@@ -53,7 +53,7 @@ def test_a_plan_earns_its_discounted_rewards_and_costs_as_much_as_an_episode_of_
     ret, cost = safe_dreamer.scores(Corridor(), safe_dreamer.planned, no_treatment, *args)
     np.testing.assert_allclose(ret, [1.0, 2.0], rtol=1e-6)
     np.testing.assert_allclose(cost, [0.0, 10.0], rtol=1e-6)
-    at_a_price = safe_dreamer.planned_at_a_price, safe_dreamer.controller
+    at_a_price = safe_dreamer.planned_at_a_price, capped_pid
     ret, _ = safe_dreamer.scores(Corridor(), *at_a_price, *args)
     np.testing.assert_allclose(ret, [1.0, 1.95], rtol=1e-6)
 
@@ -80,12 +80,12 @@ def test_it_takes_what_earns_most_without_a_cost_and_all_where_none_is_minded(le
 def test_the_price_by_hand():
     """Smoothed by a half: J = 4, then 3; with a limit of 2, gains .01, .02 and .03."""
     cfg = dataclasses.replace(CFG, pid_kp=0.01, pid_ki=0.02, pid_kd=0.03, pid_smoothing=0.5)
-    price = safe_dreamer.controller.init(cfg)
-    price = safe_dreamer.move_price(price, jnp.float32(8.0), dataclasses.replace(cfg, price_max=9.0), 0)
+    price = capped_pid.init(cfg)
+    price = control_capped(price, jnp.float32(8.0), dataclasses.replace(cfg, price_max=9.0), 0)
     np.testing.assert_allclose(price, [0.02 + 0.04 + 0.12, 0.04, 4.0], rtol=1e-5)
-    price = safe_dreamer.move_price(price, jnp.float32(2.0), cfg, 1)
+    price = control_capped(price, jnp.float32(2.0), cfg, 1)
     np.testing.assert_allclose(price, [0.01 + 0.06, 0.06, 3.0], rtol=1e-5)
-    price = safe_dreamer.move_price(price, jnp.float32(100.0), cfg, 2)
+    price = control_capped(price, jnp.float32(100.0), cfg, 2)
     np.testing.assert_allclose(price[:2], [0.1, 0.1], rtol=1e-6)  # no more than price_max
-    price = safe_dreamer.move_price(price, jnp.float32(-200.0), cfg, 3)
+    price = control_capped(price, jnp.float32(-200.0), cfg, 3)
     np.testing.assert_allclose(price[:2], [0.0, 0.0])
