@@ -1,7 +1,7 @@
 """DreamerV3, which learns in the dreams of a world model; and with a price on cost."""
 
 from functools import partial
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,7 @@ from jaxsafe.learn.dreaming import (
 from jaxsafe.learn.off_policy import off_policy
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.treatments import CappedPIDConfig, Treatment, capped_pid, no_treatment
-from jaxsafe.learn.world_model import Dreams, WorldModelConfig
+from jaxsafe.learn.world_model import Dreams, SizeName, WorldModelConfig
 from jaxsafe.nn.two_hot import BINS
 from jaxsafe.types import Algorithm, Env, Metrics, PyTree
 
@@ -91,21 +91,21 @@ class DreamerLagConfig(DreamerConfig):
 class DreamerPIDConfig(CappedPIDConfig, PriceClockConfig, DreamerConfig):
     """Dreamer-PID: Dreamer whose actor pays for cost in its dreams, at a price that real episodes set.
 
-        L_actor <- L_actor + E[u_t lam sg (R_c_t - V_c_t) log pi(a_t)]
+        L_actor <- L_actor + lam E[u_t sg (R_c_t - V_c_t) log pi(a_t)]
         I   <- clip(I + pid_ki e, 0, price_max),   e = J_c - cost_limit,   every `dual_every` steps
         lam  = clip(pid_kp e + I + pid_kd max(0, J_c - J_c'), 0, price_max)
 
     R_c are TD(lambda) returns of the predicted cost, and V_c is a critic of them. With
-    `actor_grad=backprop` the term is E[u_t lam R_c_t]. J_c is the smoothed cost of real episodes, and
-    J_c' what it was before. So the limit holds where a dream tells less of cost than there is. The rest
-    is as in Dreamer.
+    `actor_grad=backprop` the term is lam E[u_t (R_c_t - V_c_t)], through the model. J_c is the smoothed
+    cost of real episodes, and J_c' what it was before. So the price also rises for cost that dreams
+    miss. The rest is as in Dreamer.
 
     Source: ours, after Huang et al. (2024), "SafeDreamer: Safe Reinforcement Learning with World
     Models", arXiv:2307.07176, whose planner has such a price; Stooke, Achiam and Abbeel (2020),
     "Responsive Safety in Reinforcement Learning by PID Lagrangian Methods", arXiv:2007.03964.
-    Differs from Dreamer as it is here: networks and batches are larger, dreams are longer, there are
-    fewer environments, and the heads also learn in dreams, so that the model foresees cost. There are
-    as many gradient steps as in Dreamer.
+    The defaults are from short runs on point_goal1 (docs/results/slow_price). They differ from
+    Dreamer's: larger networks and batches, longer dreams, fewer environments, and `overshoot`, so that
+    the model foresees cost. The number of gradient steps is the same.
     """
 
     # The discount of costs: 33 steps ahead.
@@ -118,14 +118,14 @@ class DreamerPIDConfig(CappedPIDConfig, PriceClockConfig, DreamerConfig):
     pid_kd: Weight = 0.0  # Price for each unit that the cost rose.
     # Share of the past in the smoothed cost of an episode.
     pid_smoothing: Share = 0.9
-    price_max: Cap = float("inf")  # The highest price.
+    price_max: Cap = float("inf")  # The highest price. inf: no bound.
     num_envs: Amount = 16  # Environments side by side, of all devices together.
     replay_ratio: Amount = 128  # Rows replayed for each environment step.
     batch_size: Amount = 1024  # Rows of a gradient step, of all devices together.
     # Environment steps with random actions and without learning.
     learning_starts: Amount = 1_024
     # The networks' size: about the number of parameters, if pictures are observed.
-    size: Literal["tiny", "300k", "500k", "1m", "12m", "25m", "50m", "100m", "200m"] = "500k"
+    size: SizeName = "500k"
     # Steps ahead, at most `n_step`, for which the heads learn in dreams that take the replayed actions.
     overshoot: Annotated[int, Bounds(0, 1000)] = 15
     imagine_steps: Iterations = 15  # Steps of a dream, as in the paper.
@@ -251,10 +251,7 @@ def learn_at_a_price(
 ) -> Outcome:
     found = learn_reward(trained, memory["range"], scene, key)
     costs, critic_loss, metrics = learn_cost(trained, found.dreams, scene)
-    paid = costs.advantage
-    if scene.cfg.actor_grad == "reinforce":
-        paid = fixed(paid) * found.dreams.log_prob
-    bill = scene.over_dreams(found.dreams.weight[:-1] * scene.dual.lam * paid)
+    bill = scene.dual.lam * scene.gain(found.dreams, costs.advantage)
     return Outcome(found.loss + bill + critic_loss, {"range": found.range}, found.metrics | metrics)
 
 
@@ -302,9 +299,9 @@ SAFE_DREAMER: dict[str, Any] = VECTORS | {
 }  # fmt: skip
 # for two cores and half an hour
 CPU: dict[str, Any] = {"num_envs": 16, "replay_size": 200_000, "learning_starts": 1024}
-# Dreamer's batches and dreams, where Dreamer-PID has larger ones
-SMALL: dict[str, Any] = {
-    "batch_size": 256, "replay_ratio": 32, "overshoot": 8, "imagine_steps": 10,
+# the same for Dreamer-PID, whose own batches are too large for two cores
+CPU_PID: dict[str, Any] = CPU | {
+    "batch_size": 256, "replay_ratio": 32, "size": "300k", "overshoot": 8, "imagine_steps": 10,
 }  # fmt: skip
 # for a problem of two levers, whose next signs nobody can foresee
 LEVER: dict[str, Any] = {
@@ -338,7 +335,7 @@ ROWS = {
         DreamerPIDConfig,
         partial(make, behaviour=billed, treatment=capped_pid),
         "Dreamer whose dreams pay for cost, at a price that a controller sets by real episodes",
-        {"cpu": CPU | SMALL},
+        {"cpu": CPU_PID},
         total_steps=1_000_000,
         lever=LEVER | {"overshoot": 0, "dual_every": 256, "pid_kp": 0.05, "pid_ki": 0.02},
     ),

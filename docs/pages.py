@@ -41,6 +41,7 @@ from jaxsafe.report.published import read_published
 from jaxsafe.report.read import SettingRun, read
 from jaxsafe.run import compat, help
 from jaxsafe.run.plain import as_text
+from jaxsafe.run.settings import first_published
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
@@ -448,9 +449,11 @@ def folded_settings(config: type) -> str:
 def published(row: Row) -> str:
     """What `preset=published` and `compat=omnisafe` change."""
     lines = []
-    for i, (origin, options) in enumerate(row.published.items()):
+    for origin, options in row.published.items():
         changed = ", ".join(f"`{name}={value}`" for name, value in options.items())
-        preset = f"`preset={origin}`" if i else f"`preset=published` ({origin})"
+        preset = (
+            f"`preset=published` ({origin})" if origin == first_published(row) else f"`preset={origin}`"
+        )
         lines.append(f"{preset}: {changed}.")
     if conventions := compat.overrides("omnisafe", row.config):
         changed = ", ".join(f"`{name}={value}`" for name, value in conventions.items())

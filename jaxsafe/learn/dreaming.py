@@ -87,7 +87,7 @@ class Scene(NamedTuple):
     """What a behaviour learns from.
 
     world: the model. params: all networks by name, without gradient. latents: of the rows [T, B] of
-    `batch`, without gradient. dual: the state of the treatment of the constraint, () without one.
+    `batch`, without gradient. dual: the state of the loop's treatment, () where it has none.
     """
 
     env: Env
@@ -136,13 +136,16 @@ class Scene(NamedTuple):
         discounts = {"discount": discount, "decay": self.cfg.td_lambda}
         return Judged(dream_returns(reward, value, dreams.read["cont"], **discounts), value)
 
+    def gain(self, dreams: Dreams, advantage: jax.Array) -> jax.Array:
+        """E[u A] or, by `reinforce`, E[u sg A log pi], whose gradient raises A."""
+        if self.cfg.actor_grad == "reinforce":
+            advantage = fixed(advantage) * dreams.log_prob
+        return self.over_dreams(dreams.weight[:-1] * advantage)
+
     def actor_loss(self, dreams: Dreams, advantage: jax.Array) -> jax.Array:
         """-E[u (A + eta H)] or, by `reinforce`, -E[u (sg A log pi + eta H)]."""
-        gain = advantage
-        if self.cfg.actor_grad == "reinforce":
-            gain = fixed(advantage) * dreams.log_prob
-        gain += self.cfg.entropy_coef * dreams.entropy
-        return -self.over_dreams(dreams.weight[:-1] * gain)
+        entropy = self.over_dreams(dreams.weight[:-1] * dreams.entropy)
+        return -self.gain(dreams, advantage) - self.cfg.entropy_coef * entropy
 
     def critic_loss(
         self, trained: dict[str, PyTree], name: str, dreams: Dreams, returns: jax.Array

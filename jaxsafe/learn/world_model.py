@@ -24,6 +24,7 @@ from jaxsafe.nn.rssm import SIZES, Beliefs, Head, Latent, WorldModel, kl
 from jaxsafe.nn.two_hot import BINS, two_hot_loss, two_hot_mean
 from jaxsafe.types import Env, Metrics, PyTree
 
+SizeName = Literal["tiny", "300k", "500k", "1m", "12m", "25m", "50m", "100m", "200m"]
 CHANCE = 1  # outputs of a head that gives a probability; one that gives a number has BINS
 STD = (0.1, 1.0)  # range of the actor's standard deviation, as in the authors' code
 
@@ -37,7 +38,7 @@ class WorldModelConfig(EncoderConfig, RoundConfig):
     encoder: Literal["none", "cnn"] = "none"
     # Environments side by side, of all devices together. The authors have 16 and fewer.
     num_envs: Amount = 64
-    # Steps of each environment between two rounds of gradient steps, of 1,024 environment steps in all.
+    # Steps of each environment between two rounds of gradient steps.
     learn_every: Amount = 16
     # Rows replayed for each environment step. The authors have 32 to 1024.
     replay_ratio: Amount = 32
@@ -50,7 +51,7 @@ class WorldModelConfig(EncoderConfig, RoundConfig):
     discount: Share = 0.997
     cost_discount: Share = 0.997  # The discount of costs where one is limited, and in evaluations.
     # The networks' size: about the number of parameters, if pictures are observed. The paper's is 200m.
-    size: Literal["tiny", "300k", "500k", "1m", "12m", "25m", "50m", "100m", "200m"] = "300k"
+    size: SizeName = "300k"
     model_lr: Rate = 1e-3  # The model's learning rate, by LaProp. The authors have 4e-5.
     lr: Rate = 5e-4  # The actor's learning rate, by LaProp. The authors have 4e-5.
     critic_lr: Rate = 1e-3  # The critics' learning rate, by LaProp. The authors have 4e-5.

@@ -351,10 +351,16 @@ def algo_options(row: Row, preset: str = "fast", compat: str = "none") -> dict[s
     return dataclasses.asdict(row.config(**options))
 
 
+def first_published(row: Row) -> str:
+    """The name of the setting that `preset=published` stands for; '' if none was published. `cpu` is
+    ours."""
+    return next((name for name in row.published if name != "cpu"), "")
+
+
 def presets(row: Row) -> dict[str, Mapping[str, Any]]:
     """Overrides by name: 'fast' has none, 'published' is the first of the published settings."""
-    first = next(iter(row.published.values()), None)
-    named = {} if first is None else {"published": first}
+    first = first_published(row)
+    named = {"published": row.published[first]} if first else {}
     return {name: dict(options) for name, options in ({"fast": {}} | named | {**row.published}).items()}
 
 

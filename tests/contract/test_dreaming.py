@@ -26,7 +26,7 @@ NAMES = [name for name, row in ALGOS.items() if issubclass(row.config, WorldMode
 TINY: dict[str, Any] = {
     "num_envs": 4, "horizon": 8, "learn_every": 8, "batch_size": 32, "replay_ratio": 2, "n_step": 3,
     "replay_size": 4 * 24, "learning_starts": 4 * 10, "size": "tiny", "imagine_steps": 3,
-    "overshoot": 2, "lr_warmup": 1,
+    "lr_warmup": 1,
 }  # fmt: skip
 # rows whose update is compiled
 COMPILED = ["dreamer_lag", pytest.param("ambs", marks=pytest.mark.slow)]
@@ -34,8 +34,9 @@ COMPILED = ["dreamer_lag", pytest.param("ambs", marks=pytest.mark.slow)]
 
 def settings_of(name: str, **settings: Any) -> Any:
     few = {"shield_rollouts": 4, "plans": 8, "elites": 2, "cem_iterations": 2}
-    tiny = TINY | {k: x for k, x in few.items() if hasattr(ALGOS[name].config, k)}
-    return ALGOS[name].config(**tiny | settings)
+    config = ALGOS[name].config
+    tiny = TINY | {k: x for k, x in few.items() if hasattr(config, k)}
+    return config(**tiny | {"overshoot": min(config.overshoot, TINY["n_step"])} | settings)
 
 
 @cache

@@ -36,7 +36,7 @@ CONFIGS |= {
     for cls in (TrainConfig, envs.SafetyGymConfig, envs.VelocityConfig, envs.CarRacing, WrapConfig)
 }
 INFINITE = {  # fields whose comment or bounds say what infinity means
-    "total_iterations", "lam_max", "max_grad_norm", "target_kl", "healthy_z_range",
+    "total_iterations", "lam_max", "price_max", "max_grad_norm", "target_kl", "healthy_z_range",
     "healthy_angle_range", "healthy_state_range",
 }  # fmt: skip
 

@@ -10,10 +10,17 @@ import numpy as np
 from toys import Corridor
 
 from jaxsafe.algos import dreamer
-from jaxsafe.learn.dreaming import Judged, no_range
+from jaxsafe.learn.dreaming import Judged, Scene, no_range
 from jaxsafe.learn.treatments import CappedPID
 
 CFG = dreamer.DreamerLagConfig()
+
+
+class Averaging(Scene):
+    """A scene whose dreams all weigh the same."""
+
+    def over_dreams(self, x: jax.Array) -> jax.Array:
+        return x.mean()
 
 
 def test_the_multiplier_rises_by_the_violation_from_the_second_step_on():
@@ -64,20 +71,16 @@ def test_the_limit_of_an_episode_is_that_of_a_steady_stream_of_cost():
 
 def test_at_a_price_the_actor_pays_for_what_its_dreams_cost_beyond_the_mean(monkeypatch):
     """Two dreams of two steps at a price of 0.5: by reinforce (R - V) log pi, by backprop R - V."""
-    returns, value = (
-        jnp.array([[1.0, 4.0], [2.0, 0.0]]),
-        jnp.array([[3.0, 1.0], [2.0, 1.0], [9.0, 9.0]]),
-    )
+    returns = jnp.array([[1.0, 4.0], [2.0, 0.0]])
+    value = jnp.array([[3.0, 1.0], [2.0, 1.0], [9.0, 9.0]])
     weight = jnp.array([[1.0, 1.0], [0.5, 0.5], [0.25, 0.25]])
 
     def loss(actor_grad: str, log_prob: jax.Array, returns: jax.Array) -> jax.Array:
         dreams = SimpleNamespace(weight=weight, log_prob=log_prob)
         wishes: Any = dreamer.Wishes(dreams, no_range(), jnp.float32(7), {"a": 1})  # type: ignore[arg-type]
-        scene: Any = SimpleNamespace(
-            cfg=SimpleNamespace(actor_grad=actor_grad),
-            dual=CappedPID(*(jnp.float32(x) for x in (0.5, 0, 0))),
-            over_dreams=lambda x: x.mean(),
-        )
+        cfg = SimpleNamespace(actor_grad=actor_grad)
+        price = CappedPID(*(jnp.float32(x) for x in (0.5, 0, 0)))
+        scene = Averaging(*[None] * 5, dual=price, cfg=cfg, axis_name=None)  # type: ignore[arg-type]
         monkeypatch.setattr(dreamer, "learn_reward", lambda *args: wishes)
         found = Judged(returns, value), jnp.float32(2), {"b": 2}
         monkeypatch.setattr(dreamer, "learn_cost", lambda *args: found)
