@@ -302,6 +302,7 @@ CPU: dict[str, Any] = {"num_envs": 16, "replay_size": 200_000, "learning_starts"
 # the same for Dreamer-PID, whose own batches are too large for two cores
 CPU_PID: dict[str, Any] = CPU | {
     "batch_size": 256, "replay_ratio": 32, "size": "300k", "overshoot": 8, "imagine_steps": 10,
+    "dual_starts": 30_000,  # the task first: a price from the start on came before it
 }  # fmt: skip
 # for a problem of two levers, whose next signs nobody can foresee
 LEVER: dict[str, Any] = {
