@@ -19,7 +19,8 @@ class Row(NamedTuple):
         source, departures.
     make: make(env, axis_name=None) -> Algorithm.
     summary: what it does, in a few words.
-    published: setting -> options of the config that reproduce it; `preset=published` is the first.
+    published: setting -> options of the config that reproduce it; `preset=published` is the
+        first of them. `cpu`, which is ours, does not count.
     omnisafe: OmniSafe's name for it, from which scripts/migrate.py translates; '' if it has none.
     total_steps: environment steps of a run that does not say how many.
     holds: what keeps to the cost limit: the cost of the average episode, the cost of every episode,

@@ -76,11 +76,13 @@ def test_at_a_price_the_actor_pays_for_what_its_dreams_cost_beyond_the_mean(monk
     weight = jnp.array([[1.0, 1.0], [0.5, 0.5], [0.25, 0.25]])
 
     def loss(actor_grad: str, log_prob: jax.Array, returns: jax.Array) -> jax.Array:
-        dreams = SimpleNamespace(weight=weight, log_prob=log_prob)
-        wishes: Any = dreamer.Wishes(dreams, no_range(), jnp.float32(7), {"a": 1})  # type: ignore[arg-type]
+        dreams: Any = SimpleNamespace(weight=weight, log_prob=log_prob)
+        metrics: Any = {"a": 1}
+        wishes = dreamer.Wishes(dreams, no_range(), jnp.float32(7), metrics)
         cfg = SimpleNamespace(actor_grad=actor_grad)
         price = CappedPID(*(jnp.float32(x) for x in (0.5, 0, 0)))
-        scene = Averaging(*[None] * 5, dual=price, cfg=cfg, axis_name=None)  # type: ignore[arg-type]
+        unused: Any = [None] * 5
+        scene = Averaging(*unused, dual=price, cfg=cfg, axis_name=None)
         monkeypatch.setattr(dreamer, "learn_reward", lambda *args: wishes)
         found = Judged(returns, value), jnp.float32(2), {"b": 2}
         monkeypatch.setattr(dreamer, "learn_cost", lambda *args: found)
