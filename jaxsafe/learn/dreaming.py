@@ -257,8 +257,8 @@ def seen(
     """The latent of the present observation, the likeliest one where `key` is None."""
     world, params = world_of(env, behaviour.all_heads, learned.config), learned.params["model"]
     embedded = world.apply(params, obs, method="embed")
-    found: Any = world.apply(params, *carry, embedded, key, method="observe")
-    return found[0]
+    latent: Any = world.apply(params, *carry, embedded, key, method="observe")
+    return latent
 
 
 def chosen(env: Env, learned: Learned, name: str, latent: Latent, key: jax.Array | None) -> jax.Array:

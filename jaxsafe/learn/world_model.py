@@ -20,7 +20,8 @@ from jaxsafe.learn.sequences import SequenceBatch
 from jaxsafe.learn.timetable import RoundConfig
 from jaxsafe.nn.coders import Decoder, Encoder, VectorDecoder, VectorEncoder, check_picture
 from jaxsafe.nn.gaussian import Gaussian, entropy, log_prob, sample
-from jaxsafe.nn.rssm import SIZES, Beliefs, Head, Latent, WorldModel, kl
+from jaxsafe.nn.recurrent import states_along
+from jaxsafe.nn.rssm import SIZES, Head, Latent, WorldModel, kl
 from jaxsafe.nn.two_hot import BINS, two_hot_loss, two_hot_mean
 from jaxsafe.types import Env, Metrics, PyTree
 
@@ -162,26 +163,31 @@ def clip_by_share(share: jax.Array | float, least: float = 1e-3) -> optax.Gradie
 # ---- the model's loss --------------------------------------------------------------------------
 
 
-def filtered(
-    world: WorldModel, params: PyTree, rows: Record, key: jax.Array | None
-) -> tuple[Latent, Beliefs]:
-    """The latents of the rows [T, B], the likeliest ones where `key` is None, and what was believed of
-    them. The first row of each sequence remembers nothing."""
+def filtered(world: WorldModel, params: PyTree, rows: Record, key: jax.Array | None) -> Latent:
+    """The latents of the rows [T, B], the likeliest ones where `key` is None. The first row of each
+    sequence remembers nothing."""
     embedded: Any = world.apply(params, rows.obs, method="embed")
+    return latents_of(world, params, rows, embedded, key)
+
+
+def latents_of(
+    world: WorldModel, params: PyTree, rows: Record, embedded: jax.Array, key: jax.Array | None
+) -> Latent:
+    """`filtered`, where the observations are `embedded`, float [T, B, E]."""
     first = rows.first.at[0].set(True)
     came_by = jnp.roll(rows.action, 1, axis=0)  # row t came of the action of row t - 1
 
-    def step(latent: Latent, x: Any) -> tuple[Latent, tuple[Latent, Beliefs]]:
-        action, embedded, first, key = x
+    def step(params: PyTree, latent: Latent, embedded: jax.Array, x: Any) -> Latent:
+        action, first, key = x
         latent, action = jax.tree.map(lambda x: jnp.where(first[:, None], 0.0, x), (latent, action))
-        found: Any = world.apply(params, latent, action, embedded, key, method="observe")
-        return found[0], found
+        after: Any = world.apply(params, latent, action, embedded, key, method="observe")
+        return after
 
     nothing = jax.tree.map(
         lambda x: jnp.zeros((rows.first.shape[1], *x.shape)), world.apply({}, method="start")
     )
     keys = None if key is None else jax.random.split(key, len(rows.first))
-    return jax.lax.scan(step, nothing, (came_by, embedded, first, keys))[1]
+    return states_along(step, params, nothing, embedded, (came_by, first, keys))
 
 
 def model_loss(
@@ -200,7 +206,10 @@ def model_loss(
 
     targets: for each head, float [T, B].
     """
-    latents, (prior, posterior) = filtered(world, params, batch.rows, key)
+    embedded: Any = world.apply(params, batch.rows.obs, method="embed")
+    latents = latents_of(world, params, batch.rows, embedded, key)
+    believed: Any = world.apply(params, latents.deter, embedded, method="beliefs")
+    prior, posterior = believed
     fixed = jax.lax.stop_gradient
 
     def mean(x: jax.Array) -> jax.Array:
@@ -250,13 +259,14 @@ def overshoot_loss(
         """[K, starts, ...]: rows `first` + k of each start."""
         return jnp.stack([x[first + k : first + k + starts] for k in range(cfg.overshoot)])
 
-    def step(latent: Latent, x: tuple[jax.Array, jax.Array]) -> tuple[Latent, jax.Array]:
+    def step(params: PyTree, latent: Latent, _: tuple[()], x: Any) -> Latent:
         after: Any = world.apply(params, latent, *x, method="imagine")
-        return after, after.features
+        return after
 
     begin = jax.tree.map(lambda x: x[:starts], latents)
     keys = jax.random.split(key, cfg.overshoot)
-    features = jax.lax.scan(step, begin, (windows(batch.rows.action, 0), keys))[1]
+    dreamed = states_along(step, params, begin, (), (windows(batch.rows.action, 0), keys))
+    features = dreamed.features
     outputs: Any = world.apply(params, features, method="read")
     counts = jnp.cumprod(windows(batch.follows, 0), axis=0)
     losses = sum(head_loss(outputs[name], windows(x, 1)) for name, x in targets.items())

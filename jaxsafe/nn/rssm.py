@@ -214,13 +214,15 @@ class WorldModel(nn.Module):
 
     def observe(
         self, latent: Latent, action: jax.Array, embedded: jax.Array, key: jax.Array | None
-    ) -> tuple[Latent, Beliefs]:
+    ) -> Latent:
         """The latent of an observation that came of `action` from `latent`. `key` None takes the
         likeliest one."""
         h = self.memory(latent, within(action))
-        prior = self._beliefs(self.before, h)
-        posterior = self._beliefs(self.after, jnp.concatenate([h, embedded], -1))
-        return Latent(h, draw(posterior, key)), Beliefs(prior, posterior)
+        return Latent(h, draw(self._posterior(h, embedded), key))
+
+    def beliefs(self, h: jax.Array, embedded: jax.Array) -> Beliefs:
+        """What is believed of z in the memory `h`, before and after an observation."""
+        return Beliefs(self._beliefs(self.before, h), self._posterior(h, embedded))
 
     def imagine(self, latent: Latent, action: jax.Array, key: jax.Array) -> Latent:
         """A latent that may come of `action` from `latent`."""
@@ -236,12 +238,16 @@ class WorldModel(nn.Module):
 
     def everything(self, obs: Any, action: jax.Array) -> Any:
         """Runs all parts once, which makes their parameters."""
-        latent, _ = self.observe(self.start(), action, self.embed(obs), None)
-        return self.decode(latent), self.read(latent.features)
+        embedded = self.embed(obs)
+        latent = self.observe(self.start(), action, embedded, None)
+        return self.beliefs(latent.deter, embedded), self.decode(latent), self.read(latent.features)
 
     def start(self) -> Latent:
         """The latent before the first observation of an episode."""
         return Latent(jnp.zeros(self.size.deter), jnp.zeros(self.size.latents * self.size.classes))
+
+    def _posterior(self, h: jax.Array, embedded: jax.Array) -> jax.Array:
+        return self._beliefs(self.after, jnp.concatenate([h, embedded], -1))
 
     def _beliefs(self, head: nn.Module, x: jax.Array) -> jax.Array:
         logits = head(x)

@@ -188,7 +188,7 @@ def test_a_model_learns_to_paint_what_it_sees():
         params: Any = world.init(key, blank(observation_like(env)), jnp.zeros(1), method="everything")
         keys = jax.random.split(key, 200)
         (params, _), losses = jax.lax.scan(step, (params, rule.init(params)), keys)
-        latents, _ = world_model.filtered(world, params, rows, None)
+        latents = world_model.filtered(world, params, rows, None)
         return losses, world.apply(params, latents, method="decode"), rows.obs
 
     losses, painted, seen = jax.jit(train, compiler_options=FAST)(jax.random.key(0))

@@ -149,8 +149,7 @@ class Glass:
 
     def observe(self, latent, action, embedded, key):
         before = jnp.concatenate([latent.stoch, action], -1)
-        nothing = jnp.zeros((*embedded.shape[:-1], 1, 1))
-        return rssm.Latent(before, embedded), rssm.Beliefs(nothing, nothing)
+        return rssm.Latent(before, embedded)
 
 
 GLASS: Any = Glass()
@@ -196,7 +195,7 @@ def test_a_reward_meets_the_latent_of_the_observation_that_it_came_with():
     def worst(rows: Any, **changes: Any) -> jax.Array:
         """The largest error where there was a step: not in a sequence's first row, nor at a start."""
         rows = rows.replace(**changes)
-        latents, _ = world_model.filtered(GLASS, {}, rows, None)
+        latents = world_model.filtered(GLASS, {}, rows, None)
         known = ~batch.rows.first[1:]
         return jnp.where(known, jnp.abs(echoed(latents)[1:] - rows.reward[1:]), 0).max()
 
@@ -206,11 +205,11 @@ def test_a_reward_meets_the_latent_of_the_observation_that_it_came_with():
     assert worst(rows, obs=jnp.roll(rows.obs, 1, axis=0)) > 1
     assert worst(rows, action=jnp.roll(rows.action, 1, axis=0)) > 0.5
 
-    latents, _ = world_model.filtered(GLASS, {}, rows, None)
+    latents = world_model.filtered(GLASS, {}, rows, None)
     starts = rows.first.at[0].set(True)
     assert (latents.deter[starts] == 0).all()  # nothing is remembered
     forgotten: Any = rows.replace(first=jnp.zeros_like(rows.first))
-    latents, _ = world_model.filtered(GLASS, {}, forgotten, None)
+    latents = world_model.filtered(GLASS, {}, forgotten, None)
     assert (jnp.abs(latents.deter[starts]) > 0).any()
 
     cfg = dreamer.DreamerConfig()
@@ -245,10 +244,10 @@ def test_the_policy_remembers_what_the_model_learns_from():
     rows, acted = both(ts.stepping, jax.random.split(jax.random.key(1), 16))
     assert rows.first[1:].any()
     world = world_model.world_of(env, dreamer.blind.all_heads, cfg)
-    latents, _ = world_model.filtered(world, learned.params["model"], rows, None)
+    latents = world_model.filtered(world, learned.params["model"], rows, None)
     np.testing.assert_allclose(acted.features, latents.features, atol=1e-5)
     late = rows.replace(action=jnp.roll(rows.action, 1, axis=0))
-    other, _ = world_model.filtered(world, learned.params["model"], late, None)
+    other = world_model.filtered(world, learned.params["model"], late, None)
     assert jnp.abs(other.features - latents.features).max() > 1e-3
 
 
@@ -265,7 +264,7 @@ def test_a_sequence_that_begins_anew_is_two_sequences():
     rows = recorded(Ticker(episode_length=5), 12)
     begins = int(jnp.argmax(rows.first[1:, 0])) + 1
     world, params = tiny()
-    through = jax.jit(lambda rows: world_model.filtered(world, params, rows, None)[0])
+    through = jax.jit(lambda rows: world_model.filtered(world, params, rows, None))
     whole, alone = through(rows), through(jax.tree.map(lambda x: x[begins:], rows))
     np.testing.assert_array_equal(whole.features[begins:, 0], alone.features[:, 0])
 
@@ -295,7 +294,7 @@ def test_overshooting_reads_dreams_of_the_replayed_actions_until_an_episode_ends
     cfg, ahead = dreamer.DreamerConfig(size="tiny", n_step=11, overshoot=4), 4
     weight, key = jnp.array([0.5, 0.25, 0.25]), jax.random.key(3)
     batch = SequenceBatch(rows, weight)
-    latents, _ = world_model.filtered(world, params, rows, None)
+    latents = world_model.filtered(world, params, rows, None)
     targets = {"reward": rows.reward, "cont": world_model.goes_on(rows, cfg)}
     loss = jax.jit(lambda p: world_model.overshoot_loss(world, p, batch, latents, targets, key, cfg))
 
@@ -373,7 +372,7 @@ def test_the_model_foresees_a_deterministic_toy():
         end: Any = jax.lax.scan(improve, (begin, rule.init(begin)), jax.random.split(key, 900))[0]
         params = end[0]
         rows = play(jax.random.key(9))
-        latents, _ = world_model.filtered(world, params, rows, None)
+        latents = world_model.filtered(world, params, rows, None)
         seen = jax.tree.map(lambda x: x[5], latents)
 
         def blind(latent, x):

@@ -1,0 +1,44 @@
+"""The gradient of long sequences."""
+
+import chex
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import pytest
+
+from jaxsafe.nn.recurrent import GRU, gradient_at_once, scanned
+
+STEPS, ROWS, SIZE, WIDTH = 7, 3, 4, 2
+
+
+class Noisy(nn.Module):
+    """A unit whose memory is lost where `first`, and is disturbed by noise."""
+
+    @nn.compact
+    def __call__(self, h, x, first, key):
+        h = GRU(SIZE)(jnp.where(first[:, None], 0.0, h), x)
+        return h + 0.1 * jax.random.normal(key, h.shape)
+
+
+@pytest.mark.parametrize("of", ["params", "start", "inputs"])
+def test_the_gradient_of_all_steps_at_once_is_that_of_a_scan(of):
+    net, draw = Noisy(), jax.random.split(jax.random.key(0), 5)
+    start = jax.random.normal(draw[0], (ROWS, SIZE))
+    inputs = jax.random.normal(draw[1], (STEPS, ROWS, WIDTH))
+    given = jax.random.uniform(draw[2], (STEPS, ROWS)) < 0.3, jax.random.split(draw[3], STEPS)
+    params = net.init(draw[4], start, inputs[0], *jax.tree.map(lambda x: x[0], given))
+    args = {"params": params, "start": start, "inputs": inputs}
+
+    def loss(run, part):
+        """Of the states, each of which counts otherwise."""
+        step = lambda params, h, x, given: net.apply(params, h, x, *given)  # noqa: E731
+        states = run(step, *{**args, of: part}.values(), given)
+        return (jnp.arange(1, STEPS + 1)[:, None, None] * states**2).sum()
+
+    (value, slope), (expected, slope_of_scan) = (
+        jax.jit(jax.value_and_grad(lambda part, run=run: loss(run, part)))(args[of])
+        for run in (gradient_at_once, scanned)
+    )
+    chex.assert_trees_all_close(value, expected, rtol=1e-6)
+    chex.assert_trees_all_close(slope, slope_of_scan, rtol=1e-4, atol=1e-4)
+    assert all(jnp.abs(x).max() > 0.1 for x in jax.tree.leaves(slope))
