@@ -35,6 +35,8 @@ def guarded(command: Callable[[], int]) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return UNREAD
     except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:
+            return complain(f"{error.filename}: expected names of at most 255 bytes", 2)
         if error.errno not in BAD_DISK:
             raise
         where = f" ({error.filename})" if error.filename else ""

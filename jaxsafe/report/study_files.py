@@ -11,6 +11,7 @@ whenever the writer was stopped. Nothing in them is executed.
 """
 
 import csv
+import hashlib
 import io
 import json
 import re
@@ -25,6 +26,7 @@ from jaxsafe.run import files
 ROW = ("run", "env", "algo", "settings", "seed", "state", "steps")
 CURVES = ("train/return", "train/cost", "train/cost_rate")  # as metrics.csv calls them
 POINTS = 100
+LONGEST = 230  # letters of a folder's name; file systems take 255 bytes
 
 
 class Origin(NamedTuple):
@@ -61,9 +63,13 @@ def holds_study(folder: Path) -> bool:
 
 def name_of(run: str) -> str:
     """What the folder of a run is called: 'point_goal1-cpo-seed_1' for 'env=point_goal1 algo=cpo
-    seed=1'. As a value of `run_dir` it needs no quotes."""
+    seed=1'. As a value of `run_dir` it needs no quotes. The end of a name that is too long for a folder
+    is told by a hash."""
     words = [re.sub("^(env|algo)=", "", word) for word in run.split()]
-    return re.sub(r"[^\w.+-]+", "_", "-".join(words))
+    name = re.sub(r"[^\w.+-]+", "_", "-".join(words))
+    if len(name) <= LONGEST:
+        return name
+    return f"{name[: LONGEST - 9]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
 
 
 def read(folder: Path) -> Condensed:

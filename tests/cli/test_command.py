@@ -85,6 +85,7 @@ BAD = {
     "algo.clip=[1": "cannot read",
     "preset=quick": "valid: fast",
     "compat=omnisaf": "did you mean 'omnisafe'?",
+    f"run_dir={'long' * 70}": "at most 255 bytes",
     "resume=nowhere": "not a run folder",
     "init_from=nowhere": "not a run folder",
     "env.name=point_goal1": "choose with env=",

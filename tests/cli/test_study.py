@@ -72,6 +72,14 @@ def call(monkeypatch, *arguments: Any, train: Any = command.train) -> int:
 # ---- the files -------------------------------------------------------------------------------
 
 
+def test_each_run_has_a_folder_whose_name_a_file_system_takes():
+    runs = [f"env=point_goal1 algo=ambs {'algo.penalty_coef=0.5 ' * 20}seed={seed}" for seed in (1, 2)]
+    first, second = map(study_files.name_of, runs)
+    assert first != second and max(len(first), len(second)) < 255
+    assert first == study_files.name_of(runs[0]) and first.startswith("point_goal1-ambs-algo.penalty")
+    assert study_files.name_of("env=point_goal1 algo=cpo seed=1") == "point_goal1-cpo-seed_1"
+
+
 def test_figures_and_curves_of_a_study_are_those_of_its_runs(toy, tmp_path):
     trained(tmp_path / "run", toy.command(toy.runs[1]))
     (run,) = read_one(tmp_path / "run")
