@@ -54,7 +54,28 @@ class DreamerConfig(WorldModelConfig):
 
 
 @config
-class DreamerLagConfig(DreamerConfig):
+class ForesightConfig(DreamerConfig):
+    """Dreamer whose model foresees cost, which a price on cost needs.
+
+    The defaults are from runs on point_goal1 (docs/results/shielding). They differ from Dreamer's:
+    larger networks and batches, longer dreams, fewer environments, and `overshoot`. The number of
+    gradient steps is the same.
+    """
+
+    num_envs: Amount = 16  # Environments side by side, of all devices together.
+    replay_ratio: Amount = 128  # Rows replayed for each environment step.
+    batch_size: Amount = 1024  # Rows of a gradient step, of all devices together.
+    # Environment steps with random actions and without learning.
+    learning_starts: Amount = 1_024
+    # The networks' size: about the number of parameters, if pictures are observed.
+    size: SizeName = "500k"
+    # Steps ahead, at most `n_step`, for which the heads learn in dreams that take the replayed actions.
+    overshoot: Annotated[int, Bounds(0, 1000)] = 15
+    imagine_steps: Iterations = 15  # Steps of a dream, as in the paper.
+
+
+@config
+class DreamerLagConfig(ForesightConfig):
     """Dreamer-Lagrangian: Dreamer whose actor pays for cost in its dreams, by an augmented Lagrangian.
 
         L_actor <- L_actor + E[u_t psi(R_c_t - d)],   d = cost_limit / (T (1 - cost_discount))
@@ -72,23 +93,23 @@ class DreamerLagConfig(DreamerConfig):
     via Bayesian World Models", arXiv:2201.09802.
     Differs from it: the head of cost gives a number, not a probability, and Dreamer is the later one,
     whose actor learns by reinforce (`actor_grad=backprop` has AMBS's).
-    mu is 1 from the second step on, as in the code, so lam moves by the whole violation each time;
-    `mu_least=0` is the paper's.
+    In the code mu is 1 from the second step on, so lam moves by the whole violation each time
+    (`mu_least=1`); `mu_least=0` is the paper's. The model foresees cost (`overshoot`), as that of
+    Dreamer-PID does.
     """
 
     # The discount of costs.
     cost_discount: Annotated[float, Bounds(0, 0.9999)] = 0.997
-    # The undiscounted cost that an episode may have. In 1,000 steps it is d = 1, as in AMBS's code.
-    cost_limit: Weight = 3.0
+    cost_limit: Weight = 25.0  # The undiscounted cost that an episode may have.
     lam_init: Weight = 0.01  # The multiplier at first, as in AMBS's code.
     mu_init: Annotated[float, Bounds(1e-12, 1e6)] = 5e-9  # mu at first, as in AMBS's code.
     mu_growth: Weight = 1e-6  # The growth of mu at each gradient step, as in AMBS's code.
-    # mu is at least this from the second step on, as in AMBS's code.
-    mu_least: Weight = 1.0
+    # mu is at least this from the second step on. In AMBS's code it is 1.
+    mu_least: Weight = 0.001
 
 
 @config
-class DreamerPIDConfig(CappedPIDConfig, PriceClockConfig, DreamerConfig):
+class DreamerPIDConfig(CappedPIDConfig, PriceClockConfig, ForesightConfig):
     """Dreamer-PID: Dreamer whose actor pays for cost in its dreams, at a price that real episodes set.
 
         L_actor <- L_actor + lam E[u_t sg (R_c_t - V_c_t) log pi(a_t)]
@@ -103,9 +124,6 @@ class DreamerPIDConfig(CappedPIDConfig, PriceClockConfig, DreamerConfig):
     Source: ours, after Huang et al. (2024), "SafeDreamer: Safe Reinforcement Learning with World
     Models", arXiv:2307.07176, whose planner has such a price; Stooke, Achiam and Abbeel (2020),
     "Responsive Safety in Reinforcement Learning by PID Lagrangian Methods", arXiv:2007.03964.
-    The defaults are from short runs on point_goal1 (docs/results/slow_price). They differ from
-    Dreamer's: larger networks and batches, longer dreams, fewer environments, and `overshoot`, so that
-    the model foresees cost. The number of gradient steps is the same.
     """
 
     # The discount of costs: 33 steps ahead.
@@ -119,16 +137,6 @@ class DreamerPIDConfig(CappedPIDConfig, PriceClockConfig, DreamerConfig):
     # Share of the past in the smoothed cost of an episode.
     pid_smoothing: Share = 0.9
     price_max: Cap = float("inf")  # The highest price. inf: no bound.
-    num_envs: Amount = 16  # Environments side by side, of all devices together.
-    replay_ratio: Amount = 128  # Rows replayed for each environment step.
-    batch_size: Amount = 1024  # Rows of a gradient step, of all devices together.
-    # Environment steps with random actions and without learning.
-    learning_starts: Amount = 1_024
-    # The networks' size: about the number of parameters, if pictures are observed.
-    size: SizeName = "500k"
-    # Steps ahead, at most `n_step`, for which the heads learn in dreams that take the replayed actions.
-    overshoot: Annotated[int, Bounds(0, 1000)] = 15
-    imagine_steps: Iterations = 15  # Steps of a dream, as in the paper.
 
 
 # ---- without constraint ------------------------------------------------------------------------
@@ -273,6 +281,7 @@ def make(
 # the authors' values of settings that have other defaults here
 PAPER: dict[str, Any] = {
     "batch_size": 1024, "n_step": 63, "imagine_steps": 15, "lr_warmup": 1000, "obs_bins": 0,
+    "overshoot": 0,
 }  # fmt: skip
 # danijar/dreamerv3 @e3f0224: its settings of vectors
 PROPRIO: dict[str, Any] = PAPER | {
@@ -299,11 +308,12 @@ SAFE_DREAMER: dict[str, Any] = VECTORS | {
 }  # fmt: skip
 # for two cores and half an hour
 CPU: dict[str, Any] = {"num_envs": 16, "replay_size": 200_000, "learning_starts": 1024}
-# the same for Dreamer-PID, whose own batches are too large for two cores
-CPU_PID: dict[str, Any] = CPU | {
+# the same with foresight, whose own batches are too large for two cores
+CPU_FORESIGHT: dict[str, Any] = CPU | {
     "batch_size": 256, "replay_ratio": 32, "size": "300k", "overshoot": 8, "imagine_steps": 10,
-    "dual_starts": 30_000,  # the task first: a price from the start on came before it
 }  # fmt: skip
+# the task first: a price from the start on came before it
+CPU_PID: dict[str, Any] = CPU_FORESIGHT | {"dual_starts": 30_000}
 # for a problem of two levers, whose next signs nobody can foresee
 LEVER: dict[str, Any] = {
     "num_envs": 16, "horizon": 16, "learn_every": 8, "replay_ratio": 8, "batch_size": 128, "n_step": 7,
@@ -326,11 +336,15 @@ ROWS = {
         partial(make, behaviour=priced),
         "Dreamer with an augmented Lagrangian on the cost of its dreams",
         # d = 1 in the 500 steps of an episode
-        {"ambs": AMBS | {"cost_limit": 1.5}, "safe_dreamer": SAFE_DREAMER, "cpu": CPU},
+        {
+            "ambs": AMBS | {"cost_limit": 1.5, "mu_least": 1.0},
+            "safe_dreamer": SAFE_DREAMER,
+            "cpu": CPU_FORESIGHT,
+        },
         total_steps=1_000_000,
         # with a mu of 1 the multiplier overshoots, and costs stay near 1.4; with reinforce one of two
         # seeds earns 9.8 of 14.4 after 160 updates, with backprop both earn 13.8
-        lever=LEVER | {"mu_least": 0.05, "actor_grad": "backprop"},
+        lever=LEVER | {"overshoot": 0, "mu_least": 0.05, "actor_grad": "backprop"},
     ),
     "dreamer_pid": Row(
         DreamerPIDConfig,

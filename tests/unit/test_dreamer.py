@@ -13,7 +13,7 @@ from jaxsafe.algos import dreamer
 from jaxsafe.learn.dreaming import Judged, Scene, no_range
 from jaxsafe.learn.treatments import CappedPID
 
-CFG = dreamer.DreamerLagConfig()
+CFG = dreamer.DreamerLagConfig(mu_least=1.0, cost_limit=3.0)
 
 
 class Averaging(Scene):
