@@ -58,7 +58,7 @@ class VectorEncoder(nn.Module):
             of_bins = shares(obs, self.bins)
             x = jnp.concatenate([x, of_bins.reshape(*obs.shape[:-1], -1)], -1)
         for _ in range(self.size.layers):
-            x = Hidden(self.size.units)(x)
+            x = Hidden(self.size.units, self.size.dtype)(x)
         return x
 
 
@@ -70,7 +70,8 @@ class VectorDecoder(nn.Module):
 
     @nn.compact
     def __call__(self, latent: Latent) -> jax.Array:
-        return Head(self.size.layers, self.size.units, self.obs_size)(latent.features)
+        size = self.size
+        return Head(size.layers, size.units, self.obs_size, dtype=size.dtype)(latent.features)
 
     def loss(self, decoded: jax.Array, obs: jax.Array) -> jax.Array:
         """The squared error of what `__call__` gave, summed over the observation: float [...]."""
@@ -102,6 +103,7 @@ class Convolution(nn.Module):
 
     out: int
     grows: bool = False
+    dtype: str = "float32"
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
@@ -110,9 +112,9 @@ class Convolution(nn.Module):
         reads, stride = (REPEATED_READS, 1) if self.grows else (READS, 2)
         # row and column of the place that is read (s, t), of the tap (d, e), of the pixel (a, b)
         matrix = jnp.einsum("ads,bet,deco->stcabo", reads, reads, kernel, precision="highest")
-        seen = patches(x, reads.shape[-1], stride)
-        squares = seen @ matrix.reshape(seen.shape[-1], 4 * self.out)
-        return squares.reshape(*squares.shape[:-1], 2, 2, self.out) + bias
+        seen = patches(x.astype(self.dtype), reads.shape[-1], stride)
+        squares = seen @ matrix.reshape(seen.shape[-1], 4 * self.out).astype(self.dtype)
+        return squares.reshape(*squares.shape[:-1], 2, 2, self.out) + bias.astype(self.dtype)
 
 
 def picture_of(squares: jax.Array) -> jax.Array:
@@ -130,7 +132,7 @@ class PictureEncoder(nn.Module):
     def __call__(self, picture: jax.Array) -> jax.Array:
         x = picture.astype(jnp.float32) / 255 - 0.5
         for channels in self.size.channels:
-            x = normed(Convolution(channels)(x).max((-3, -2)))
+            x = normed(Convolution(channels, dtype=self.size.dtype)(x).max((-3, -2)))
         return x.reshape(*x.shape[:-3], math.prod(x.shape[-3:]))
 
 
@@ -149,14 +151,15 @@ class PictureDecoder(nn.Module):
         height, width = (side // 2 ** len(channels) for side in self.shape[:2])
         front = latent.deter.shape[:-1]
         h = latent.deter.reshape(*front, blocks, self.size.deter // blocks)
-        of_h = BlockDense(height * width * channels[-1] // blocks)(h)  # its own channels
+        dtype = self.size.dtype
+        of_h = BlockDense(height * width * channels[-1] // blocks, dtype)(h)  # its own channels
         of_h = jnp.moveaxis(of_h.reshape(*front, blocks, height, width, -1), -4, -2)
-        z = Hidden(2 * self.size.units)(latent.stoch)
-        of_z = nn.Dense(height * width * channels[-1], kernel_init=fan_in(1.0))(z)
+        z = Hidden(2 * self.size.units, dtype)(latent.stoch)
+        of_z = nn.Dense(height * width * channels[-1], dtype=dtype, kernel_init=fan_in(1.0))(z)
         shape = (*front, height, width, channels[-1])
         x = normed(of_h.reshape(shape) + of_z.reshape(shape))
         for out in channels[-2::-1]:
-            x = normed(picture_of(Convolution(out, grows=True)(x)))
+            x = normed(picture_of(Convolution(out, grows=True, dtype=dtype)(x)))
         return nn.sigmoid(picture_of(Convolution(self.shape[-1], grows=True)(x)))
 
 

@@ -25,7 +25,9 @@ UNIFORM = 0.01  # the probability that a draw of a latent is uniform
 class Size(NamedTuple):
     """deter: of h. hidden: units of the layers about it. latents, classes: of z. units, layers: of
     encoder, decoder, actor and critic. channels: of a picture's layers, each of which halves it.
-    blocks: of the recurrent unit's weights."""
+    blocks: of the recurrent unit's weights. dtype: of the products and outputs of hidden layers and of
+    the recurrent unit. Weights, norms' sums, h and last layers are float32 all the same.
+    """
 
     deter: int
     hidden: int
@@ -35,6 +37,7 @@ class Size(NamedTuple):
     latents: int = 32
     layers: int = 3
     blocks: int = 8
+    dtype: str = "float32"
 
 
 def layers_of(depth: int) -> tuple[int, ...]:
@@ -84,45 +87,48 @@ def fan_in(scale: float) -> Callable[..., jax.Array]:
 
 
 def normed(x: jax.Array) -> jax.Array:
-    """Divided by the root mean square over the last axis, then SiLU. Call it in a compact `__call__`,
-    whose module then has the scale of the norm."""
-    return nn.silu(nn.RMSNorm(1e-4)(x))
+    """Divided by the root mean square over the last axis, then SiLU, in the dtype of `x`. Call it in a
+    compact `__call__`, whose module then has the scale of the norm."""
+    return nn.silu(nn.RMSNorm(1e-4, dtype=x.dtype)(x))
 
 
 class Hidden(nn.Module):
     """A linear layer, normalised by its root mean square, then SiLU: float [..., I] -> [..., units]."""
 
     units: int
+    dtype: str = "float32"
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        return normed(nn.Dense(self.units, kernel_init=fan_in(1.0))(x))
+        return normed(nn.Dense(self.units, dtype=self.dtype, kernel_init=fan_in(1.0))(x))
 
 
 class Head(nn.Module):
     """Hidden layers and a linear one, float [..., I] -> [..., out]. `scale` is of the last weights.
-    With 0 the outputs are 0 at first."""
+    With 0 the outputs are 0 at first. `dtype` is of the hidden layers."""
 
     layers: int
     units: int
     out: int
     scale: float = 1.0
+    dtype: str = "float32"
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         for _ in range(self.layers):
-            x = Hidden(self.units)(x)
+            x = Hidden(self.units, self.dtype)(x)
         last = fan_in(self.scale) if self.scale else nn.initializers.zeros
-        return nn.Dense(self.out, kernel_init=last)(x)
+        return nn.Dense(self.out, dtype="float32", kernel_init=last)(x)
 
 
 class BlockDense(nn.Module):
-    """A linear layer of each block, float [..., blocks, I] -> [..., blocks, out].
+    """A linear layer of each block, float [..., blocks, I] -> [..., blocks, out], in `dtype`.
 
     shared: float [..., J], further inputs, which every block sees after its own.
     """
 
     out: int
+    dtype: str = "float32"
 
     @nn.compact
     def __call__(self, x: jax.Array, shared: jax.Array | None = None) -> jax.Array:
@@ -130,10 +136,14 @@ class BlockDense(nn.Module):
         inputs = own + (0 if shared is None else shared.shape[-1])
         init = nn.initializers.variance_scaling(1.0, "fan_in", "truncated_normal", batch_axis=(0,))
         kernel = self.param("kernel", init, (blocks, inputs, self.out))
+        bias = self.param("bias", nn.initializers.zeros, (blocks, self.out))
+        x, shared, kernel, bias = jax.tree.map(
+            lambda x: x.astype(self.dtype), (x, shared, kernel, bias)
+        )
         y = jnp.einsum("...bi,bio->...bo", x, kernel[:, :own])
         if shared is not None:  # no copy of them for each block
             y += jnp.einsum("...j,bjo->...bo", shared, kernel[:, own:])
-        return y + self.param("bias", nn.initializers.zeros, (blocks, self.out))
+        return y + bias
 
 
 class Memory(nn.Module):
@@ -147,9 +157,9 @@ class Memory(nn.Module):
 
     @nn.compact
     def __call__(self, latent: Latent, action: jax.Array) -> jax.Array:
-        blocks, width = self.size.blocks, self.size.deter // self.size.blocks
+        blocks, width, dtype = self.size.blocks, self.size.deter // self.size.blocks, self.size.dtype
         parts = (latent.deter, latent.stoch, action)
-        u = jnp.concatenate([Hidden(self.size.hidden)(x) for x in parts], -1)
+        u = jnp.concatenate([Hidden(self.size.hidden, dtype)(x) for x in parts], -1)
 
         def split(x: jax.Array) -> jax.Array:
             return x.reshape(*x.shape[:-1], blocks, width)
@@ -157,8 +167,9 @@ class Memory(nn.Module):
         def join(x: jax.Array) -> jax.Array:
             return x.reshape(*x.shape[:-2], blocks * width)
 
-        y = normed(join(BlockDense(width)(split(latent.deter), u)))
-        reset, candidate, gate = jnp.split(BlockDense(3 * width)(split(y)), 3, axis=-1)
+        y = normed(join(BlockDense(width, dtype)(split(latent.deter), u)))
+        gates = BlockDense(3 * width, dtype)(split(y)).astype(latent.deter.dtype)
+        reset, candidate, gate = jnp.split(gates, 3, axis=-1)
         keep = 1 - nn.sigmoid(join(gate) - 1)
         return (1 - keep) * jnp.tanh(nn.sigmoid(join(reset)) * join(candidate)) + keep * latent.deter
 
@@ -205,9 +216,10 @@ class WorldModel(nn.Module):
     def setup(self) -> None:
         z = self.size.latents * self.size.classes
         self.memory = Memory(self.size)
-        self.before = Head(2, self.size.hidden, z)
-        self.after = Head(1, self.size.hidden, z)
-        self.readers = {name: Head(1, self.size.units, out, scale=0.0) for name, out in self.heads}
+        hidden, units, dtype = self.size.hidden, self.size.units, self.size.dtype
+        self.before = Head(2, hidden, z, dtype=dtype)
+        self.after = Head(1, hidden, z, dtype=dtype)
+        self.readers = {name: Head(1, units, out, scale=0.0, dtype=dtype) for name, out in self.heads}
 
     def embed(self, obs: Any) -> jax.Array:
         return self.encoder(obs)

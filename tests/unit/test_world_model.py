@@ -20,8 +20,9 @@ from jaxsafe.learn.next_step_rollout import collect_records, started
 from jaxsafe.learn.replay import Record, Source, Span
 from jaxsafe.learn.rollout import init_rollout
 from jaxsafe.learn.sequences import SequenceBatch, drawn_sequences
-from jaxsafe.nn import rssm, two_hot
+from jaxsafe.nn import coders, rssm, two_hot
 
+FLOAT32 = {jnp.dtype("float32")}
 THREE: dict[str, Any] = dreamer.LEVER | {"num_envs": 3, "replay_ratio": 16, "stagger": False}
 
 # ---- two-hot -----------------------------------------------------------------------------------
@@ -387,3 +388,40 @@ def test_the_model_foresees_a_deterministic_toy():
     foreseen, came, stood = trained.lower(jax.random.key(0)).compile(FAST)(jax.random.key(0))
     error, still = (jnp.sqrt(((x - came) ** 2).mean((1, 2))) for x in (foreseen, stood))
     assert error[-1] < 0.25 * still[-1], (error, still)
+
+
+def test_hidden_layers_in_bfloat16_change_a_loss_and_its_gradient_little():
+    """Rounding errors of 2^-9 each, some tens of them, one upon the other. Of four pixels that are
+    nearly alike they make another the largest."""
+    draw = jax.random.split(jax.random.key(0), 4)
+    latent = rssm.Latent(jax.random.normal(draw[0], (64, 32)), jax.random.normal(draw[1], (64, 16)))
+    picture = (255 * jax.random.uniform(draw[2], (64, 12, 12, 3))).astype(jnp.uint8)
+    obs = {"vision": picture, "vector": jax.random.normal(draw[3], (64, 7))}
+
+    def model(dtype):
+        size = rssm.SIZES["tiny"]._replace(dtype=dtype)
+        return rssm.WorldModel(size, coders.Encoder(size, 21), coders.Decoder(size, (12, 12, 3), 7), ())
+
+    def loss(params, dtype):
+        world = model(dtype)
+        embedded = world.apply(params, obs, method="embed")
+        after: Any = world.apply(params, latent, jnp.ones((64, 2)), embedded, None, method="observe")
+        believed: Any = world.apply(params, after.deter, embedded, method="beliefs")
+        # z of the latent that was given: a rounding would turn over some of its likeliest classes
+        seen = rssm.Latent(after.deter, latent.stoch)
+        decoded = world.apply(params, seen, method="decode")
+        assert {x.dtype for x in jax.tree.leaves((after, believed, decoded))} == FLOAT32
+        return world.decoder.loss(decoded, obs).mean() + rssm.kl(*believed).mean()
+
+    init = jax.jit(partial(model("bfloat16").init, method="everything"), compiler_options=FAST)
+    params = init(jax.random.key(1), jax.tree.map(lambda x: x[0], obs), jnp.ones(2))
+    assert {x.dtype for x in jax.tree.leaves(params)} == FLOAT32
+    (rounded, slopes), (exact, exact_slopes) = (
+        jax.jit(jax.value_and_grad(partial(loss, dtype=dtype)), compiler_options=FAST)(params)
+        for dtype in ("bfloat16", "float32")
+    )
+    assert 1e-6 < abs(rounded - exact) / exact < 1e-2
+    flat, exact_flat = (
+        np.concatenate([np.ravel(x) for x in jax.tree.leaves(g)]) for g in (slopes, exact_slopes)
+    )
+    assert 1e-4 < np.linalg.norm(flat - exact_flat) / np.linalg.norm(exact_flat) < 0.1
