@@ -3,12 +3,13 @@
 The environment has the sizes of point_goal1 and costs nothing to step, so that what is left of an
 update is the learner: acting, estimates, the policy's step and the critics'. An offline algorithm has
 100,000 transitions of random numbers. Options are preset=, compat= and algo.OPTION= of train. Prints
-the median, and with --kernels what an update consists of. On a GPU that is compiled without CUDA
-graphs, which hide what their kernels come from.
+the median, the floating-point operations of matrix products, and with --kernels what an update consists
+of. On a GPU that is compiled without CUDA graphs, which hide what their kernels come from.
 """
 
 import argparse
 import collections
+import math
 import os
 import re
 import statistics
@@ -16,7 +17,7 @@ import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -56,6 +57,33 @@ def transitions(env: Weightless, count: int = 100_000) -> DataSet:
     obs, next_obs = (draw((count, env.obs_size)) for _ in range(2))
     action, reward, cost = draw((count, env.action_size)), draw(count), np.abs(draw(count))
     return data_set(obs, action, reward, cost, next_obs, np.zeros(count), time_up, costs)
+
+
+def products_of(jaxpr: Any) -> int:
+    """The floating-point operations of a program's matrix products, two for each multiplication.
+
+    Of the branches of a `cond` the dearest counts. The body of a `while` counts once.
+    """
+    total = 0
+    for step in jaxpr.eqns:
+        if step.primitive.name == "dot_general":
+            (summed, _), _ = step.params["dimension_numbers"]
+            terms = math.prod(step.invars[0].aval.shape[i] for i in summed)
+            total += 2 * terms * math.prod(step.outvars[0].aval.shape)
+            continue
+        inside = [
+            products_of(getattr(x, "jaxpr", x))
+            for x in jax.tree.leaves(list(step.params.values()), is_leaf=is_program)
+            if is_program(x)
+        ]
+        if inside:
+            dearest = max(inside) if step.primitive.name == "cond" else sum(inside)
+            total += step.params.get("length", 1) * dearest
+    return total
+
+
+def is_program(x: Any) -> bool:
+    return hasattr(getattr(x, "jaxpr", x), "eqns")
 
 
 class Kernel(NamedTuple):
@@ -127,10 +155,13 @@ def main() -> int:
         return 2
     size = f"{cfg.updates} gradient steps" if offline else f"{cfg.num_envs} x {cfg.horizon}"
     warm_up = 0 if offline else -(-getattr(cfg, "learning_starts", 0) // (cfg.num_envs * cfg.horizon))
+    products = products_of(jax.make_jaxpr(update)(state, np.int32(0)).jaxpr) / 1e12
     timing = timed(update, state, before=2 + warm_up, repeats=args.repeats)
+    seconds = statistics.median(timing.runs)
     print(
         f"{' '.join([args.algo, *args.options])}, {args.seeds} x {size}: "
-        f"{1e3 * statistics.median(timing.runs):.1f} ms an update, compiled in {timing.compile_s:.1f} s"
+        f"{1e3 * seconds:.1f} ms an update, compiled in {timing.compile_s:.1f} s\n"
+        f"{products:.3g} TFLOP of products an update, {products / seconds:.3g} TFLOP/s"
     )
     if args.kernels:
         show(kernels_of(timing), args.kernels)

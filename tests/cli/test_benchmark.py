@@ -15,7 +15,8 @@ from jaxsafe.commands import benchmark, peers
 from jaxsafe.config import ConfigError
 
 SCRIPTS = Path(__file__).parent.parent.parent / "scripts"
-kernels_of = runpy.run_path(str(SCRIPTS / "profile_learner.py"))["kernels_of"]
+profile = runpy.run_path(str(SCRIPTS / "profile_learner.py"))
+kernels_of, products_of = profile["kernels_of"], profile["products_of"]
 
 
 def test_a_row_tells_what_was_measured(tmp_path, monkeypatch, capsys):
@@ -146,3 +147,23 @@ def test_a_peer_s_rate_is_that_of_its_settled_epochs():
     row = peers.sac_training(train, Evaluator, None, peers.Sizes(100, 50, 4))
     assert (row["slowest"], row["env_steps_per_s"], row["fastest"]) == (12.0, 14.0, 16.0)
     assert (row["num_envs"], row["replay_ratio"]) == (100, 2.0)
+
+
+def test_the_products_of_a_program_are_counted_in_loops_branches_and_gradients():
+    weights, x = jnp.ones((4, 6)), jnp.ones((3, 4))
+
+    def once(weights, x):
+        return (x @ weights).sum()  # 3 x 6 sums of 4 products
+
+    def often(weights, x):
+        def step(total, x):
+            return total + jax.lax.cond(total > 0, once, lambda *_: 0.0, weights, x), ()
+
+        return jax.lax.scan(step, 0.0, jnp.stack([x] * 5))[0]
+
+    def count(fn):
+        return products_of(jax.make_jaxpr(fn)(weights, x).jaxpr)
+
+    assert count(once) == 2 * 3 * 6 * 4
+    assert count(often) == count(jax.jit(often)) == 5 * count(once)
+    assert count(jax.grad(once)) == 2 * count(once)  # forward, and back to the weights
