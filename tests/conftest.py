@@ -5,11 +5,12 @@ from pathlib import Path
 
 import jax
 import pytest
-from compiling import keep_programs
+from compiling import compile_quickly, keep_programs
 
 from jaxsafe import algos, envs
 from jaxsafe.envs.view import backend
 
+compile_quickly()
 keep_programs()
 
 # In the background the tests are told to ignore these. The programs that they start would inherit

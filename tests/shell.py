@@ -22,7 +22,6 @@ SMALL = (
     "algo.critic_epochs=2", "algo.hidden=[8,8]", "eval_episodes=2", "video=false",
 )  # fmt: skip
 STEPS = 64  # of an update of SMALL
-FAST_XLA = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
 
 
 def typed(script: str, *args: str) -> int | str | None:
@@ -36,11 +35,9 @@ def typed(script: str, *args: str) -> int | str | None:
 
 
 def start(script: str, *args: str, cwd: Path, **environ: str) -> subprocess.Popen:
-    """A new process, which finds the toys and keeps what it compiles."""
+    """A new process, which finds the toys."""
     path = os.pathsep.join([str(TESTS), str(SCRIPTS.parent), os.environ.get("PYTHONPATH", "")])
-    cache = {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.1", "XDG_CACHE_HOME": str(cwd)}
-    cache = {name: os.environ.get(name, value) for name, value in cache.items()}
-    process = {**os.environ, **cache, "JAX_PLATFORMS": "cpu", "PYTHONPATH": path, **environ}
+    process = {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": path, **environ}
     return subprocess.Popen(
         [sys.executable, str(SCRIPTS / f"{script}.py"), *args],
         cwd=cwd, env=process, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,

@@ -13,8 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import rich.console
-from compiling import FAST
-from toys import START, Corridor
+from toys import Corridor
 
 import jaxsafe
 from jaxsafe import algos, api
@@ -45,18 +44,6 @@ class PricedConfig(PPOConfig):
 PRICED = algos.Row(
     PricedConfig, lambda env, axis_name=None: on_policy(env, penalty, clipped, adam_epochs, axis_name)
 )
-
-
-@pytest.fixture(scope="module", autouse=True)
-def compiled_quickly():
-    def quick(program: programs.Program, ts: Any) -> Any:
-        return (
-            jax.jit(program.update, donate_argnums=0, compiler_options=FAST).lower(ts, START).compile()
-        )
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(programs, "compiled", quick)
-        yield
 
 
 @pytest.fixture(autouse=True)

@@ -18,7 +18,6 @@ import pytest
 import yaml
 from compiling import FAST
 from shell import (
-    FAST_XLA,
     SMALL,
     STEPS,
     TOY,
@@ -186,7 +185,7 @@ def real(tmp_path_factory) -> tuple[Path, str]:
     """A run of Safety Gym on engine c by the script itself, and what it printed."""
     home = tmp_path_factory.mktemp("real")
     args = ("env=point_goal0", "env.num_steps=20", *SMALL[1:], f"total_steps={2 * STEPS}")
-    status, out, err = call("train", *args, "run_dir=run", cwd=home, XLA_FLAGS=FAST_XLA)
+    status, out, err = call("train", *args, "run_dir=run", cwd=home)
     assert status == 0, err
     return home / "run", out
 
@@ -209,9 +208,7 @@ def test_a_run_folder_holds_what_a_reader_needs(real):
 
 
 def test_evaluate_prints_the_table(real, tmp_path):
-    status, out, err = call(
-        "evaluate", str(real[0]), "--episodes", "3", cwd=tmp_path, XLA_FLAGS=FAST_XLA
-    )
+    status, out, err = call("evaluate", str(real[0]), "--episodes", "3", cwd=tmp_path)
     assert status == 0, err
     for row in ("return", "cost", "violation rate", "cost rate"):
         assert any(line.startswith(row) for line in out.splitlines())

@@ -32,8 +32,7 @@ def free_port() -> int:
 
 
 def start(cwd: Path, *args: str, devices: int = 1) -> subprocess.Popen:
-    here = {"JAX_NUM_CPU_DEVICES": str(devices), "XLA_FLAGS": shell.FAST_XLA}
-    return shell.start("train", *ARGS, *args, cwd=cwd, **here)
+    return shell.start("train", *ARGS, *args, cwd=cwd, JAX_NUM_CPU_DEVICES=str(devices))
 
 
 def start_pair(cwd: Path, *args: str) -> list[subprocess.Popen]:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from shell import FAST_XLA, SMALL, STEPS, call
+from shell import SMALL, STEPS, call
 
 LAUNCHERS = {
     "joblib": ("hydra_plugins.hydra_joblib_launcher", ["hydra.launcher.n_jobs=2"]),
@@ -17,7 +17,7 @@ def multirun(launcher: str, cwd: Path, *arguments: str) -> tuple[int, str, str]:
     module, options = LAUNCHERS[launcher]
     pytest.importorskip(module, reason="pip install -e '.[launchers]'")
     words = ["-m", *SMALL, f"total_steps={2 * STEPS}", f"hydra/launcher={launcher}", *options]
-    return call("train", *words, *arguments, cwd=cwd, XLA_FLAGS=FAST_XLA)
+    return call("train", *words, *arguments, cwd=cwd)
 
 
 @pytest.mark.slow  # each job is a new process, which imports and compiles

@@ -1,7 +1,6 @@
 """Sweeps of a toy environment, all in this process."""
 
 import csv
-import functools
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +10,6 @@ import jax
 import numpy as np
 import pytest
 import shell
-from compiling import FAST
 from toys import START, Corridor
 
 from jaxsafe import algos
@@ -71,20 +69,6 @@ def assert_close(a: dict[tuple, dict[str, np.ndarray]], b: dict[tuple, dict[str,
             np.testing.assert_allclose(
                 a[member][name], b[member][name], rtol=1e-3, atol=1e-4, err_msg=f"{member} {name}"
             )
-
-
-@pytest.fixture(scope="module", autouse=True)
-def compiled_quickly():
-    @functools.cache
-    def compiled(update: Any) -> Any:
-        return jax.jit(update, donate_argnums=0, compiler_options=FAST)
-
-    def quick(program: programs.Program, ts: Any) -> Any:
-        return compiled(program.update).lower(ts, START).compile()
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(programs, "compiled", quick)
-        yield
 
 
 @pytest.fixture(scope="module")

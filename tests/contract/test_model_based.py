@@ -267,7 +267,7 @@ for name in sys.argv[2:]:
 
 @pytest.mark.slow
 def test_two_devices_keep_the_same_parameters():
-    env = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
+    env = os.environ | {"JAX_NUM_CPU_DEVICES": "2", "JAX_PLATFORMS": "cpu"}
     here = os.path.dirname(os.path.dirname(__file__))
     names = ["safe_loop", "cap_pets"]
     command = [sys.executable, "-c", DEVICES, here, *names]

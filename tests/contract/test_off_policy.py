@@ -460,7 +460,7 @@ for name in sys.argv[2:]:
 
 @pytest.mark.parametrize("name", ["sac", pytest.param("td3_lag", marks=pytest.mark.slow)])
 def test_one_seed_over_two_devices_learns_alike_and_two_seeds_are_the_lone_ones(name):
-    env = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
+    env = os.environ | {"JAX_NUM_CPU_DEVICES": "2", "JAX_PLATFORMS": "cpu"}
     here = os.path.dirname(os.path.dirname(__file__))
     out = subprocess.run(
         [sys.executable, "-c", DEVICES, here, name], env=env, capture_output=True, text=True

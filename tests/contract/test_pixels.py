@@ -118,7 +118,7 @@ def test_ppo_learns_where_the_patch_is():
     options = {"hidden": (32,), "trunk": "shared", "lr": 2e-3, "epochs": 4, "cost_limit": 5.0}
     cfg = ALGOS["ppo_lag"].config(num_envs=64, horizon=10, minibatches=4, encoder="cnn", **options)
     ts = jax.jit(lambda: algo.init(jax.random.key(0), cfg, START))()
-    update = jax.jit(algo.update)  # quick to run: convolutions are slow where little is optimised
+    update = jax.jit(algo.update)
     for _ in range(32):
         ts, metrics = update(ts, START)
     assert metrics["train/return"] > 3 and metrics["train/nonfinite"] == 0

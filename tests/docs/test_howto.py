@@ -7,7 +7,6 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-import jax
 import pytest
 
 from jaxsafe import envs
@@ -24,14 +23,6 @@ SMALL = (
     "num_envs=4", "algo.horizon=16", "algo.minibatches=2", "algo.critic_epochs=2", "algo.hidden=[8,8]",
     "total_steps=128", "eval_episodes=2", "video=false",
 )  # fmt: skip
-
-
-@pytest.fixture(autouse=True, scope="module")
-def quickly() -> Iterator[None]:
-    """Compile for a few steps, not for millions."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
 
 
 def blocks(page: Path) -> list[tuple[bool, str, str]]:

@@ -40,7 +40,6 @@ learning = {"total_updates": 20, "updates": 10, "batch_size": 8, "hidden": (4,),
     "shielding": "seen, ahead = 8, 5",
 }
 TASK = "toys:Corridor"  # of tests/, where a notebook has a `task`: compiles in seconds, and is cached
-FAST_XLA = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
 
 
 def cells(path: Path) -> list[dict[str, Any]]:
@@ -54,7 +53,6 @@ def tagged(path: Path, tag: str) -> list[str]:
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
 def test_a_notebook_runs_from_top_to_bottom(path, tmp_path, monkeypatch):
     monkeypatch.setenv("JAX_PLATFORMS", "cpu")
-    monkeypatch.setenv("XLA_FLAGS", FAST_XLA)
     monkeypatch.setenv("PYTHONPATH", str(ROOT / "tests"), prepend=os.pathsep)
     notebook: Any = nbformat.read(path, as_version=4)
     for cell in notebook.cells:

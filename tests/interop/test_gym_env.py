@@ -5,11 +5,9 @@ import importlib
 import itertools
 import sys
 import types
-from collections.abc import Iterator
 from typing import Any
 
 import gymnasium
-import jax
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
@@ -21,14 +19,6 @@ from jaxsafe.config import ConfigError
 from jaxsafe.interop.gymnasium import GymEnv, GymVectorEnv, SixTuple, SixTupleVector
 
 UNBOUNDED = "ignore:.*Box observation space .* value is -?infinity"
-
-
-@pytest.fixture(autouse=True, scope="module")
-def quickly() -> Iterator[None]:
-    """Compile for a few steps, not for millions."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
 
 
 def walk(env, steps: int = 5, seed: int | None = 7) -> list:
