@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import difflib
+import functools
 import importlib
 import math
 import numbers
@@ -89,8 +90,14 @@ def config(cls: type[T]) -> type[T]:
     return cls
 
 
+@functools.cache
+def hints_of(cls: type, bounds: bool = False) -> dict[str, Any]:
+    """The type of each field, with its bounds if asked for."""
+    return typing.get_type_hints(cls, include_extras=bounds)
+
+
 def fields_of(cls: type, *kinds: Any) -> list[str]:
-    hints = typing.get_type_hints(cls)
+    hints = hints_of(cls)
     return [f.name for f in dataclasses.fields(cls) if hints[f.name] in kinds]  # type: ignore[arg-type]
 
 
@@ -139,7 +146,7 @@ def from_dict(cls: type[T], values: dict[str, Any], where: str = "") -> T:
         ConfigError: an unknown name (with the nearest valid one), a value of the wrong type or out of
             its bounds.
     """
-    hints = typing.get_type_hints(cls, include_extras=True)
+    hints = hints_of(cls, bounds=True)
     names = [f.name for f in dataclasses.fields(cls) if f.init]  # type: ignore[arg-type]
     for name in values:
         if name not in names:
@@ -152,7 +159,7 @@ def check_values(cfg: Any, where: str = "") -> None:
 
     JAX's traced values are not checked.
     """
-    hints = typing.get_type_hints(type(cfg), include_extras=True)
+    hints = hints_of(type(cfg), bounds=True)
     for name in (f.name for f in dataclasses.fields(cfg)):
         if isinstance(value := getattr(cfg, name), numbers.Real | tuple):
             convert(value, hints[name], f"{where}{name}")
