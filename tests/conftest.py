@@ -10,7 +10,6 @@ from compiling import compile_quickly, keep_programs
 from jaxsafe import algos, envs
 from jaxsafe.envs.view import backend
 
-compile_quickly()
 keep_programs()
 
 # In the background the tests are told to ignore these. The programs that they start would inherit
@@ -22,6 +21,12 @@ for number in (signal.SIGINT, signal.SIGHUP):
 MAPS = Path("/proc/self/maps")
 MOST_MAPS = 40_000  # Linux lets a process have 65,530
 OURS = [(registry, dict(registry)) for registry in (envs.ENVS, algos.ALGOS)]
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Slow proofs run longer than they compile: they compile as users' programs do."""
+    if "not slow" in config.option.markexpr:
+        compile_quickly()
 
 
 @pytest.fixture(autouse=True, scope="module")
