@@ -9,8 +9,8 @@ from jaxsafe.run.devices import use_compilation_cache
 FAST = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
 EXACT = FAST.copy()  # as users' programs add up
 if jax.__version_info__ < (0, 11):
-    # The emitters of fusions take more time than all else at this level. XLA's older ones get the
-    # implicit gradients of Beta draws wrong: a test of these has EXACT.
+    # The emitters of fusions take more time than all else at this level. With XLA's older ones two ways
+    # to the implicit gradients of Beta draws differ: a test of these has EXACT.
     FAST["xla_cpu_use_fusion_emitters"] = False
     EXACT["xla_cpu_use_fusion_emitters"] = True
 

@@ -33,11 +33,12 @@ from jaxsafe.learn.world_model import (
     laprop,
     model_loss,
     policy_of,
+    size_of,
     value_of,
     world_of,
 )
 from jaxsafe.nn.gaussian import Gaussian, sample
-from jaxsafe.nn.rssm import SIZES, Latent, WorldModel
+from jaxsafe.nn.rssm import Latent, WorldModel
 from jaxsafe.nn.two_hot import BINS, two_hot_loss
 from jaxsafe.types import Env, Metrics, Policy, PyTree
 
@@ -289,7 +290,7 @@ def dreaming_learner(env: Env, behaviour: Behaviour, policy: Policy | None = Non
             raise ConfigError(
                 f"overshoot={cfg.overshoot}: expected at most n_step={cfg.n_step}, a sequence's steps"
             )
-        size = SIZES[cfg.size]
+        size = size_of(cfg)
         obs, action = blank(observation_like(env)), jnp.zeros(action_size)
         features = jnp.zeros(size.deter + size.latents * size.classes)
         model_key, actor_key, critic_key = jax.random.split(key, 3)

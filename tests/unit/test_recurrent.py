@@ -31,7 +31,10 @@ def test_the_gradient_of_all_steps_at_once_is_that_of_a_scan(of):
 
     def loss(run, part):
         """Of the states, each of which counts otherwise."""
-        step = lambda params, h, x, given: net.apply(params, h, x, *given)  # noqa: E731
+
+        def step(params, h, x, given):
+            return net.apply(params, h, x, *given)
+
         states = run(step, *{**args, of: part}.values(), given)
         return (jnp.arange(1, STEPS + 1)[:, None, None] * states**2).sum()
 
