@@ -18,7 +18,8 @@ from jaxsafe.run.policies import open_run
 AMBS = (
     TOY, "algo=ambs", "num_envs=4", "algo.horizon=8", "algo.learn_every=8", "algo.batch_size=32",
     "algo.replay_ratio=2", "algo.n_step=3", "algo.replay_size=128", "algo.learning_starts=32",
-    "algo.size=tiny", "algo.imagine_steps=3", "algo.shield_rollouts=4", "algo.shield_horizon=5",
+    "algo.size=tiny", "algo.imagine_steps=3", "algo.overshoot=2", "algo.rule=hoeffding",
+    "algo.shield_rollouts=4", "algo.shield_horizon=5",
     "algo.labels=[wall]", "eval_episodes=2", "video=false",
 )  # fmt: skip
 STEPS = 32  # of an update

@@ -20,7 +20,7 @@ from jaxsafe.learn.world_model import dream, dream_returns
 from jaxsafe.nn.gaussian import Gaussian
 from jaxsafe.nn.rssm import Latent
 
-CFG = ambs.AMBSConfig(discount=1 - 1 / 333)
+CFG = ambs.AMBSConfig(discount=1 - 1 / 333, rule="hoeffding", shield_rollouts=512, delta=0.1)
 
 
 # ---- the bounds --------------------------------------------------------------------------------
@@ -313,7 +313,7 @@ def test_on_a_known_chain_it_overrules_where_the_bound_says(monkeypatch, verdict
 def test_in_the_simulator_it_knows_what_comes(monkeypatch):
     """Two steps to the right go beyond the ledge, and one does not."""
     env, algo = Ledge(), ALGOS["ambs"].make(Ledge())
-    cfg = ambs.AMBSConfig(size="tiny", shield="true_dynamics", rule="binomial", shield_rollouts=64)
+    cfg = ambs.AMBSConfig(size="tiny", shield="true_dynamics", delta=0.1)
     learned = algo.learned(jax.eval_shape(lambda key: algo.init(key, cfg, START), jax.random.key(0)))
     assert algo.policy.privileged(dataclasses.replace(learned, config=cfg))
     monkeypatch.setattr(ambs, "chosen", lambda *_: jnp.ones(1))
