@@ -95,8 +95,8 @@ class CostCriticConfig(PriceClockConfig):
         ),
     )
 
-    # How the values of two cost critics become one. max is cautious: its estimates are several times
-    # too high. one: a single critic, as in OmniSafe.
+    # How the values of two cost critics become one. max is cautious: it takes estimates that are too
+    # high. one: a single critic, as in OmniSafe.
     cost_reduce: Literal["mean", "max", "one"] = "mean"
     # Whether a Q_c below 0 counts as 0, because no cost is negative. Without it the policy finds
     # actions whose cost is estimated far too low. Costs that `cost_centre` centres have values below 0:

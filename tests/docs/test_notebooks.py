@@ -22,7 +22,8 @@ TINY: dict[str, Any] = {
 SHIELD: dict[str, Any] = {
     "preset": "cpu", "num_envs": 4, "horizon": 8, "learn_every": 8, "batch_size": 32, "replay_ratio": 2,
     "n_step": 3, "replay_size": 128, "learning_starts": 32, "size": "tiny", "imagine_steps": 3,
-    "shield_rollouts": 4, "delta": 0.8, "shield_horizon": 5, "total_steps": 128, "eval_episodes": 2,
+    "overshoot": 2, "shield_rollouts": 4, "delta": 0.8, "shield_horizon": 5, "total_steps": 128,
+    "eval_episodes": 2,
 }  # fmt: skip
 SMALL = {  # what the settings of each become
     "quickstart": TINY | {"env.num_steps": 40},
