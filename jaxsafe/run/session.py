@@ -183,6 +183,8 @@ def run(session: Session, report: Reporter, finish: Finish) -> int:
             to_wandb = wandb_callback(session.folder, settings.plain(), program.members)
             hooks = hooks._replace(callbacks=(*hooks.callbacks, to_wandb))
     report.line(greeting(session))
+    if line := about_cpu(settings):
+        report.line(line)
     for line in dict.fromkeys(filter(None, map(settings.row.note, settings.configs))):
         report.line(line)
     if line := about_replay(program, train):
@@ -241,6 +243,15 @@ def write_head(session: Session) -> None:
         run_folder.append_versions(folder, device_name(), engine_of(session.env), data)
     except OSError as error:
         raise checkpoint.CheckpointError(f"cannot write to {folder}: {error.strerror}") from error
+
+
+def about_cpu(settings: Settings) -> str:
+    """On a CPU: that there are settings for it, if these are the defaults; else ''."""
+    meant, defaults = settings.row.published.get("cpu", {}), settings.row.config()
+    others = any(getattr(settings.algo, name) != getattr(defaults, name) for name in meant)
+    if jax.default_backend() != "cpu" or not meant or others:
+        return ""
+    return "the defaults are for a GPU; preset=cpu is for two cores and half an hour"
 
 
 def greeting(session: Session) -> str:

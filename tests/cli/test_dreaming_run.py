@@ -13,7 +13,9 @@ from jaxsafe.algos import ambs
 from jaxsafe.envs.view import render
 from jaxsafe.report.dreams import play
 from jaxsafe.run import checkpoint
+from jaxsafe.run.arguments import compose
 from jaxsafe.run.policies import open_run
+from jaxsafe.run.session import about_cpu
 
 AMBS = (
     TOY, "algo=ambs", "num_envs=4", "algo.horizon=8", "algo.learn_every=8", "algo.batch_size=32",
@@ -89,3 +91,11 @@ def test_a_label_that_the_environment_does_not_have_is_refused_in_a_line(capsys,
     args = ("algo.labels=[walls]", "total_steps=64", f"run_dir={tmp_path / 'run'}")
     assert typed("train", *AMBS, *args) == 2
     assert "labels: unknown cost 'walls'; did you mean 'wall'?" in capsys.readouterr().err
+
+
+def test_on_a_cpu_the_defaults_name_the_preset_for_it(monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
+    task = ["env=point_goal1", "algo=ambs"]
+    found = [about_cpu(compose([*task, *more])) for more in ([], ["preset=cpu"], ["algo.size=tiny"])]
+    assert "preset=cpu is for" in found[0] and found[1:] == ["", ""]
+    assert about_cpu(compose(["env=point_goal1", "algo=cpo"])) == ""  # which has none
