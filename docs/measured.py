@@ -38,17 +38,6 @@ def beyond(value: float, spread: tuple[float, float]) -> float:
     return float(np.sign(value - mean) * max(0.0, abs(value - mean) - width))
 
 
-def evaluated(runs: Sequence[SettingRun]) -> list[SettingRun]:
-    """The runs with what their final policies made in fresh episodes in place of what training made;
-    without those whose evaluation was not kept."""
-    names = ("return", "cost")
-    known = [run for run in runs if np.isfinite(run.values.get("final cost", np.nan)).all()]
-    return [
-        run._replace(values={**run.values, **{name: run.values[f"final {name}"] for name in names}})
-        for run in known
-    ]
-
-
 def their_curves() -> dict[tuple[str, str], tuple[str, str]]:
     """Return and cost at the end of OmniSafe's training by (env, algorithm); '' where unreadable."""
     with (RESULTS / "published_curves.csv").open() as file:
@@ -364,7 +353,7 @@ def pages() -> dict[Path, str]:
     runs = read([RESULTS / name for name in TABLE])
     runs = [run for run in runs if run.config["algo.name"] not in EXTRA]
     groups = ordered(group(runs, ["algo.name"]))
-    final = ordered(group(evaluated(runs), ["algo.name"]))
+    final = ordered(group(studies.evaluated(runs), ["algo.name"]))
     theirs = read([RESULTS / "omnisafe"])
     theirs = [run for run in theirs if run.config["compat"] == "omnisafe"]
     margin = ["car_goal2", "point_button1", "point_goal2"]
@@ -408,7 +397,7 @@ def main() -> None:
         studies.write_page(studies.read(path.parent))
     runs = read([RESULTS / name for name in TABLE])
     learning(runs, HERE / "images" / "learning.png")
-    shown = [run for run in evaluated(runs) if run.config["algo.name"] in SHOWN]
+    shown = [run for run in studies.evaluated(runs) if run.config["algo.name"] in SHOWN]
     groups = ordered(group(shown, ["algo.name"]))
     published = {(g.env, g.name): beside(g, PUBLISHED) for g in groups}
     picture = plots.trade_off(groups, "evaluated policies", published)

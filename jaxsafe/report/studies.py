@@ -299,7 +299,7 @@ def page(study: Study) -> tuple[str, list[Picture]]:
     ]
     makers: dict[str, Callable[[], str]] = {
         "figures": lambda: "\n\n".join(shown),
-        "matrix": lambda: matrix(groups, known),
+        "matrix": lambda: matrices(groups, known),
         "runs": lambda: run_table(study, runs, known),
     }
     made = {name: make() for name, make in makers.items() if f"<!-- measured: {name} -->" in text}
@@ -336,10 +336,15 @@ def pictures_of(
     found = []
     if 1 < len(settings) <= MOST:
         theirs = {(g.env, g.name): beside(g, known) for g in groups}
-        hollow = "; hollow diamonds are published means" if any(theirs.values()) else ""
-        title = "last 10 % of training"
-        draw = functools.partial(plots.trade_off, groups, title, theirs)
-        caption = f"Return against cost, a point a setting{hollow}"
+        hollow, title, drawn = "", "last 10 % of training", groups
+        if any(theirs.values()):  # these are of evaluated policies, and so are ours then
+            hollow, title, drawn = (
+                "; hollow diamonds are published means",
+                "evaluated policies",
+                final(groups),
+            )
+        draw = functools.partial(plots.trade_off, drawn, title, theirs)
+        caption = f"Return against cost of {title.replace(' %', '%')}, a point a setting{hollow}"
         found.append(Picture(images / f"{name}-trade_off.png", caption, draw))
     for i, first in enumerate(range(0, len(settings), CHUNK), 1):
         chunk = settings[first : first + CHUNK]
@@ -357,6 +362,33 @@ def save_small(figure: Figure, path: Path) -> None:
     small = picture.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
     with files.replacing(path) as part:
         small.save(part, optimize=True)
+
+
+def evaluated(runs: Sequence[SettingRun]) -> list[SettingRun]:
+    """The runs with what their final policies made in fresh episodes in place of what training made;
+    without those whose evaluation was not kept."""
+    names = ("return", "cost")
+    known = [run for run in runs if np.isfinite(run.values.get("final cost", np.nan)).all()]
+    return [
+        run._replace(values={**run.values, **{name: run.values[f"final {name}"] for name in names}})
+        for run in known
+    ]
+
+
+def final(groups: Sequence[Group]) -> list[Group]:
+    """`groups` of evaluated policies, without those of which none is known."""
+    return [g._replace(runs=runs) for g in groups if (runs := evaluated(g.runs))]
+
+
+def matrices(groups: Sequence[Group], known: Mapping[tuple[str, str], Published]) -> str:
+    """What training made of each setting on each task; and what its policies made, beside what is
+    published of evaluated policies."""
+    if not any(beside(g, known) for g in groups):
+        return matrix(groups, {})
+    return (
+        f"The last tenth of training:\n\n{matrix(groups, {})}\n\n"
+        f"Evaluated policies; *in italics* published ones:\n\n{matrix(final(groups), known)}"
+    )
 
 
 def matrix(groups: Sequence[Group], known: Mapping[tuple[str, str], Published]) -> str:
