@@ -171,16 +171,20 @@ def drawn_batch() -> Transitions:
 
 
 @pytest.mark.parametrize(
-    "method, lam, reduce, price_unit, omnisafe",
-    [("sac", None, "", "", False), ("sac", 0.7, "mean", "deviation", False),
-     ("td3", None, "", "", False), ("td3", 1.5, "max", "deviation", False),
-     ("ddpg", None, "", "", False), ("ddpg", 0.3, "one", "reward", False),
-     ("sac", 0.7, "one", "reward", True), ("ddpg", 0.3, "one", "reward", True)],
+    "row, lam, reduce, price_unit, omnisafe",
+    [("sac", None, "", "", False), ("sac_lag", 0.7, "mean", "deviation", False),
+     ("td3", None, "", "", False), ("td3_lag", 1.5, "max", "deviation", False),
+     ("ddpg", None, "", "", False), ("ddpg_lag", 0.3, "one", "reward", False),
+     ("sac_pid", 0.4, "max", "reward", False), ("td3_pid", 0.9, "one", "deviation", False),
+     ("ddpg_pid", 1.2, "mean", "deviation", False), ("sac_lag", 0.7, "one", "reward", True),
+     ("td3_lag", 1.5, "one", "reward", True), ("ddpg_lag", 0.3, "one", "reward", True)],
 )  # fmt: skip
 def test_two_gradient_steps_are_those_of_the_paper_or_of_omnisafe(
-    method, lam, reduce, price_unit, omnisafe
+    row, lam, reduce, price_unit, omnisafe
 ):
-    row = method if lam is None else f"{method}_lag"
+    entry, method = ALGOS[row], row.split("_")[0]
+    make: Any = entry.make
+    treatment = no_treatment if lam is None else make.keywords["treatment"]
     settings: dict[str, Any] = {"hidden": (), "layer_norm": False, "lr": 0.01, "critic_lr": 0.02,
                                 "tau": 0.1, "discount": 0.9, "cost_discount": 0.8,
                                 "policy_delay": 1}  # fmt: skip
@@ -188,16 +192,17 @@ def test_two_gradient_steps_are_those_of_the_paper_or_of_omnisafe(
         settings |= {"alpha_init": 0.3, "alpha_lr": 0.03, "target_entropy": -1.0, "lr_decay": False}
     settings |= {"cost_reduce": reduce, "price_unit": price_unit} if reduce else {}
     if omnisafe:
-        conventions = compat.overrides("omnisafe", ALGOS[row].config)
+        conventions = compat.overrides("omnisafe", entry.config)
         assert conventions.items() >= {"cost_reduce": reduce, "price_unit": price_unit}.items()
         settings |= conventions | {"cost_normalize": True}
-    cfg = jax.tree.map(jnp.float32, ALGOS[row].config(**settings))
-    learner = actor_critic(Lever(), ACTORS[method](2), no_treatment if lam is None else lagrangian)
-    nets = jax.jit(lambda key: learner.init(key, 3, 2, cfg))(jax.random.key(0))
+    cfg = jax.tree.map(jnp.float32, entry.config(**settings))
+    learner = actor_critic(Lever(), ACTORS[method](2), treatment)
+    init = jax.jit(lambda key: learner.init(key, 3, 2, cfg), compiler_options=FAST)
+    nets = init(jax.random.key(0))
     batch = drawn_batch()
     narrow = jax.tree.map(lambda x: jnp.asarray(x, NARROW.get(x.dtype.kind, x.dtype)), batch)
     step = jax.jit(lambda nets, at: learner.step(nets, narrow, at, cfg, None), compiler_options=FAST)
-    dual = () if lam is None else Multiplier(jnp.float32(lam), ())
+    dual = () if lam is None else treatment.init(cfg)._replace(lam=jnp.float32(lam))
 
     trained = ["actor", "critic_r"] + ["critic_c"] * (lam is not None)
     targets = {"actor": "target_actor", "critic_r": "target_r", "critic_c": "target_c"}

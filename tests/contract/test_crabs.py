@@ -1,7 +1,7 @@
 """CRABS on toys: what it does before its first certificate, and after it."""
 
 import dataclasses
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import jax
@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 from compiling import FAST
 from learners import at
-from toys import START, Corridor, Ticker
+from toys import START, Corridor, Ticker, momentum
 
-from jaxsafe.algos import ALGOS
+from jaxsafe.algos import ALGOS, crabs
 from jaxsafe.config import ConfigError
 from jaxsafe.learn.acting import Player
 from jaxsafe.learn.certificate import interval_barrier
+from jaxsafe.learn.learner import GradientStep
+from jaxsafe.learn.replay import Transitions
 
 ROW = ALGOS["crabs"]
 TINY: dict[str, Any] = {
@@ -134,3 +136,123 @@ def test_it_acts_by_its_policy_until_there_is_a_certificate_and_then_within_it()
     np.testing.assert_allclose(act(bound, within), act(free, within))
     np.testing.assert_allclose(act(bound, beyond), 0.0)
     assert (jnp.abs(act(free, beyond)) > 0).all() and (jnp.abs(act(free, within)) > 0).all()
+
+
+# ---- a gradient step by hand -------------------------------------------------------------------
+
+GAINS = np.array([[0.1], [0.4]])  # of the models, by which the second action moves y
+
+
+def u_by_hand(obs, action):
+    """log 2 + B - 1, because f is 0, of the farther one of the two y."""
+    x = np.abs(obs[:, 1] + GAINS * action[:, 1]).max(0) / 0.5
+    inside = np.minimum(x, 1)
+    log = np.log((1.01 + inside) * (1.01 - inside) / 1.01**2) / np.log(0.01 * 2.01 / 1.01**2)
+    return np.log(2) - 1 + np.where(x < 1, log, 1 + 2 * (x - 1) / (0.01 * 2.01))
+
+
+def linear(params, x):
+    layer = jax.tree.map(np.float64, params["params"]["Dense_0"])
+    return x @ layer["kernel"] + layer["bias"][..., None, :]
+
+
+def value(critics, obs, action):
+    """The critics' values, float [2, B]."""
+    return linear(critics, np.concatenate([obs, action], -1))[..., 0]
+
+
+def drawn(params, obs, key):
+    """Actions of the policy, and their log probabilities."""
+    noise = np.float64(jax.random.normal(key, (len(obs), 2)))
+    mean, log_std = np.split(linear(params, obs), 2, -1)
+    action = np.tanh(mean + np.exp(log_std) * noise)
+    log_prob = -0.5 * noise**2 - log_std - 0.5 * np.log(2 * np.pi) - np.log(1 - action**2)
+    return action, log_prob.sum(-1)
+
+
+def transitions() -> Transitions:
+    """Eight steps: the next y is near the middle, or near or beyond an end. One of these terminated,
+    and one does not count."""
+    rng = np.random.default_rng(0)
+    obs, next_obs = 0.1 * rng.normal(size=(2, 8, 4))
+    obs[:, 1] = [0, 0.1, -0.2, 0.3, -0.35, 0.4, 0.45, 0.6]
+    next_obs[:, 1] = [0.05, -0.1, 0.6, 0.7, 0.35, 0.3, -0.3, 0.2]
+    cost = np.array([0, 0, 1, 1, 0, 0.5, 0, 0])
+    fields: dict[str, Any] = {
+        "obs": obs, "action": np.tanh(rng.normal(size=(8, 2))), "reward": rng.normal(size=8),
+        "cost": cost, "costs": cost[:, None], "next_obs": next_obs, "steps": np.array([1.0, 2] * 4),
+        "terminated": np.arange(8) == 3, "weight": np.array([1 / 7] * 7 + [0]),
+    }  # fmt: skip
+    return Transitions(**fields)
+
+
+@cache
+def gradient_step():
+    """Networks with f = 0 and models by hand, and (certified) -> what a step makes of them."""
+    settings: dict[str, Any] = {
+        "hidden": (), "layer_norm": False, "model_hidden": (), "discount": 0.9, "penalty": 10.0,
+        "alpha_init": 0.3, "adversary_init": 0.1, "max_grad_norm": float("inf"),
+    }  # fmt: skip
+    cfg = jax.tree.map(jnp.float32, ROW.config(**TINY | settings))
+    learner, batch = crabs.crabs(Corridor()), transitions()
+    batch = jax.tree.map(lambda x: jnp.asarray(x, bool if x.dtype == bool else jnp.float32), batch)
+    nets = jax.jit(lambda key: learner.init(key, 4, 2, cfg), compiler_options=FAST)(jax.random.key(3))
+    params = nets.params
+    model = jax.tree.map(jnp.zeros_like, params["model"])
+    layer = model.ensemble.layers[0]
+    layer = layer.replace(weight=layer.weight.at[:, 5, 1].set(GAINS[:, 0]))
+    scale = model.scale.replace(std=jnp.ones(6))
+    params = params | {
+        "barrier": jax.tree.map(jnp.zeros_like, params["barrier"]),
+        "model": model.replace(ensemble=model.ensemble.replace(layers=(layer,)), scale=scale),
+        "targets": jax.tree.map(lambda x: 2 * x + 0.1, params["targets"]),
+    }
+    at = GradientStep(jnp.int32(0), jnp.float32(1), jax.random.key(7))
+
+    @partial(jax.jit, compiler_options=FAST)
+    def step(certified):
+        now = nets._replace(params=params | {"certified": certified})
+        return learner.step(now, batch, at, cfg, None)
+
+    return params, step
+
+
+@pytest.mark.parametrize("certified", [True, False])
+def test_a_gradient_step_counts_what_the_certificate_allows_and_charges_for_the_rest(certified):
+    """The policy's value is -1000 - u where u > 0. Without a certificate the step is SAC's."""
+    b, (params, step) = transitions(), gradient_step()
+    after, metrics = step(jnp.float32(certified))
+    critic_key, policy_key = jax.random.split(jax.random.key(7))
+
+    # critics
+    action, log_prob = drawn(params["actor"], b.next_obs, critic_key)
+    worth = value(params["targets"]["critic_r"], b.next_obs, action).min(0) - 0.3 * log_prob
+    y = b.reward - 10 * b.cost + 0.9**b.steps * ~b.terminated * worth
+    allowed = u_by_hand(b.next_obs, action) <= 0
+    assert not allowed[2:4].any() and 2 < allowed[:7].sum() < 6
+    counted = b.weight * (allowed | b.terminated | (not certified))
+    error = value(params["critic_r"], b.obs, b.action) - y
+    np.testing.assert_allclose(metrics["train/critic_loss"], (counted * error**2).sum(), rtol=1e-5)
+    slope = momentum(after, "critic_r")["params"]["Dense_0"]["bias"][:, 0]
+    np.testing.assert_allclose(slope, 0.1 * (2 * counted * error).sum(1), rtol=1e-4, atol=1e-6)
+
+    # the policy, which climbs the new critics
+    def loss(actor):
+        action, log_prob = drawn(actor, b.obs, policy_key)
+        u = u_by_hand(b.obs, action)
+        q = value(after.params["critic_r"], b.obs, action).min(0)
+        refused = (u > 0) & certified
+        return -(b.weight * (np.where(refused, -1000 - u, q) - 0.3 * log_prob)).sum(), refused
+
+    found, refused = loss(params["actor"])
+    assert (0 < refused[:7].sum() < 7) == certified
+    np.testing.assert_allclose(metrics["train/actor_loss"], found, rtol=1e-5)
+    np.testing.assert_allclose(metrics["train/refused"], (b.weight * refused).sum(), rtol=1e-5)
+    layer = jax.tree.map(np.float64, params["actor"]["params"]["Dense_0"])
+
+    def moved(by):
+        return loss({"params": {"Dense_0": layer | {"bias": layer["bias"] + by}}})[0]
+
+    slope = [(moved(by) - moved(-by)) / 2e-6 for by in 1e-6 * np.eye(4)]
+    bias = momentum(after, "actor")["params"]["Dense_0"]["bias"]
+    np.testing.assert_allclose(bias, 0.1 * np.array(slope), rtol=1e-4, atol=1e-6)

@@ -1,5 +1,7 @@
 """The offline learners against NumPy: gradients of linear networks, values, limits, an LP."""
 
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
@@ -17,7 +19,7 @@ from jaxsafe.learn.learner import GradientStep
 from jaxsafe.learn.offline import batch_at, constrained, data_set, first_obs_at, value_ranges
 from jaxsafe.learn.treatments import Multiplier, lagrangian
 from jaxsafe.run import evaluate
-from jaxsafe.types import Shared
+from jaxsafe.types import Shared, State
 
 LINEAR: dict[str, Any] = {"hidden": (), "obs_normalize": False, "max_grad_norm": 1e9, "discount": 0.9}
 LAM = 0.7
@@ -303,21 +305,44 @@ def test_gradients_of_coptidice():
     assert_gradient(after, "actor", imitate, nets.params["actor"])
 
 
-def test_a_loss_of_coptidice_over_a_batch_is_the_mean_over_its_transitions():
-    cfg = coptidice.COptiDICEConfig(**LINEAR, alpha=0.5, batch_size=7)
-    learner = coptidice.learner(Corridor())
+STILL: dict[str, Any] = {"critic_lr": 0.0}
+LINEAR_VAE: dict[str, Any] = {"vae_hidden": ()}
+# COptiDICE's W is a softmax over the batch. With a tau as large as this it is 1.
+EACH_LEARNER: dict[str, Any] = {
+    "bc": (bc.learner, bc.BCConfig, {}),
+    "vae_bc": (bc.autoencoder, bc.VAEBCConfig, LINEAR_VAE),
+    "bcq": (bcq.learner, bcq.BCQConfig, STILL | LINEAR_VAE),
+    "bcq_lag": (partial(bcq.learner, treatment=lagrangian), bcq.BCQLagConfig, STILL | LINEAR_VAE),
+    "crr": (crr.learner, crr.CRRConfig, STILL),
+    "ccrr": (partial(crr.learner, treatment=crr.unscaled), crr.CCRRConfig, STILL),
+    "coptidice": (
+        coptidice.learner, coptidice.COptiDICEConfig,
+        STILL | {"alpha": 0.5, "tau_init": 1e6, "tau_lr": 0.0},
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", EACH_LEARNER)
+def test_the_gradients_of_a_batch_are_the_means_over_its_transitions(name, monkeypatch):
+    """So are the metrics. A transition has the same noise alone as in the batch, and no network moves
+    within a step. Adam's first moment is a tenth of the gradient."""
+    make, config, options = EACH_LEARNER[name]
+    cfg, learner = config(**LINEAR, **options, lr=0.0, batch_size=7), make(Corridor())
     nets, batch, at, _ = prepared(learner, cfg, n=7)
+    normal = jax.random.normal
 
-    step = jax.jit(learner.step, static_argnums=4, compiler_options=FAST)
+    def found(rows):
+        monkeypatch.setattr(jax.random, "normal", lambda key, shape: normal(key, (7, *shape[1:]))[rows])
+        own = jax.tree.map(lambda x: x[rows], batch)._replace(weight=jnp.full(len(rows), 1 / len(rows)))
+        after, metrics = learner.step(nets, own, at._replace(first_obs=at.first_obs[rows]), cfg, None)
+        return {name: momentum(after, name) for name in after.opt_state}, metrics
 
-    def losses(rows):
-        own = jax.tree.map(lambda x: x[rows], batch)
-        moment = at._replace(first_obs=at.first_obs[rows])
-        metrics = step(nets, own, moment, cfg, None)[1]
-        return np.array([metrics["train/nu_loss"], metrics["train/actor_loss"]])
-
-    alone = np.mean([losses(np.array([i])) for i in range(7)], 0)
-    np.testing.assert_allclose(losses(np.arange(7)), alone, rtol=1e-5)
+    together = jnp.arange(7)
+    both = jax.jit(lambda: (found(together), jax.vmap(found)(together[:, None])), compiler_options=FAST)
+    whole, alone = both()
+    assert all(np.abs(x).max() > 1e-5 for x in jax.tree.leaves(whole[0]))
+    for x, y in zip(*map(jax.tree.leaves, (whole, alone)), strict=True):
+        np.testing.assert_allclose(x, y.mean(0), rtol=1e-4, atol=1e-6)
 
 
 # ---- values and limits --------------------------------------------------------------------------
@@ -462,34 +487,116 @@ def lever_data(name, n=20_000):
     )  # fmt: skip
 
 
-def trained_on_lever(name, iterations=10, **options):
-    """Return and cost of a whole episode, of 2 seeds: by sampled actions of BCQ, whose price is for
+def trained(name, env, data, limit, episodes=200, iterations=10, **options):
+    """Sums over whole episodes, means of each of 2 seeds: by sampled actions of BCQ, whose price is for
     them, by the mean action of the others."""
     row = ALGOS[name]
-    sizes = {"updates": 1000, "obs_normalize": False, "cost_limit": LIMIT, "lr_decay": True}
+    sizes = {"updates": 1000, "obs_normalize": False, "cost_limit": limit, "lr_decay": True}
     sizes |= {"total_iterations": float(iterations), "critic_lr": 1e-3}
     settings: dict[str, Any] = {**sizes, **row.lever, **options}
-    cfg, algo, data = row.config(**settings), row.make(Lever()), lever_data(name)
+    cfg, algo = row.config(**settings), row.make(env)
     update = jax.jit(jax.vmap(algo.update, (0, None)))
     shared = Shared(np.int32(0), data=data)
     keys = jax.random.split(jax.random.key(0), 2)
     ts = jax.jit(jax.vmap(lambda key: algo.init(key, cfg, shared)))(keys)
-    metrics = {}
     for i in range(iterations):
-        ts, metrics = update(ts, shared._replace(iteration=np.int32(i)))
-    whole = evaluate.run_episodes(algo, jax.vmap(algo.learned)(ts), 200, 0, name.startswith("bcq"))
-    return whole.ret.mean(1), whole.cost.mean(1), metrics
+        ts, _ = update(ts, shared._replace(iteration=np.int32(i)))
+    learned, sampled = jax.vmap(algo.learned)(ts), name.startswith("bcq")
+    whole = evaluate.run_episodes(algo, learned, episodes, 0, sampled)
+    return jax.tree.map(lambda x: x.mean(1), whole)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["bcq", "crr"])
 def test_without_a_constraint_the_best_of_the_data_is_found(name):
-    ret, cost, _ = trained_on_lever(name)
-    assert (ret > 18.5).all() and (cost > 8).all()  # 20 and 10 at best, 11.7 in the data
+    whole = trained(name, Lever(), lever_data(name), LIMIT)
+    assert (whole.ret > 18.5).all() and (whole.cost > 8).all()  # 20 and 10 at best, 11.7 in the data
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["bcq_lag", "ccrr", "coptidice"])
 def test_with_a_constraint_the_best_within_the_limit_is_found(name):
-    ret, cost, _ = trained_on_lever(name)
-    assert (cost < 1.15 * LIMIT).all() and (ret > 0.9 * BEST).all()
+    whole = trained(name, Lever(), lever_data(name), LIMIT)
+    assert (whole.cost < 1.15 * LIMIT).all() and (whole.ret > 0.9 * BEST).all()
+
+
+EDGE = 0.6  # of Slope: the data have no action beyond it
+START = 3 / 8 * EDGE  # the share of second states at first, and in the data
+
+
+@dataclass(frozen=True)
+class Slope:
+    """Two states. The further an action goes, the likelier the second, which earns and costs.
+
+    Observation [2]: the state s, 0 or 1, one-hot. It is 1 at first with probability START, and next
+    with probability u = (1 + a) / 2 in [0, 1], the action clipped.
+
+        reward = s,   cost = s u^2,   beyond = 1 where u > EDGE + 0.1
+    """
+
+    obs_size: int = 2
+    action_size: int = 1
+    episode_length: int = 10
+    cost_names: tuple[str, ...] = ("cost", "beyond")
+
+    def reset(self, key: jax.Array) -> State:
+        return self._state(key, START, jnp.zeros(()), jnp.zeros(2))
+
+    def step(self, state: State, action: jax.Array) -> State:
+        u, s = 0.5 * (1 + jnp.clip(action[0], -1.0, 1.0)), state.obs[1]
+        return self._state(state.physics, u, s, jnp.stack([s * u**2, u > EDGE + 0.1]))
+
+    def _state(self, key: jax.Array, chance: Any, reward: jax.Array, costs: jax.Array) -> State:
+        key, state_key = jax.random.split(key)
+        obs = jax.nn.one_hot(jax.random.bernoulli(state_key, chance).astype(jnp.int32), 2)
+        return State(key, obs, reward, costs[0], costs, jnp.bool_(False), {})
+
+
+def slope_data(episodes=2000):
+    """Bold episodes, that go anywhere up to EDGE, and as many timid ones, that go half as far."""
+    rng = np.random.default_rng(0)
+    u = rng.choice([EDGE / 2, EDGE], (episodes, 1)) * rng.random((episodes, 10))
+    states = rng.random((episodes, 11)) < np.append(np.full((episodes, 1), START), u, 1)
+    s, after = (x.ravel().astype(int) for x in (states[:, :-1], states[:, 1:]))
+    u, late = u.ravel(), np.arange(u.size) % 10 == 9
+    action = 2 * u[:, None] - 1
+    return data_set(np.eye(2)[s], action, s, s * u**2, np.eye(2)[after], late & False, late)
+
+
+def best_on_slope(u, limit):
+    """Return and cost of 10 steps of the best policy whose actions are among u [n], from the linear
+    program over the discounted visits of states and actions."""
+    s, u = np.repeat([0, 1], len(u)), np.tile(u, 2)
+    cost, flow = s * u**2, np.stack([s - 0.9 * u, np.ones_like(u)])
+    visits = linprog(
+        -s, A_ub=cost[None], b_ub=[limit / 10], A_eq=flow, b_eq=[0.1 * START, 1], bounds=(0, None)
+    ).x
+    return 10 * s @ visits, 10 * cost @ visits
+
+
+# close to the data: the autoencoder decodes few latents beyond those that it has seen
+NEAR: dict[str, Any] = {"perturbation": 0.02, "kl_weight": 0.005, "latent_clip": 2.0, "batch_size": 128}
+FEW: dict[str, Any] = {"candidates": 10, "act_candidates": 10, "dual_lr": 1e-3}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name, limit, options",
+    [
+        ("bcq", 10.0, NEAR),
+        ("crr", 10.0, {"temperature": 0.01}),
+        ("bcq_lag", 1.0, NEAR | FEW),
+        ("ccrr", 1.0, {"temperature": 0.02}),
+    ],
+)
+def test_the_linear_programs_best_of_the_actions_in_the_data_is_found(name, limit, options):
+    """The program is over the hundredths of u that the data have, 0 to 0.6. With all actions it would
+    earn 20% more or better. A limit of 10 does not bind, as no episode can cost more."""
+    data = slope_data()
+    u = (np.unique(np.floor(50 * (data.action + 1))) + 0.5) / 100
+    ret, cost = best_on_slope(u, limit)
+    assert best_on_slope(np.linspace(0, 1, 101), limit)[0] > 1.2 * ret
+    whole = trained(name, Slope(), data, limit, episodes=1000, **options)
+    np.testing.assert_allclose(whole.ret, ret, rtol=0.15)
+    np.testing.assert_allclose(whole.cost, cost, rtol=0.25)
+    assert (whole.costs[..., 1] < 0.01).all()

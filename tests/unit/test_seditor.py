@@ -5,6 +5,7 @@ import functools
 import math
 from typing import Any
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -192,18 +193,23 @@ def test_the_proposer_feels_its_own_action_and_what_the_editor_makes_of_it():
     assert opposed[0] < heedless[0] - 0.01
 
 
-def test_the_editor_brings_unsafe_proposals_to_the_bound_as_the_price_grows(monkeypatch):
-    """Q_r = -(a - 1/2)^2, and Q_c = a+ costs from 0 on. The proposals stay where reward is."""
+@pytest.fixture
+def hill(monkeypatch):
+    """Q_r = -(a - s)^2, and Q_c = a+ costs from 0 on."""
 
     def worth(params, obs, action, cfg):
-        return -((action[..., 0] - 0.5) ** 2)
+        return -((action[..., 0] - obs[..., 0]) ** 2)
 
     def both(params, obs, action, names, cfg):
         return Values(worth(params, obs, action, cfg)[None], jax.nn.relu(action[..., 0]))
 
     monkeypatch.setattr(seditor, "reward_value", worth)
     monkeypatch.setattr(seditor, "with_reduced_cost", both)
-    params, obs, rule = nets(), jnp.zeros((64, 1)), optax.adam(0.1)  # without entropy
+
+
+def test_the_editor_brings_unsafe_proposals_to_the_bound_as_the_price_grows(hill):
+    """The proposals stay where reward is."""
+    params, obs, rule = nets(), jnp.full((64, 1), 0.5), optax.adam(0.1)  # without entropy
 
     def train(lam):
         def loss(own, key):
@@ -221,7 +227,7 @@ def test_the_editor_brings_unsafe_proposals_to_the_bound_as_the_price_grows(monk
         own: Any = {name: params[name] for name in ("proposer", "editor")}
         keys = jax.random.split(jax.random.key(0), 250)
         (own, _), _ = jax.lax.scan(step, (own, rule.init(own)), keys)
-        many = jnp.zeros((1000, 1))
+        many = jnp.full((1000, 1), 0.5)
         return seditor.edited(own["proposer"], own["editor"], many, jax.random.key(9), CFG)
 
     drawn = jax.jit(jax.vmap(train), compiler_options=FAST)(jnp.array([0.0, 1.0, 5.0]))
@@ -229,6 +235,39 @@ def test_the_editor_brings_unsafe_proposals_to_the_bound_as_the_price_grows(monk
     mean, unsafe = drawn.action.mean((1, 2)), (drawn.action > 0.05).mean((1, 2))
     assert mean[0] > 0.4 and 0 < mean[1] < mean[0] - 0.3 and -0.4 < mean[2] < 0
     assert unsafe[0] > 0.8 and unsafe[2] < 0.3
+
+
+def test_the_editor_leaves_safe_proposals_alone(hill):
+    """Proposals are near s, where reward is: at 1/2 they are unsafe, and at -1/2 safe."""
+    cfg = dataclasses.replace(CFG, hidden=(16,))
+    head = jnp.outer(jnp.ones(16), jnp.array([1.35, -1.35]))  # Beta(31, 11) at 1/2
+    layers = {
+        "Dense_0": {"kernel": jnp.ones((1, 16)), "bias": jnp.zeros(16)},
+        "Dense_1": {"kernel": head, "bias": jnp.full(2, 20.0)},
+    }
+    params = nets(proposer={"params": layers})
+    obs, rule = jnp.repeat(jnp.array([[0.5], [-0.5]]), 64, axis=0), optax.adam(0.1)
+
+    def step(carry, key):
+        editor, state = carry
+
+        def loss(editor):
+            return -seditor.editor_gain(editor, params, Price(5.0), obs, key, cfg)[0].mean()
+
+        change, state = rule.update(jax.grad(loss)(editor), state)
+        return (optax.apply_updates(editor, change), state), None
+
+    def train(editor):
+        keys = jax.random.split(jax.random.key(0), 300)
+        (editor, _), _ = jax.lax.scan(step, (editor, rule.init(editor)), keys)
+        many = jnp.repeat(obs[::64], 1000, axis=0)
+        return seditor.edited(params["proposer"], editor, many, jax.random.key(9), cfg)
+
+    editor = beta.init_beta(jax.random.key(1), 2, 1, cfg)
+    drawn = jax.jit(train, compiler_options=FAST)(editor)
+    edit = (drawn.action - drawn.proposal).reshape(2, 1000)
+    assert edit[0].mean() < -0.4
+    assert abs(edit[1].mean()) < 0.1 and abs(edit[1]).mean() < 0.25
 
 
 # ---- returns and scales ------------------------------------------------------------------------
@@ -316,6 +355,26 @@ def test_the_multiplier_begins_at_one_and_takes_adams_steps_of_l():
     for _ in range(5):
         dual = seditor.soft_lagrangian.update(dual, jnp.float32(9.0), capped, 0)
     np.testing.assert_allclose(dual.lam, 1.005, rtol=1e-5)
+
+
+def test_the_scale_of_replayed_costs_does_not_move_the_price():
+    """It is told what the steps of the rollout have cost, as they are."""
+    algo = ALGOS["seditor"].make(Lever())
+    cfg = ALGOS["seditor"].config(
+        num_envs=4, horizon=4, learn_every=4, learning_starts=0, batch_size=8, replay_ratio=0.5,
+        replay_size=64, n_step=3, hidden=(), dual_every=16, cost_limit=2.0, stagger=False,
+    )  # fmt: skip
+
+    @functools.partial(jax.jit, compiler_options=FAST)
+    def price(scale):
+        ts = algo.init(jax.random.key(0), cfg, START)
+        moments = jax.tree.map(lambda x: jnp.full_like(x, scale), ts.opt_state["moments"])
+        ts = dataclasses.replace(ts, opt_state=ts.opt_state | {"moments": moments})
+        return ts.dual, algo.update(ts, START)[0].dual
+
+    (before, one), (_, two) = price(1.0), price(100.0)
+    assert one.raw != before.raw
+    chex.assert_trees_all_equal(one, two)
 
 
 # ---- the gradient step -------------------------------------------------------------------------
