@@ -591,8 +591,7 @@ ROWS = {
         AMBSConfig,
         make,
         "Dreamer with a shield that dreams ahead, and a safe policy",
-        PENALTIES
-        | {"pixels": PIXELS, "cpu": CPU, "true_dynamics": {"shield": "true_dynamics"}},
+        PENALTIES | {"pixels": PIXELS, "cpu": CPU, "true_dynamics": {"shield": "true_dynamics"}},
         total_steps=1_000_000,
         holds="nothing",
         check=check,
