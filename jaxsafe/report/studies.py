@@ -336,15 +336,14 @@ def pictures_of(
     found = []
     if 1 < len(settings) <= MOST:
         theirs = {(g.env, g.name): beside(g, known) for g in groups}
-        hollow, title, drawn = "", "last 10 % of training", groups
+        draw = functools.partial(plots.trade_off, groups, "last 10 % of training", theirs)
+        caption = "Return against cost of last 10% of training, a point a setting"
         if any(theirs.values()):  # these are of evaluated policies, and so are ours then
-            hollow, title, drawn = (
-                "; hollow diamonds are published means",
-                "evaluated policies",
-                final(groups),
+            draw = functools.partial(plots.trade_off, final(groups), "evaluated policies", theirs)
+            caption = (
+                "Return against cost of evaluated policies, a point a setting; hollow diamonds are "
+                "published means"
             )
-        draw = functools.partial(plots.trade_off, drawn, title, theirs)
-        caption = f"Return against cost of {title.replace(' %', '%')}, a point a setting{hollow}"
         found.append(Picture(images / f"{name}-trade_off.png", caption, draw))
     for i, first in enumerate(range(0, len(settings), CHUNK), 1):
         chunk = settings[first : first + CHUNK]

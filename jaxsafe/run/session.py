@@ -247,9 +247,11 @@ def write_head(session: Session) -> None:
 
 def about_cpu(settings: Settings) -> str:
     """On a CPU: that there are settings for it, if these are the defaults; else ''."""
-    meant, defaults = settings.row.published.get("cpu", {}), settings.row.config()
-    others = any(getattr(settings.algo, name) != getattr(defaults, name) for name in meant)
-    if jax.default_backend() != "cpu" or not meant or others:
+    meant = settings.row.published.get("cpu")
+    if jax.default_backend() != "cpu" or not meant:
+        return ""
+    defaults = settings.row.config()
+    if any(getattr(settings.algo, name) != getattr(defaults, name) for name in meant):
         return ""
     return "the defaults are for a GPU; preset=cpu is for two cores and half an hour"
 

@@ -17,6 +17,7 @@ import pytest
 from jaxsafe.commands import study as command
 from jaxsafe.config import ConfigError
 from jaxsafe.report import plots, studies, study_files
+from jaxsafe.report.published import Published
 from jaxsafe.report.read import read, read_one
 from jaxsafe.run import run_folder
 from jaxsafe.run.arguments import compose
@@ -114,6 +115,18 @@ def test_a_run_without_a_finished_episode_is_a_dash(toy, tmp_path):
     studies.add(toy, toy.runs[0], run, studies.origin_of(tmp_path / "run"))
     found = studies.matrix(studies.in_order(toy, read([toy.folder])), {})
     assert found.splitlines()[-1] == "| `cpo` | - |"
+
+
+def test_evaluated_policies_stand_beside_published_ones_and_training_apart(toy, tmp_path):
+    trained(tmp_path / "run", toy.command(toy.runs[0]))
+    (run,) = read_one(tmp_path / "run")
+    studies.add(toy, toy.runs[0], run, studies.origin_of(tmp_path / "run"))
+    known = {("point_goal1", "cpo"): Published((9.0, 1.0), (3.0, 1.0), 25.0, "theirs", "")}
+    groups = studies.in_order(toy, read([toy.folder]))
+    first, second = studies.matrices(groups, known).split("\n\nEvaluated policies")
+    assert studies.matrix(groups, {}) in first and "*" not in first
+    assert second.endswith("| `cpo` | 6.0, 1.5<br>*9.0, 3.0* |")
+    assert studies.matrices(groups, {}) == studies.matrix(groups, {})
 
 
 def test_a_window_has_means_and_the_swing_of_the_cost_by_hand(toy, tmp_path):
