@@ -487,9 +487,9 @@ def lever_data(name, n=20_000):
     )  # fmt: skip
 
 
-def trained(name, env, data, limit, episodes=200, iterations=10, **options):
-    """Sums over whole episodes, means of each of 2 seeds: by sampled actions of BCQ, whose price is for
-    them, by the mean action of the others."""
+def trained(name, env, data, limit, iterations=10, **options):
+    """Sums over whole episodes, means over 1000 of each of 2 seeds: by sampled actions of BCQ, whose
+    price is for them, by the mean action of the others."""
     row = ALGOS[name]
     sizes = {"updates": 1000, "obs_normalize": False, "cost_limit": limit, "lr_decay": True}
     sizes |= {"total_iterations": float(iterations), "critic_lr": 1e-3}
@@ -502,7 +502,7 @@ def trained(name, env, data, limit, episodes=200, iterations=10, **options):
     for i in range(iterations):
         ts, _ = update(ts, shared._replace(iteration=np.int32(i)))
     learned, sampled = jax.vmap(algo.learned)(ts), name.startswith("bcq")
-    whole = evaluate.run_episodes(algo, learned, episodes, 0, sampled)
+    whole = evaluate.run_episodes(algo, learned, 1000, 0, sampled)
     return jax.tree.map(lambda x: x.mean(1), whole)
 
 
@@ -596,7 +596,7 @@ def test_the_linear_programs_best_of_the_actions_in_the_data_is_found(name, limi
     u = (np.unique(np.floor(50 * (data.action + 1))) + 0.5) / 100
     ret, cost = best_on_slope(u, limit)
     assert best_on_slope(np.linspace(0, 1, 101), limit)[0] > 1.2 * ret
-    whole = trained(name, Slope(), data, limit, episodes=1000, **options)
+    whole = trained(name, Slope(), data, limit, **options)
     np.testing.assert_allclose(whole.ret, ret, rtol=0.15)
     np.testing.assert_allclose(whole.cost, cost, rtol=0.25)
     assert (whole.costs[..., 1] < 0.01).all()
