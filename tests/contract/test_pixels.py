@@ -150,7 +150,8 @@ DREAMERS = ("dreamer", "dreamer_lag")
 
 @pytest.mark.parametrize("name", ["ambs", *(pytest.param(n, marks=pytest.mark.slow) for n in DREAMERS)])
 def test_a_dreamers_update_keeps_the_structure_and_the_replay_keeps_bytes(name):
-    algo, cfg = ALGOS[name].make(Patch()), ALGOS[name].config(**dreamer.LEVER, encoder="cnn")
+    settings = dreamer.LEVER | {"overshoot": 3, "encoder": "cnn"}
+    algo, cfg = ALGOS[name].make(Patch()), ALGOS[name].config(**settings)
     before = jax.eval_shape(lambda: algo.init(jax.random.key(0), cfg, START))
     after, _ = jax.eval_shape(algo.update, before, START)
     chex.assert_trees_all_equal_shapes_and_dtypes(before, after)
