@@ -273,7 +273,7 @@ def train(
     Raises:
         ConfigError: where the script would print a line and end: an unknown name (with the nearest
             valid one), a value of the wrong type or out of bounds, a run that does not fit the memory.
-        jaxsafe.run.checkpoint.CheckpointError, OSError: the disk failed; the last checkpoint stays.
+        jaxsafe.run.checkpoint.NotSaved, OSError: the disk failed; the last checkpoint stays.
         jaxsafe.run.divergence.Diverged: the run learns no more; likewise.
         KeyboardInterrupt: stopped, see above.
     """
@@ -321,7 +321,7 @@ def sweep(env: Any = None, algo: Any = None, **options: Any) -> SweepResult:
 
     Raises:
         ConfigError: as of `train`, or nothing to sweep.
-        jaxsafe.run.checkpoint.CheckpointError, OSError: the disk failed; what was saved stays.
+        jaxsafe.run.checkpoint.NotSaved, OSError: the disk failed; what was saved stays.
         jaxsafe.run.divergence.Diverged: a run did, after the others were trained.
         KeyboardInterrupt: stopped, with a checkpoint.
     """

@@ -25,7 +25,7 @@ def guarded(command: Callable[[], int]) -> int:
         return status
     except (ConfigError, *arguments.ERRORS) as error:
         return complain(one_line(error), 2)
-    except (checkpoint.CheckpointError, NoVideo) as error:
+    except (checkpoint.NotSaved, NoVideo) as error:
         return complain(one_line(error), 1)
     except Diverged as error:
         return complain(one_line(error), DIVERGED)

@@ -37,8 +37,12 @@ NAME = re.compile(r"[\w.'\[\]<>-]+")  # of a leaf
 OVERHEAD = 64 * files.MB  # bytes by which the files may exceed their arrays
 
 
-class CheckpointError(RuntimeError):
-    """A checkpoint that cannot be written or read. The message is one line for the user."""
+class CheckpointError(ConfigError):
+    """A checkpoint that cannot be used. The message is one line for the user."""
+
+
+class NotSaved(RuntimeError):
+    """What could not be written, as on a full disk. The message is one line for the user."""
 
 
 class Progress(NamedTuple):
@@ -123,7 +127,7 @@ def save(folder: Path, ts: PyTree, at: Progress, since: int = 0, replay: bool = 
         since: the iteration from which on its replay holds everything.
         replay: whether to keep the replay.
     Raises:
-        CheckpointError: it could not be written (a full disk); earlier checkpoints stay.
+        NotSaved: it could not be written (a full disk); earlier checkpoints stay.
     """
     target, part = folder / f"{at.iteration:08d}", folder / f"{at.iteration:08d}.part"
     try:
@@ -154,7 +158,7 @@ def save(folder: Path, ts: PyTree, at: Progress, since: int = 0, replay: bool = 
         shutil.rmtree(part, ignore_errors=True)
         last = checkpoints(folder)
         kept = f"the last good one is {last[0]}" if last else "there is no earlier one"
-        raise CheckpointError(f"cannot write checkpoint {target}: {reason(error)}; {kept}") from error
+        raise NotSaved(f"cannot write checkpoint {target}: {reason(error)}; {kept}") from error
     for old in checkpoints(folder)[KEEP:]:
         shutil.rmtree(old, ignore_errors=True)
     return target

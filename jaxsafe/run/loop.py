@@ -72,7 +72,7 @@ def train(
     Returns:
         The train state, with its leading axis, and how far it is.
     Raises:
-        checkpoint.CheckpointError, OSError: the disk failed; the last good checkpoint stays.
+        checkpoint.NotSaved, OSError: the disk failed; the last good checkpoint stays.
         divergence.Diverged: no member learns any more; likewise.
         memory.TooLarge: an update cannot fit the memory.
     """

@@ -233,7 +233,7 @@ def write_head(session: Session) -> None:
     """What a run folder has before the first iteration.
 
     Raises:
-        checkpoint.CheckpointError: the disk failed.
+        checkpoint.NotSaved: the disk failed.
     """
     folder, train = session.folder, session.settings.train
     try:
@@ -242,7 +242,7 @@ def write_head(session: Session) -> None:
         data = None if train.dataset is None else dataset.sha256(train.dataset)
         run_folder.append_versions(folder, device_name(), engine_of(session.env), data)
     except OSError as error:
-        raise checkpoint.CheckpointError(f"cannot write to {folder}: {error.strerror}") from error
+        raise checkpoint.NotSaved(f"cannot write to {folder}: {error.strerror}") from error
 
 
 def about_cpu(settings: Settings) -> str:

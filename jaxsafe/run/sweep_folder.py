@@ -62,4 +62,4 @@ def write_folder(sweep: Sweep, parallel: dict[str, int]) -> None:
         sweep.folder.mkdir(parents=True, exist_ok=True)
         files.write(sweep.folder / "sweep.yaml", yaml.safe_dump(saved._asdict(), sort_keys=False))
     except OSError as error:
-        raise checkpoint.CheckpointError(f"cannot write to {sweep.folder}: {error.strerror}") from error
+        raise checkpoint.NotSaved(f"cannot write to {sweep.folder}: {error.strerror}") from error

@@ -63,6 +63,18 @@ def test_resumed_without_its_replay_it_fills_it_anew_before_it_learns_on(tmp_pat
     assert checkpoint.load(run / "checkpoints")[1].since == 12
 
 
+def test_a_kept_replay_that_is_missing_is_one_line(tmp_path, capsys):
+    run = tmp_path / "run"
+    args = (*SAC, f"run_dir={run}", "eval_episodes=0", "checkpoint_iterations=1")
+    assert typed("train", *args, f"total_steps={3 * STEPS}") == 0
+    for kept in checkpoint.checkpoints(run / "checkpoints"):
+        max((kept / "state").rglob("*"), key=lambda file: file.stat().st_size).unlink()
+    capsys.readouterr()
+    assert typed("train", *args, f"total_steps={4 * STEPS}", "resume=true") == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: ") and "is corrupt (missing or unknown file" in line
+
+
 @pytest.mark.parametrize(
     "options, message",
     [

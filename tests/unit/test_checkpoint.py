@@ -5,7 +5,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from jaxsafe.run import checkpoint
-from jaxsafe.run.checkpoint import CheckpointError, Progress, checkpoints, restore, save
+from jaxsafe.run.checkpoint import CheckpointError, NotSaved, Progress, checkpoints, restore, save
 
 
 def state(scale: float = 1.0):
@@ -110,7 +110,7 @@ def test_a_full_disk_is_one_error_and_the_last_good_checkpoint_stays(tmp_path, m
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(checkpoint.ocp.Checkpointer, "save", full)
-    with pytest.raises(CheckpointError, match=f"No space left on device; the last good one is {good}"):
+    with pytest.raises(NotSaved, match=f"No space left on device; the last good one is {good}"):
         save(tmp_path, state(2.0), at(2))
     assert checkpoints(tmp_path) == [good] and not list(tmp_path.glob("*.part"))
     assert_same(restore(tmp_path, jax.eval_shape(state))[0], state(1.0))
