@@ -6,15 +6,17 @@ docs/data. Each table stands between <!-- measured: NAME --> and <!-- end -->.
 
 import csv
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
 
 from jaxsafe.report import plots, stats, studies
-from jaxsafe.report.group import Group, group, ordered
-from jaxsafe.report.published import beside, read_published
+from jaxsafe.report.comparison_tables import SCORES, aggregates
+from jaxsafe.report.group import Group, group, ordered, suite
+from jaxsafe.report.published import Published, beside, read_published
 from jaxsafe.report.read import SettingRun, read
 from jaxsafe.report.study_files import holds_study
 from jaxsafe.report.tables import between_marks, cell
@@ -30,6 +32,9 @@ SWEEP = "jaxsafe, and dynamics"  # `solver` of the rows that are compared with e
 SHOWN = ("cpo", "cppo_pid", "cup", "focops", "p3o", "pcpo", "ppo_lag", "rcpo", "trpo_lag", "trpo_pid")
 FREE = ("pg", "npg", "trpo", "ppo")  # blind to cost
 EARLY = ("ppo_early_terminated", "trpo_early_terminated")  # evaluated in cut episodes there
+TASKS = [
+    f"{robot}_{task}{n}" for task in ("goal", "button") for n in "12" for robot in ("point", "car")
+]
 
 
 def beyond(value: float, spread: tuple[float, float]) -> float:
@@ -67,6 +72,52 @@ def outside(training: Sequence[Group], final: Sequence[Group]) -> str:
             lines.append(f"| `{g.env}` `{g.name}` | {' | '.join(cells)} |")
     summary = f"{within} of {count} cells lie within the published spreads in both return and cost."
     return "\n".join([summary, "", *lines])
+
+
+class Policy(NamedTuple):
+    """What evaluated policies made."""
+
+    ret: float
+    cost: float
+    algo: str
+    study: str = ""
+
+
+def best() -> str:
+    """On each task our policies that earn most at a cost of at most 25, and OmniSafe's at 27.5, of
+    algorithms that have a limit of 25."""
+    ours: dict[str, list[Policy]] = {env: [] for env in TASKS}
+    theirs: dict[str, list[Policy]] = {env: [] for env in TASKS}
+    for path in STUDIES:
+        for run in studies.evaluated(read([path.parent])):
+            if run.env in ours and run.limits.get("") == 25 and len(run.seeds) >= 5:
+                ret, cost = (run.values[name].mean() for name in ("return", "cost"))
+                made = Policy(ret, cost, run.config["algo.name"], path.parent.name)
+                ours[run.env].append(made)
+    for (env, algo), known in PUBLISHED.items():
+        if env in theirs and known.cost_limit == 25:
+            theirs[env].append(Policy(known.ret[0], known.cost[0], algo))
+
+    def most(policies: Sequence[Policy], cost: float) -> Policy:
+        return max(x for x in policies if x.cost <= cost and x.algo not in (*FREE, *EARLY))
+
+    lines = ["| | OmniSafe, at most 27.5 | ours, at most 25 | study |", "|---|---:|---:|---|"]
+    met = []
+    for env in TASKS:
+        known, made = most(theirs[env], 27.5), most(ours[env], 25)
+        met += [f"`{env}`"] if made.ret >= known.ret else []
+        cells = [f"{x.ret:.1f}, {x.cost:.0f} `{x.algo}`" for x in (known, made)]
+        lines.append(f"| `{env}` | {' | '.join(cells)} | [{made.study}]({made.study}/README.md) |")
+    summary = f"Ours earns at least as much on {len(met)} of {len(TASKS)} tasks: {', '.join(met)}."
+    return "\n".join([summary, "", *lines])
+
+
+def apart(groups: Sequence[Group], known: Mapping[tuple[str, str], Published]) -> str:
+    """The table of all tasks, with early termination below it."""
+    early = [g for g in groups if g.name in EARLY]
+    rest = [g for g in groups if g.name not in EARLY]
+    words = "Early termination. Episodes end at the limit in training, and in OmniSafe's evaluation:"
+    return f"{studies.matrix(rest, known)}\n\n{words}\n\n{studies.matrix(early, known)}"
 
 
 def held(training: Sequence[Group], final: Sequence[Group]) -> str:
@@ -359,11 +410,15 @@ def pages() -> dict[Path, str]:
     margin = ["car_goal2", "point_button1", "point_goal2"]
     written = {
         RESULTS / "README.md": {
-            "matrix": studies.matrix(groups, {}),
-            "evaluated": studies.matrix(final, PUBLISHED),
+            "matrix": apart(groups, {}),
+            "evaluated": apart(final, PUBLISHED),
             "held": held(groups, final),
         },
-        RESULTS / "published.md": {"outside": outside(groups, final), "held": held(groups, final)},
+        RESULTS / "published.md": {
+            "best": best(),
+            "outside": outside(groups, final),
+            "held": held(groups, final),
+        },
         RESULTS / "omnisafe" / "README.md": {
             "conventions": conventions(groups, group(theirs, ["algo.name"]))
         },
@@ -402,6 +457,9 @@ def main() -> None:
     published = {(g.env, g.name): beside(g, PUBLISHED) for g in groups}
     picture = plots.trade_off(groups, "evaluated policies", published)
     studies.save_small(picture, RESULTS / "images" / "trade_off.png")
+    scored = suite([g for g in ordered(group(runs, ["algo.name"])) if g.name not in EXTRA])
+    picture = plots.normalised(list(scored.groups), SCORES, aggregates(scored))
+    studies.save_small(picture, RESULTS / "images" / "scores.png")
     for path, text in pages().items():
         path.write_text(text)
 

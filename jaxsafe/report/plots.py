@@ -24,6 +24,7 @@ FORMATS = ("png", "svg")
 LONG = 30  # letters of a name in the legend that leave the panels too little room
 MARKERS = {"-": "o", "--": "s", ":": "^", "-.": "v"}  # by the kind of line that goes with it
 ESTIMATED = "estimate, no episode ended yet"
+RATES = {"train/cost_rate": "cost rate so far", "train/overruled": "override rate of the shield"}
 PANELS = (("train/return", "return of an episode"), ("train/cost", "cost of an episode"))
 
 
@@ -213,16 +214,17 @@ def front(points: Sequence[tuple[float, float]]) -> tuple[list[float], list[floa
 
 
 def learning(groups: Sequence[Group]) -> Figure:
-    """Return, cost and, where it is known, cost rate so far over training: a row a task, a line a
-    setting.
+    """Return, cost and, where they are known, cost rate so far and override rate over training: a row a
+    task, a line a setting.
 
     A point is the mean over one of at most 50 equal stretches of training; the band is the 95 %
     interval over seeds. A line ends where the first of its seeds does.
     """
     envs = sorted({g.env for g in groups})
     names = ["train/return", "train/cost"]
-    names += ["train/cost_rate"] * any("train/cost_rate" in run.table for g in groups for run in g.runs)
-    figure = Figure(figsize=(13, 3.4 * len(envs)), layout="constrained")
+    tables = [run.table for g in groups for run in g.runs]
+    names += [name for name in RATES if any(name in table for table in tables)]
+    figure = Figure(figsize=(13 + 4 * (len(names) > 3), 3.4 * len(envs)), layout="constrained")
     FigureCanvasAgg(figure)
     looks = styles(groups)
     rows = figure.subplots(len(envs), len(names), squeeze=False)
@@ -235,7 +237,7 @@ def learning(groups: Sequence[Group]) -> Figure:
         for g in shown:
             for axes, name in zip(panels, names, strict=True):
                 if all(name in run.table for run in g.runs):
-                    guess = g.estimated and name != "train/cost_rate"
+                    guess = g.estimated and name not in RATES
                     column = run_folder.estimate_of(name) if guess else name
                     values = np.concatenate([stretches(run.table, column, edges) for run in g.runs])
                     label = f"{g.name}, {ESTIMATED}" if guess else g.name
@@ -253,7 +255,8 @@ def learning(groups: Sequence[Group]) -> Figure:
             if alone or g is shown[limits.index(g.cost_limit)]:
                 color = looks[g.name]["color"] if alone else "0.4"
                 cost.axhline(g.cost_limit, color=color, ls="--", lw=1)
-        for axes, label in zip(panels, ("return", "cost", "cost rate so far"), strict=False):
+        for axes, name in zip(panels, names, strict=True):
+            label = RATES.get(name) or name.removeprefix("train/")
             axes.set(title=f"{env}, {label}")
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         clocks = dict.fromkeys(axis_of(run.table) for run in runs)

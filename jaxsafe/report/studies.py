@@ -2,7 +2,7 @@
 
     STUDY/study.yaml    what is asked, and which runs answer it, in order of worth
     STUDY/final.csv     a row a run and seed: what it reached, and what it was made with
-    STUDY/curves.npz    return, cost and cost rate of each row over training, 100 points each
+    STUDY/curves.npz    return, cost and rates of each row over training, 100 points each
     STUDY/README.md     a page made from the other three
 
 A run of a study is one training command with all its seeds. `add` condenses its run folder, and
@@ -167,7 +167,7 @@ def rows_of(
 
 
 def points(trained: SettingRun) -> list[np.ndarray]:
-    """Return, cost and cost rate of each seed over a hundred equal stretches, float32 [3, 100].
+    """The `CURVES` of each seed over a hundred equal stretches, float32 [4, 100].
 
     Twelve bits of the mantissa are kept, four digits: the rest is noise that does not compress.
     """

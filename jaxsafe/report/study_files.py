@@ -1,8 +1,9 @@
 """The two files of a study that hold its runs.
 
     final.csv    a row a run and seed: the columns of `ROW`, then figures, then those of `Origin`
-    curves.npz   curves    float32 [rows, 3, 100]: return, cost and cost rate over training, as means
-                           over equal stretches of it; NaN before the first episode has ended
+    curves.npz   curves    float32 [rows, 4, 100]: return, cost, cost rate and override rate over
+                           training, as means over equal stretches of it; NaN before the first episode
+                           has ended, and where no shield acts. Older files lack the last one
                  run, seed text [rows], to find the curves of a row
                  settings  JSON: every setting of the runs, {common: {...}, runs: {run: {...}}}
 
@@ -24,8 +25,9 @@ import numpy as np
 from jaxsafe.run import files
 
 ROW = ("run", "env", "algo", "settings", "seed", "state", "steps")
-CURVES = ("train/return", "train/cost", "train/cost_rate")  # as metrics.csv calls them
+CURVES = ("train/return", "train/cost", "train/cost_rate", "train/overruled")  # as in metrics.csv
 POINTS = 100
+OLDER = 3  # curves of a file from before the override rate was kept
 LONGEST = 230  # letters of a folder's name; file systems take 255 bytes
 
 
@@ -48,7 +50,7 @@ class Condensed(NamedTuple):
     """The runs of a study."""
 
     rows: list[dict[str, str]]
-    curves: dict[tuple[str, str], np.ndarray]  # by run and seed, float32 [3, 100]
+    curves: dict[tuple[str, str], np.ndarray]  # by run and seed, float32 [4, 100]
     settings: dict[str, dict[str, Any]]  # by run, as `flat` names them
 
     def figures(self) -> list[str]:
@@ -87,13 +89,16 @@ def read(folder: Path) -> Condensed:
         if not all(isinstance(x, str) for row in rows for x in (*row.keys(), *row.values())):
             raise ValueError("final.csv has rows of another length than its header")
         keys = zip(found["run"].tolist(), found["seed"].tolist(), strict=True)
-        curves = dict(zip(keys, found["curves"], strict=True))
+        kept = found["curves"]
+        if kept.shape[1:] not in ((len(CURVES), POINTS), (OLDER, POINTS)) or kept.dtype.kind != "f":
+            raise ValueError(f"curves.npz has curves {kept.dtype}{kept.shape}")
+        lacking = ((0, 0), (0, len(CURVES) - kept.shape[1]), (0, 0))
+        whole = np.pad(kept, lacking, constant_values=np.nan)
+        curves = dict(zip(keys, whole, strict=True))
         saved = json.loads(str(found["settings"]))
         settings = {run: saved["common"] | own for run, own in saved["runs"].items()}
         if any((row["run"], row["seed"]) not in curves or row["run"] not in settings for row in rows):
             raise ValueError("curves.npz lacks rows of final.csv")
-        if found["curves"].shape[1:] != (len(CURVES), POINTS) or found["curves"].dtype.kind != "f":
-            raise ValueError(f"curves.npz has curves {found['curves'].dtype}{found['curves'].shape}")
     return Condensed(rows, curves, settings)
 
 

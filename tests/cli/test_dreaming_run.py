@@ -8,14 +8,16 @@ import jax
 import numpy as np
 import pytest
 from shell import SCRIPTS, TOY, assert_same_run, typed
+from toys import START
 
 from jaxsafe.algos import ambs
 from jaxsafe.envs.view import render
 from jaxsafe.report.dreams import play
-from jaxsafe.run import checkpoint
+from jaxsafe.run import checkpoint, run_folder
 from jaxsafe.run.arguments import compose
 from jaxsafe.run.policies import open_run
 from jaxsafe.run.session import about_cpu
+from jaxsafe.run.settings import load, make_env
 
 AMBS = (
     TOY, "algo=ambs", "num_envs=4", "algo.horizon=8", "algo.learn_every=8", "algo.batch_size=32",
@@ -70,6 +72,69 @@ def test_foresight_compares_dreams_with_what_came(trained):
     for k in range(4):
         np.testing.assert_array_equal(found.paid[k].reshape(3, -1), cost[:, starts + k + 1])
     assert found.predicted.shape == found.paid.shape and np.isfinite(found.predicted).all()
+
+
+@pytest.fixture(scope="module")
+def untrained(tmp_path_factory):
+    """A run of Dreamer in the corridor whose policy is all zeros."""
+    run = tmp_path_factory.mktemp("untrained") / "run"
+    made = compose([*DREAMER, TOY, f"run_dir={run}"])
+    algo = made.row.make(make_env(made), None)
+    like = jax.eval_shape(lambda: algo.learned(algo.init(jax.random.key(0), made.algo, START)))
+    policy = jax.tree.map(lambda x: np.zeros((1, *x.shape), x.dtype), like)
+    run.mkdir()
+    run_folder.write_config(run, made.plain())
+    checkpoint.save(run / "policy", checkpoint.to_arrays(policy), checkpoint.Progress(1, 64, 4))
+    return run
+
+
+DREAMER = ("algo=dreamer", *(word for word in AMBS[2:9] if "overshoot" not in word))
+TICKER, PATCH = "env=toys:Ticker", "env=toys:Patch"
+MISFITS = {  # command, and what its line says
+    "another observation": (
+        ("train", *DREAMER, TICKER, "init_from=RUN"),
+        ("does not fit", "env.name is toys:Corridor there, toys:Ticker here"),
+    ),
+    "pictures": (
+        ("train", *DREAMER, PATCH, "algo.encoder=cnn", "init_from=RUN"),
+        ("does not fit", "env.name is toys:Corridor there, toys:Patch here", "algo.encoder is none there"),
+    ),
+    "another algorithm": (
+        ("train", *AMBS, "init_from=RUN"),
+        ("critic_c1", "is absent", "algo.name is dreamer there, ambs here"),
+    ),
+    "another size": (
+        ("train", *DREAMER, TOY, "algo.size=300k", "init_from=RUN"),
+        ("does not fit", "algo.size is tiny there, 300k here"),
+    ),
+    "resumed elsewhere": (
+        ("train", TICKER, "resume=RUN"), ("env=toys:Ticker", "was trained with toys:Corridor")
+    ),
+    "evaluated elsewhere": (
+        ("evaluate", "RUN", TICKER), ("env=toys:Ticker", "was trained with env=toys:Corridor")
+    ),
+    "evaluated where the observation has changed": (
+        ("evaluate", "CHANGED", TICKER), ("does not fit", "is [4], expected [2]")
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", MISFITS)
+def test_a_model_of_other_observations_is_refused_in_a_line(untrained, case, tmp_path, capsys):
+    """CHANGED is a run whose environment has other observations and actions now."""
+    changed, told = tmp_path / "changed", MISFITS[case][1]
+    shutil.copytree(untrained, changed)
+    for name in ("toys:Corridor", "toys:Ticker", "toys:Patch"):
+        load("env", name)
+    config = changed / "config.yaml"
+    config.write_text(config.read_text().replace("toys:Corridor", "toys:Ticker"))
+    command, *words = (
+        word.replace("RUN", str(untrained)).replace("CHANGED", str(changed)) for word in MISFITS[case][0]
+    )
+    new = () if command == "evaluate" or "resume" in words[-1] else (f"run_dir={tmp_path / 'run'}",)
+    assert typed(command, *words, *new) == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1 and all(part in err for part in told), err
 
 
 def test_an_area_of_1_sorts_all_and_a_half_is_a_coin_s():

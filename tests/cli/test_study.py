@@ -52,10 +52,11 @@ def trained(folder: Path, options: list[str], steps: int = 4000, nonfinite: Any 
     config |= {"dataset": given["dataset"]} if "dataset" in given else {}
     run_folder.write_config(folder, config)
     run_folder.append_versions(folder, "abacus", "c")
-    names = ["train/return", "train/cost", "train/cost_rate", "train/nonfinite"]
+    names = [*study_files.CURVES, "train/nonfinite"]
     log = run_folder.Metrics(folder, names, 0)
     for i in range(1, steps // 10 + 1):
-        values = [np.array([i, 2 * i]), np.array([i % 40, 30.0]), np.full(2, 0.1), np.array(nonfinite)]
+        values = [np.array([i, 2 * i]), np.array([i % 40, 30.0]), np.full(2, 0.1), np.full(2, 0.3)]
+        values.append(np.array(nonfinite))
         values[0] = np.where(i < 5, np.nan, values[0])
         at = Progress(i, 10 * i, i)
         log.append(at, [0, 1], 60.0 * i, dict(zip(names, values, strict=True)))
@@ -96,6 +97,21 @@ def test_figures_and_curves_of_a_study_are_those_of_its_runs(toy, tmp_path):
     for name in study_files.CURVES:
         here, there = (plots.stretches(r.table, name, edges) for r in (same, run))
         np.testing.assert_allclose(here, there, rtol=2e-3, err_msg=name)
+
+
+def test_a_study_from_before_override_rates_were_kept_has_none(toy, tmp_path):
+    trained(tmp_path / "run", toy.command(toy.runs[0]))
+    (run,) = read_one(tmp_path / "run")
+    studies.add(toy, toy.runs[0], run, study_files.Origin())
+    path = toy.folder / "curves.npz"
+    found = dict(np.load(path))
+    np.testing.assert_allclose(found["curves"][:, 3], 0.3, rtol=1e-3)
+    np.savez(path, **found | {"curves": found["curves"][:, : study_files.OLDER]})
+    (older,) = read([toy.folder])
+    assert {"train/cost_rate"} == older.table.keys() & {"train/cost_rate", "train/overruled"}
+    np.savez(path, **found | {"curves": found["curves"][:, :2]})
+    with pytest.raises(ConfigError, match="curves.npz has curves float32"):
+        study_files.read(toy.folder)
 
 
 def test_a_data_set_is_called_by_its_file(toy, tmp_path):
