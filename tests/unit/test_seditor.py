@@ -24,7 +24,9 @@ from jaxsafe.learn.learner import GradientStep
 from jaxsafe.learn.normalise import averaged, no_moments, standard
 from jaxsafe.learn.replay import Record
 from jaxsafe.learn.sequences import SequenceBatch, lambda_returns
+from jaxsafe.learn.timetable import timetable_of
 from jaxsafe.nn import beta
+from jaxsafe.types import Shared
 
 CFG = seditor.SEditorConfig(hidden=(), layer_norm=False)
 
@@ -495,6 +497,9 @@ def test_the_published_settings_are_one_step_of_1024_sequences_for_160_environme
     assert algo.clocks(cfg) == (160, 1) and cfg.batch_size == 1024 * 8
     assert algo.clocks(row.config()) == (5120, 32)
     assert cfg.n_step + 1 == 8 and cfg.dual_every == 160
+    rounds = jnp.arange(5_000_000 // 160)
+    at = jax.vmap(lambda i: timetable_of(cfg, None).at(0, Shared(i)))(rounds)
+    assert at.ready.sum() == 31_188  # gradient steps; the price moves in all 31,250 rounds
 
 
 def test_a_batch_that_is_no_number_of_sequences_is_refused():
