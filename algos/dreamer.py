@@ -91,8 +91,9 @@ class DreamerLagConfig(ForesightConfig):
     Shielding for Probabilistic Safety Guarantees in Continuous Environments", arXiv:2402.00816, as in
     their code; the augmented Lagrangian is that of As et al. (2022), "Constrained Policy Optimization
     via Bayesian World Models", arXiv:2201.09802.
-    Differs from it: the head of cost gives a number, not a probability, and Dreamer is the later one,
-    whose actor learns by reinforce (`actor_grad=backprop` has AMBS's).
+    Differs from it: the head of cost says how much a step costs, with `preset=ambs`, too. In AMBS's
+    code it says how likely a step has a violation, and two in a step count as one. Dreamer is the later
+    one, whose actor learns by reinforce (`actor_grad=backprop` has AMBS's).
     In the code mu is 1 from the second step on, so lam moves by the whole violation each time
     (`mu_least=1`); `mu_least=0` is the paper's. The model foresees cost (`overshoot`), as that of
     Dreamer-PID does.

@@ -212,7 +212,11 @@ def warm_start(
             "algo.hidden",
             "algo.trunk",
             "algo.std",
+            "algo.size",
+            "algo.encoder",
+            "algo.obs_bins",
             "algo.obs_normalize",
+            "algo.name",
             *options,
         )
         if there.get(name) != here.get(name)

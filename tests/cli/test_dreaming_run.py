@@ -3,6 +3,7 @@
 import json
 import runpy
 import shutil
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -19,13 +20,16 @@ from jaxsafe.run.policies import open_run
 from jaxsafe.run.session import about_cpu
 from jaxsafe.run.settings import load, make_env
 
-AMBS = (
-    TOY, "algo=ambs", "num_envs=4", "algo.horizon=8", "algo.learn_every=8", "algo.batch_size=32",
-    "algo.replay_ratio=2", "algo.n_step=3", "algo.replay_size=128", "algo.learning_starts=32",
-    "algo.size=tiny", "algo.imagine_steps=3", "algo.overshoot=2", "algo.rule=hoeffding",
-    "algo.shield_rollouts=4", "algo.shield_horizon=5",
-    "algo.labels=[wall]", "eval_episodes=2", "video=false",
+TINY = (
+    "num_envs=4", "algo.horizon=8", "algo.learn_every=8", "algo.batch_size=32", "algo.replay_ratio=2",
+    "algo.n_step=3", "algo.replay_size=128", "algo.learning_starts=32", "algo.size=tiny",
+    "algo.imagine_steps=3", "eval_episodes=2", "video=false",
 )  # fmt: skip
+AMBS = (
+    TOY, "algo=ambs", *TINY, "algo.overshoot=2", "algo.rule=hoeffding", "algo.shield_rollouts=4",
+    "algo.shield_horizon=5", "algo.labels=[wall]",
+)  # fmt: skip
+DREAMER = ("algo=dreamer", *TINY, "total_steps=64")
 STEPS = 32  # of an update
 foresight = runpy.run_path(str(SCRIPTS / "foresight.py"))
 
@@ -74,65 +78,56 @@ def test_foresight_compares_dreams_with_what_came(trained):
     assert found.predicted.shape == found.paid.shape and np.isfinite(found.predicted).all()
 
 
-@pytest.fixture(scope="module")
-def untrained(tmp_path_factory):
-    """A run of Dreamer in the corridor whose policy is all zeros."""
-    run = tmp_path_factory.mktemp("untrained") / "run"
-    made = compose([*DREAMER, TOY, f"run_dir={run}"])
-    algo = made.row.make(make_env(made), None)
-    like = jax.eval_shape(lambda: algo.learned(algo.init(jax.random.key(0), made.algo, START)))
-    policy = jax.tree.map(lambda x: np.zeros((1, *x.shape), x.dtype), like)
-    run.mkdir()
-    run_folder.write_config(run, made.plain())
-    checkpoint.save(run / "policy", checkpoint.to_arrays(policy), checkpoint.Progress(1, 64, 4))
-    return run
-
-
-DREAMER = ("algo=dreamer", *(word for word in AMBS[2:9] if "overshoot" not in word))
 TICKER, PATCH = "env=toys:Ticker", "env=toys:Patch"
-MISFITS = {  # command, and what its line says
+MISFITS = {  # a command, and what its line says
     "another observation": (
-        ("train", *DREAMER, TICKER, "init_from=RUN"),
+        ("train", *DREAMER, TICKER, "run_dir=new", "init_from=run"),
         ("does not fit", "env.name is toys:Corridor there, toys:Ticker here"),
     ),
     "pictures": (
-        ("train", *DREAMER, PATCH, "algo.encoder=cnn", "init_from=RUN"),
-        ("does not fit", "env.name is toys:Corridor there, toys:Patch here", "algo.encoder is none there"),
+        ("train", *DREAMER, PATCH, "algo.encoder=cnn", "run_dir=new", "init_from=run"),
+        ("toys:Corridor there, toys:Patch here", "algo.encoder is none there, cnn here"),
     ),
     "another algorithm": (
-        ("train", *AMBS, "init_from=RUN"),
+        ("train", *AMBS, "total_steps=64", "run_dir=new", "init_from=run"),
         ("critic_c1", "is absent", "algo.name is dreamer there, ambs here"),
     ),
     "another size": (
-        ("train", *DREAMER, TOY, "algo.size=300k", "init_from=RUN"),
+        ("train", *DREAMER, TOY, "algo.size=300k", "run_dir=new", "init_from=run"),
         ("does not fit", "algo.size is tiny there, 300k here"),
     ),
-    "resumed elsewhere": (
-        ("train", TICKER, "resume=RUN"), ("env=toys:Ticker", "was trained with toys:Corridor")
+    "resumed elsewhere": (("train", TICKER, "resume=run"), ("was trained with toys:Corridor",)),
+    "evaluated elsewhere": (("evaluate", "run", TICKER), ("was trained with env=toys:Corridor",)),
+    "evaluated where observations and actions have changed": (
+        ("evaluate", "changed", TOY),
+        ("does not fit", "is [2], expected [4]"),
     ),
-    "evaluated elsewhere": (
-        ("evaluate", "RUN", TICKER), ("env=toys:Ticker", "was trained with env=toys:Corridor")
-    ),
-    "evaluated where the observation has changed": (
-        ("evaluate", "CHANGED", TICKER), ("does not fit", "is [4], expected [2]")
-    ),
-}  # fmt: skip
+}
+
+
+def untrained(folder: Path, env: str) -> None:
+    """Write the run of a Dreamer there whose policy is all zeros."""
+    run = compose([*DREAMER, env])
+    algo = run.row.make(make_env(run), None)
+    like = jax.eval_shape(lambda: algo.learned(algo.init(jax.random.key(0), run.algo, START)))
+    policy = jax.tree.map(lambda x: np.zeros((1, *x.shape), x.dtype), like)
+    folder.mkdir()
+    run_folder.write_config(folder, run.plain())
+    checkpoint.save(folder / "policy", checkpoint.to_arrays(policy), checkpoint.Progress(1, 64, 4))
 
 
 @pytest.mark.parametrize("case", MISFITS)
-def test_a_model_of_other_observations_is_refused_in_a_line(untrained, case, tmp_path, capsys):
-    """CHANGED is a run whose environment has other observations and actions now."""
-    changed, told = tmp_path / "changed", MISFITS[case][1]
-    shutil.copytree(untrained, changed)
-    for name in ("toys:Corridor", "toys:Ticker", "toys:Patch"):
-        load("env", name)
-    config = changed / "config.yaml"
-    config.write_text(config.read_text().replace("toys:Corridor", "toys:Ticker"))
-    command, *words = (
-        word.replace("RUN", str(untrained)).replace("CHANGED", str(changed)) for word in MISFITS[case][0]
-    )
-    new = () if command == "evaluate" or "resume" in words[-1] else (f"run_dir={tmp_path / 'run'}",)
-    assert typed(command, *words, *new) == 2
+def test_a_model_of_other_observations_is_refused_in_a_line(case, tmp_path, monkeypatch, capsys):
+    (command, *words), told = MISFITS[case]
+    monkeypatch.chdir(tmp_path)
+    for env in (TOY, TICKER, PATCH):
+        load("env", env.removeprefix("env="))
+    if "changed" in words:
+        untrained(Path("changed"), TICKER)
+        run_folder.write_config(Path("changed"), compose([*DREAMER, TOY]).plain())
+    else:
+        untrained(Path("run"), TOY)
+    assert typed(command, *words) == 2
     err = capsys.readouterr().err
     assert err.count("\n") == 1 and all(part in err for part in told), err
 

@@ -1,7 +1,7 @@
 """The shield by hand: what a dream counts for, what is learned of it, and where it overrules."""
 
 import dataclasses
-from functools import partial
+from functools import cache, partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,16 +11,33 @@ import numpy as np
 import pytest
 import scipy.stats
 from compiling import FAST
+from jax.flatten_util import ravel_pytree
 from toys import START, Corridor, Ledge
 
-from jaxsafe.algos import ALGOS, ambs
+from jaxsafe.algos import ALGOS, ambs, dreamer
 from jaxsafe.config import ConfigError
 from jaxsafe.learn.acting import Learned, Player
-from jaxsafe.learn.world_model import dream, dream_returns
+from jaxsafe.learn.dreaming import Judged, Scene, no_range
+from jaxsafe.learn.next_step_rollout import collect_records, started
+from jaxsafe.learn.replay import Record
+from jaxsafe.learn.rollout import init_rollout
+from jaxsafe.learn.sequences import SequenceBatch
+from jaxsafe.learn.world_model import Dreams, dream, dream_returns, world_of
 from jaxsafe.nn.gaussian import Gaussian
 from jaxsafe.nn.rssm import Latent
+from jaxsafe.types import Algorithm
 
 CFG = ambs.AMBSConfig(discount=1 - 1 / 333, rule="hoeffding", shield_rollouts=512, delta=0.1)
+
+
+@cache
+def newborn() -> tuple[Algorithm, Any]:
+    """The shield in the corridor with four dreams, and what it has learned before the first step."""
+    algo = ALGOS["ambs"].make(Corridor())
+    sizes: dict[str, Any] = {"num_envs": 4, "replay_ratio": 32, "shield_rollouts": 4}
+    cfg = ambs.AMBSConfig(**ambs.LEDGE | sizes)
+    init = jax.jit(lambda key: algo.init(key, cfg, START), compiler_options=FAST)
+    return algo, algo.learned(init(jax.random.key(0)))
 
 
 # ---- the bounds --------------------------------------------------------------------------------
@@ -121,6 +138,29 @@ def test_a_violation_counts_within_the_horizon_and_not_a_step_later():
     assert [k for k in range(1, 36) if one_dream({k: 10.0})] == [*range(1, 31)]
 
 
+def test_sums_that_are_taken_backwards_are_the_direct_ones():
+    """R_t = sum_i discount^i c_{t+1+i}, and the critics' part last, until a state has k = 0. Half of
+    the 400 dreams of 15 steps end."""
+    keys = jax.random.split(jax.random.key(0), 3)
+    cost = 10 * jax.random.uniform(keys[0], (16, 400)) ** 12
+    alive = jax.random.bernoulli(keys[1], 0.95, (16, 400))
+    value = 10 * jax.random.uniform(keys[2], (16, 400))
+    given = np.concatenate([cost[1:], value[-1:]]).astype(np.float64)
+    runs = np.asarray(alive[1:], np.float64)
+
+    def direct(t: int) -> np.ndarray:
+        counts = np.cumprod(np.concatenate([np.ones((1, 400)), runs[t:]]), axis=0)
+        return (CFG.discount ** np.arange(16 - t)[:, None] * counts * given[t:]).sum(0)
+
+    args = cost, value, jnp.float32(alive)
+    found = dream_returns(*args, discount=CFG.discount, decay=1.0)
+    np.testing.assert_allclose(found, [direct(t) for t in range(15)], rtol=1e-4)
+    dreams = ambs.Dreamt(cost[1:], alive[1:], value[-1], jnp.zeros((15, 400), bool))
+    expected = direct(0) > 10 * CFG.discount**30
+    np.testing.assert_array_equal(ambs.unsafe(dreams, CFG), expected)
+    assert 100 < expected.sum() < 300 and 100 < (runs.min(0) == 0).sum() < 300
+
+
 def test_costs_add_up_and_end_with_the_episode():
     assert one_dream({1: 3.2, 2: 3.2, 3: 3.2}) and not one_dream({1: 3.0, 2: 3.0, 3: 3.0})
     assert not one_dream({1: 3.2, 2: 3.2, 3: 3.2}, ends=1)
@@ -154,6 +194,55 @@ def test_the_value_of_costs_ends_with_the_first_violation():
     safe = jnp.array([[1.0], [0.0], [0.0]])
     until = dream_returns(cost, value, safe, discount=CFG.discount, decay=CFG.td_lambda)
     np.testing.assert_array_equal(until, [[10.0], [10.0]])
+
+
+def test_what_critics_of_cost_are_told_is_cut_at_a_violation_and_at_most_its_cost(monkeypatch):
+    """By hand, of five dreams of two steps: four have ended or had a violation in the first, and what
+    follows is anything. And within [0, C] of many more, whatever the networks say."""
+    draws = [jax.random.normal(key, (3, 1000)) for key in jax.random.split(jax.random.key(0), 5)]
+    (cost, first, second), (cont, safe) = (20 * x for x in draws[:3]), map(jax.nn.sigmoid, draws[3:])
+    cost = cost.at[1, :5].set(jnp.array([10.0, 25.0, -3.0, 4.0, 0.0])).at[2, 4].set(25.0)
+    cont = cont.at[1, :5].set(jnp.array([1.0, 1.0, 1.0, 0.0, 1.0]))
+    safe = safe.at[1, :5].set(jnp.array([0.0, 0.0, 0.0, 1.0, 1.0])).at[2, 4].set(0.0)
+    first, second = first.at[1, 4].set(30.0), second.at[1, 4].set(5.0)
+    says, zeros = {"cost": cost, "cont": cont, "safe": safe, "reward": cost}, jnp.zeros((3, 1000))
+    dreams = Dreams(zeros, zeros[1:], zeros[1:], zeros[1:], says, zeros)
+    told: dict[str, jax.Array] = {}
+
+    class Told(Scene):
+        """A scene where every actor has these dreams, and where critics are told and do not learn."""
+
+        def dream(self, actor, key):
+            return dreams
+
+        def value(self, critic, features):
+            return zeros
+
+        def judge(self, name, dreams, reward, discount):
+            return Judged(zeros[1:], zeros)
+
+        def over_dreams(self, x):
+            return x.mean()
+
+        def critic_loss(self, trained, name, dreams, returns):
+            told[name] = returns
+            return jnp.zeros(())
+
+        def critic_loss_with_rows(self, trained, name, dreams, returns, reward, discount):
+            return jnp.zeros(())
+
+    monkeypatch.setattr(ambs, "value_of", lambda critic, features, cfg: critic)
+    params = {"critic_safe": (), "critic_c1": first, "critic_c2": second}
+    batch: Any = SimpleNamespace(rows=SimpleNamespace(reward=zeros))
+    unused: Any = None
+    scene = Told(unused, unused, params, batch, unused, (), CFG, None)
+    actors = {"actor": zeros, "safe": zeros}
+    ambs.learn(actors, ambs.shielded_behaviour.memory(CFG), scene, jax.random.key(0))
+    np.testing.assert_array_equal(told["critic_c1"], told["critic_c2"])
+    until = told["critic_c1"]
+    np.testing.assert_array_equal(until[0, :4], [10, 10, 0, 4])
+    np.testing.assert_allclose(until[0, 4], CFG.discount * (0.05 * 5 + 0.95 * 10), rtol=1e-5)
+    assert until.min() == 0 and until.max() == CFG.violation_cost
 
 
 def test_labels_say_which_costs_are_violations():
@@ -202,6 +291,49 @@ def test_without_a_weight_penl_is_dreamer():
         np.testing.assert_array_equal(ambs.penalised(found, cfg), found.reward)
     cfg = dataclasses.replace(CFG, penalty="none", penalty_coef=5.0)
     np.testing.assert_array_equal(ambs.penalised(found, cfg), found.reward)
+
+
+@pytest.mark.parametrize("actor_grad", ["reinforce", pytest.param("backprop", marks=pytest.mark.slow)])
+def test_without_a_weight_the_task_s_actor_learns_what_dreamer_s_does(actor_grad):
+    """From the same networks, rows and random numbers, but for rounding: AMBS's two actors dream in one
+    program, which adds up in another order."""
+    (_, learned), env, key = newborn(), Corridor(), jax.random.key(1)
+    options: dict[str, Any] = {"actor_grad": actor_grad, "penalty": "penl", "imagine_steps": 3}
+    world = world_of(env, ambs.shielded_behaviour.all_heads, learned.config)
+    start: Any = world.apply({}, method="start")
+    no, reward = jnp.zeros((4, 2), bool), jax.random.normal(key, (4, 2))
+    zeros = jnp.zeros((4, 2, 4))
+    rows = Record(zeros, zeros[..., :2], reward, reward, reward[..., None], no, no, no)
+    memory = ambs.shielded_behaviour.memory(learned.config)
+
+    @jax.jit
+    def slopes(coef):
+        """Of the loss of AMBS and of Dreamer by the actor's parameters; and what both remember."""
+        cfg = dataclasses.replace(learned.config, penalty_coef=coef, **options)
+        params = jax.tree.map(
+            lambda x: x + 0.01 * jnp.sin(jnp.arange(x.size)).reshape(x.shape), learned.params
+        )  # heads and critics are 0 at first
+        latents = jax.tree.map(lambda x: jax.random.normal(key, (4, 2, *x.shape)), start)
+        scene = Scene(env, world, params, SequenceBatch(rows, jnp.full(2, 0.5)), latents, (), cfg, None)
+
+        def shielded(actor):
+            found = ambs.learn(params | {"actor": actor}, memory, scene, key)
+            return found.loss, found.memory["reward"]
+
+        def plain(actor):
+            dream_key = jax.random.split(key)[0]  # the task's
+            found = dreamer.learn(params | {"actor": actor}, {"range": no_range()}, scene, dream_key)
+            return found.loss, found.memory["range"]
+
+        found = [jax.grad(f, has_aux=True)(params["actor"]) for f in (shielded, plain)]
+        return [(ravel_pytree(x)[0], jnp.stack(y)) for x, y in found]
+
+    def distance(x, y):
+        return jnp.linalg.norm(x - y) / jnp.linalg.norm(y)
+
+    ours, dreamers = slopes(jnp.float32(0))
+    assert all(distance(x, y) < 1e-4 for x, y in zip(ours, dreamers, strict=True))
+    assert distance(slopes(jnp.float32(1))[0][0], dreamers[0]) > 0.1
 
 
 class Slope:
@@ -328,11 +460,7 @@ def test_in_the_simulator_it_knows_what_comes(monkeypatch):
 
 def test_the_executed_action_is_one_of_the_two_and_is_what_is_remembered():
     """And an environment's action does not depend on its neighbours."""
-    algo, env = ALGOS["ambs"].make(Corridor()), Corridor()
-    sizes: dict[str, Any] = {"num_envs": 4, "replay_ratio": 32, "shield_rollouts": 4}
-    cfg = ambs.AMBSConfig(**ambs.LEDGE | sizes)
-    init = jax.jit(lambda key: algo.init(key, cfg, START), compiler_options=FAST)
-    learned = algo.learned(init(jax.random.key(0)))
+    (algo, learned), env = newborn(), Corridor()
     state = jax.vmap(env.reset)(jax.random.split(jax.random.key(1), 4))
 
     @jax.jit
@@ -354,6 +482,42 @@ def test_the_executed_action_is_one_of_the_two_and_is_what_is_remembered():
     alone = acted(jnp.float32(jnp.inf), dataclasses.replace(state, obs=others))
     np.testing.assert_array_equal(alone[0][0], task[0])
     assert (alone[0][1:] != task[1:]).any()
+
+
+def test_an_evaluation_takes_the_sampled_actions_that_training_takes():
+    """With the same keys, over six steps of four environments, in each of which violations are drawn
+    with probability 1/2: the shield acts where two of four dreams have one."""
+    (algo, learned), env = newborn(), Corridor()
+    luck: dict[str, Any] = {"verdict": "drawn", "shield_horizon": 1, "delta": jnp.float32(0.4)}
+    learned = dataclasses.replace(learned, config=dataclasses.replace(learned.config, **luck))
+    player, keys = Player(algo.policy, learned, env), jax.random.split(jax.random.key(2), 6)
+
+    @jax.jit
+    def both():
+        rollout = init_rollout(env, jax.random.key(1), 4, stagger=False)
+        carry = jax.tree.map(lambda x: jnp.zeros((4, *x.shape)), player.begin())
+        stepping = started(dataclasses.replace(rollout, carry=carry))
+        rows, steps = collect_records(env, player.act_in_all, stepping, keys)[1]
+
+        def evaluated(x):
+            """One environment alone, from the same start, with its keys of the rollout."""
+
+            def step(now, key):
+                state, carry = now
+                action, carry = player.act(carry, state, key)
+                return (env.step(state, action), carry), (state.obs, action)
+
+            state, number = x
+            of_all = jax.vmap(lambda key: jax.random.split(jax.random.split(key)[0], 4))(keys)
+            return jax.lax.scan(step, (state, player.begin()), of_all[:, number])[1]
+
+        alone = jax.lax.map(evaluated, (rollout.state, jnp.arange(4)))
+        return (rows.obs, rows.action), steps.said["overruled"], alone
+
+    training, overruled, evaluation = both()
+    assert 4 < overruled.sum() < 20
+    for x, y in zip(training, evaluation, strict=True):
+        np.testing.assert_allclose(x, jnp.swapaxes(y, 0, 1), atol=1e-5)
 
 
 # ---- evaluation --------------------------------------------------------------------------------

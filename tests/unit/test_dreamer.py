@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from toys import Corridor
 
-from jaxsafe.algos import dreamer
+from jaxsafe.algos import ALGOS, dreamer
 from jaxsafe.learn.dreaming import Judged, Scene, no_range
 from jaxsafe.learn.treatments import CappedPID
 
@@ -67,6 +67,59 @@ def test_the_limit_of_an_episode_is_that_of_a_steady_stream_of_cost():
     np.testing.assert_allclose(dreamer.discounted_limit(Corridor(), cfg), 0.4)
     env = Corridor(episode_length=1000)
     np.testing.assert_allclose(dreamer.discounted_limit(env, CFG), 1.0, rtol=1e-4)
+
+
+def test_the_preset_of_ambs_has_the_numbers_of_its_lagrangian():
+    """Of the released settings of Safety Gym: d = 1 in an episode of 500 steps, lam = 0.01 and
+    mu = 5e-9 at first, and a mu that grows by 1e-6 and is at least 1 later."""
+    row = ALGOS["dreamer_lag"]
+    cfg = row.config(**row.published["ambs"])
+    limit = dreamer.discounted_limit(Corridor(episode_length=500), cfg)
+    np.testing.assert_allclose(limit, 1, rtol=1e-4)
+    np.testing.assert_array_equal(dreamer.priced.memory(cfg)["dual"], [0.01, 5e-9])
+    numbers = (cfg.mu_growth, cfg.mu_least, cfg.cost_discount, cfg.td_lambda, cfg.replay_value)
+    assert numbers == (1e-6, 1.0, 0.997, 0.95, 0.0)
+    assert (cfg.actor_grad, cfg.limit_ends, cfg.overshoot) == ("backprop", True, 0)
+
+
+def test_the_multiplier_s_actor_pays_for_its_dreams_and_the_multiplier_moves_by_their_mean(monkeypatch):
+    """Two dreams of two steps, with lam = 0.5, mu = 2 and d = 0.75: by backprop psi(R - d), whose slope
+    is lam + mu (R - d) >= 0, in no unit but its own; by reinforce its advantage times log pi."""
+    returns = jnp.array([[1.0, 4.0], [2.0, 0.0]])
+    value = jnp.array([[3.0, 1.0], [2.0, 1.0], [9.0, 9.0]])
+    weight = jnp.array([[1.0, 1.0], [0.5, 0.5], [0.25, 0.25]])
+    dual = dreamer.Augmented(jnp.float32(0.5), jnp.float32(2.0))
+    cfg = dataclasses.replace(CFG, cost_limit=0.75, cost_discount=0.95)  # of 20 steps: d = 0.75
+
+    def outcome(actor_grad: str, log_prob: jax.Array, returns: jax.Array) -> Any:
+        dreams: Any = SimpleNamespace(weight=weight, log_prob=log_prob)
+        wishes = dreamer.Wishes(dreams, no_range(), jnp.float32(7), {})
+        unused: Any = [None] * 4
+        of = dataclasses.replace(cfg, actor_grad=actor_grad)
+        scene = Averaging(Corridor(), *unused, dual=(), cfg=of, axis_name=None)
+        monkeypatch.setattr(dreamer, "learn_reward", lambda *args: wishes)
+        found = Judged(returns, value), jnp.float32(2), {}
+        monkeypatch.setattr(dreamer, "learn_cost", lambda *args: found)
+        memory = {"range": no_range(), "dual": dual}
+        return dreamer.learn_priced({}, memory, scene, jax.random.key(0))
+
+    def loss(*args: Any) -> jax.Array:
+        return outcome(*args).loss
+
+    log_prob = jnp.array([[-1.0, -2.0], [-3.0, -4.0]])
+    psi = jnp.array([[0.1875, 12.1875], [2.1875, -0.0625]])  # lam g + mu g^2 / 2, or -lam^2 / (2 mu)
+    price = jnp.array([[1.0, 7.0], [3.0, 0.0]])
+    paid = weight[:2] * psi
+    np.testing.assert_allclose(loss("backprop", log_prob, returns), 9 + paid.mean(), rtol=1e-5)
+    slopes = jax.grad(loss, argnums=(1, 2))("backprop", log_prob, returns)
+    np.testing.assert_allclose(slopes, [jnp.zeros((2, 2)), weight[:2] * price / 4], rtol=1e-5)
+    beyond = weight[:2] * (psi - jnp.array([[6.1875, 0.1875], [2.1875, 0.1875]]))  # psi(V - d)
+    expected = 9 + (beyond * log_prob).mean()
+    np.testing.assert_allclose(loss("reinforce", log_prob, returns), expected, rtol=1e-5)
+    slopes = jax.grad(loss, argnums=(1, 2))("reinforce", log_prob, returns)
+    np.testing.assert_allclose(slopes, [beyond / 4, jnp.zeros((2, 2))], rtol=1e-5)
+    after = outcome("backprop", log_prob, returns).memory["dual"]  # R - d is 1 on average
+    np.testing.assert_allclose(after, (0.5 + 2 * 1.0, 2 * (1 + 1e-6)), rtol=1e-5)
 
 
 def test_at_a_price_the_actor_pays_for_what_its_dreams_cost_beyond_the_mean(monkeypatch):

@@ -15,7 +15,8 @@ from toys import START, Corridor, Ticker
 from jaxsafe.algos import ALGOS, dreamer
 from jaxsafe.learn import world_model
 from jaxsafe.learn.acting import Player
-from jaxsafe.learn.dreaming import Range, moved
+from jaxsafe.learn.dreaming import Behaviour, Outcome, Range, dreaming_learner, moved
+from jaxsafe.learn.learner import GradientStep
 from jaxsafe.learn.next_step_rollout import collect_records, started
 from jaxsafe.learn.replay import Record, Source, Span
 from jaxsafe.learn.rollout import init_rollout
@@ -388,6 +389,47 @@ def test_the_model_foresees_a_deterministic_toy():
     foreseen, came, stood = trained.lower(jax.random.key(0)).compile(FAST)(jax.random.key(0))
     error, still = (jnp.sqrt(((x - came) ** 2).mean((1, 2))) for x in (foreseen, stood))
     assert error[-1] < 0.25 * still[-1], (error, still)
+
+
+def test_a_task_without_failures_is_foreseen_to_go_on_beyond_its_time_limit():
+    """The head `cont` after 60 gradient steps on episodes of 5 steps, of which each sixth row is the
+    last. On average k is above 0.9995, and about 5/6 where time limits are learned as failures."""
+    env = Ticker(episode_length=5)
+    cfg = dreamer.DreamerConfig(size="tiny", lr_warmup=1, model_lr=0.02)
+    rows: Any = recorded(env, 12)
+    assert rows.truncated.any() and not rows.terminated.any()
+    fails = rows.replace(terminated=rows.truncated, truncated=rows.terminated)
+    ends = world_model.goes_on(rows, dataclasses.replace(cfg, limit_ends=True))
+    np.testing.assert_array_equal(ends, world_model.goes_on(fails, cfg))
+
+    def idle(trained, memory, scene, key):
+        return Outcome(jnp.zeros(()), memory, {})
+
+    # without actor and critics, of which the model learns nothing
+    model_alone = Behaviour(idle, lambda cfg: (), actors=(), critics=())
+    learner = dreaming_learner(env, model_alone)
+    world = world_model.world_of(env, model_alone.all_heads, cfg)
+    init = jax.jit(lambda key: learner.init(key, env.obs_size, env.action_size, cfg))
+
+    @jax.jit
+    def improved(nets, rows, key):
+        batch = SequenceBatch(rows, jnp.full(3, 1 / 3))
+        at = GradientStep(jnp.int32(0), jnp.float32(1), key)
+        return learner.step(nets, batch, at, cfg, None)[0]
+
+    @jax.jit
+    def foreseen(params):
+        latents = world_model.filtered(world, params["model"], rows, None)
+        return world_model.read(world, params["model"], latents.features)["cont"].mean()
+
+    def learned_from(rows):
+        nets = init(jax.random.key(0))
+        for key in jax.random.split(jax.random.key(1), 60):
+            nets = improved(nets, rows, key)
+        return foreseen(nets.params)
+
+    assert learned_from(rows) > 0.9995
+    assert learned_from(fails) < 0.9
 
 
 def test_hidden_layers_in_bfloat16_change_a_loss_and_its_gradient_little():
