@@ -110,7 +110,7 @@ def test_a_study_from_before_override_rates_were_kept_has_none(toy, tmp_path):
     (older,) = read([toy.folder])
     assert {"train/cost_rate"} == older.table.keys() & {"train/cost_rate", "train/overruled"}
     np.savez(path, **found | {"curves": found["curves"][:, :2]})
-    with pytest.raises(ConfigError, match="curves.npz has curves float32"):
+    with pytest.raises(ConfigError, match=r"curves\.npz has curves float32"):
         study_files.read(toy.folder)
 
 
