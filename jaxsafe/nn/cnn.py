@@ -7,6 +7,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from jaxsafe.nn.initializers import orthogonal
 from jaxsafe.types import PyTree
 
 LAYERS = ((32, 8, 4), (64, 4, 2), (64, 3, 1))  # channels, side of the kernel, stride
@@ -48,7 +49,7 @@ class CNN(nn.Module):
 
     @nn.compact
     def __call__(self, obs: dict[str, jax.Array]) -> jax.Array:
-        weights = nn.initializers.orthogonal(math.sqrt(2.0))
+        weights = orthogonal(math.sqrt(2.0))
         x = obs["vision"].astype(jnp.float32) / 255
         for channels, side, stride in LAYERS:
             layer = nn.Dense(channels, precision=self.precision, kernel_init=weights)

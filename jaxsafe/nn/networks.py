@@ -14,6 +14,7 @@ import jax.numpy as jnp
 
 from jaxsafe.nn.cnn import CNN
 from jaxsafe.nn.gaussian import Gaussian
+from jaxsafe.nn.initializers import INITS
 from jaxsafe.nn.recurrent import Recurrent, Sequences, unroll
 from jaxsafe.types import PyTree
 
@@ -87,20 +88,7 @@ def aligned_dot(x: jax.Array, weight: jax.Array, *args: Any, **kwargs: Any) -> j
     return jax.lax.dot_general(x, filled, *args, **kwargs)[..., : weight.shape[1]]
 
 
-def torch_uniform(fan_in: int) -> Callable[..., jax.Array]:
-    def init(key: jax.Array, shape: Any, dtype: Any = jnp.float32) -> jax.Array:
-        return jax.random.uniform(key, shape, dtype, -1 / math.sqrt(fan_in), 1 / math.sqrt(fan_in))
-
-    return init
-
-
 ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {"tanh": nn.tanh, "relu": nn.relu}
-INITS = {  # name -> (gain, fan in) -> initialisers of weights and of biases
-    "orthogonal": lambda gain, fan_in: (nn.initializers.orthogonal(gain), nn.initializers.zeros),
-    "torch": lambda gain, fan_in: (torch_uniform(fan_in), torch_uniform(fan_in)),
-    "fan_in": lambda gain, fan_in: (torch_uniform(fan_in), nn.initializers.zeros),
-    "xavier": lambda gain, fan_in: (nn.initializers.xavier_uniform(), nn.initializers.zeros),
-}
 
 
 def mlp(cfg: Any, out: int, gain: float = 1.0) -> MLP:

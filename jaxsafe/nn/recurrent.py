@@ -8,6 +8,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from jaxsafe.nn.initializers import orthogonal
 from jaxsafe.types import PyTree
 
 
@@ -40,7 +41,7 @@ class GRU(nn.Module):
     @nn.compact
     def __call__(self, h: jax.Array, x: jax.Array) -> jax.Array:
         def dense(name: str, outputs: int, bias: bool = True) -> nn.Dense:
-            weights = nn.initializers.orthogonal()
+            weights = orthogonal()
             highest = jax.lax.Precision.HIGHEST  # see networks.MLP
             return nn.Dense(outputs, bias, precision=highest, kernel_init=weights, name=name)
 

@@ -1,3 +1,6 @@
+import re
+
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +11,7 @@ from jaxsafe.algos.sac import SACConfig
 from jaxsafe.nn.cnn import patches
 from jaxsafe.nn.critics import init_critics, largest, q_values, smallest
 from jaxsafe.nn.gaussian import log_prob
+from jaxsafe.nn.initializers import orthogonal
 from jaxsafe.nn.networks import LOG_STD, action_dist, aligned_dot, init_params, value
 
 
@@ -31,6 +35,16 @@ def test_orthogonal_layers_keep_angles_and_the_policy_starts_near_zero():
     dist = action_dist(tree["actor"], jax.random.normal(jax.random.key(1), (9, 5)), PPOConfig())
     assert jnp.abs(dist.mean).max() < 0.1
     np.testing.assert_array_equal(dist.log_std, jnp.full((9, 3), -0.5))
+
+
+def test_orthogonal_layers_of_several_members_are_flax_s_and_are_factorised_one_by_one():
+    """Batches of them hang a CPU of few cores, see `orthogonal`."""
+    keys, shape = jax.random.split(jax.random.key(0), 3), (8, 5)
+    theirs = [nn.initializers.orthogonal(0.5)(key, shape) for key in keys]
+    drawn = jax.jit(jax.vmap(lambda key: orthogonal(0.5)(key, shape)))
+    np.testing.assert_array_equal(drawn(keys), theirs)
+    batches = re.findall('num_batch_dims = "([0-9])"', drawn.lower(keys).as_text())
+    assert batches and set(batches) == {"0"}
 
 
 def test_the_critics_differ_and_give_one_value_a_state():
