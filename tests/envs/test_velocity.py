@@ -22,6 +22,7 @@ from jaxsafe.envs.velocity.suite import NAMES
 from jaxsafe.envs.velocity.task import Velocity, World
 from jaxsafe.types import State
 
+DATA = Path(__file__).parent.parent / "data"
 ROBOTS = list(NAMES)
 THEIRS = {"halfcheetah": "half_cheetah"}  # their files, where named otherwise
 FLYING = ("ant", "humanoid")  # robots whose speed counts in x and y
@@ -123,39 +124,64 @@ class Step(NamedTuple):
     terminated: np.ndarray
 
 
-@functools.cache
-def recorded(robot: str, count: int) -> Step:
-    """Steps of random actions, some of them beyond the limits."""
-    env, rng = theirs(robot), np.random.default_rng(0)
-    model, data = env.model, env.data
-    steps: list[tuple] = []
-    env.reset(seed=0)
+class Start(NamedTuple):
+    """A state in float32 and the action there, each [...]."""
+
+    qpos: np.ndarray
+    qvel: np.ndarray
+    warmstart: np.ndarray
+    action: np.ndarray
+
+
+def taken(env: Any, robot: str, start: Start) -> Step:
+    """One step of Gymnasium's, [...] each."""
+    data = env.data
 
     def place() -> np.ndarray:
         if robot == "humanoid":
             return data.subtree_com[1, :2].copy()
         return np.array([data.qpos[0], data.qpos[1] if robot in ("ant", "swimmer") else 0.0])
 
-    while len(steps) < count:
-        qpos, qvel, warmstart = (
-            x.astype(np.float32) for x in (data.qpos, data.qvel, data.qacc_warmstart)
-        )
-        action = rng.uniform(-1.2, 1.2, model.nu).astype(np.float32)
-        env.set_state(qpos.astype(float), qvel.astype(float))
-        data.qacc_warmstart[:] = warmstart
-        before = place()
-        _, reward, terminated, _, info = env.step(action * env.action_space.high.astype(float))
-        lagging = np.array([info["x_velocity"], info.get("y_velocity", 0.0)])
-        if robot in FLYING:
-            mujoco.mj_forward(model, data)
-            mujoco.mj_rnePostConstraint(model, data)
-        after, obs = data.qpos.copy(), env._get_obs()
-        velocity = (place() - before) / env.dt
-        row = (qpos, qvel, warmstart, action, before, after, obs, velocity, lagging, reward, terminated)
-        steps.append(row)
-        if terminated or len(steps) % 50 == 0:
-            env.reset(seed=len(steps))
+    env.set_state(start.qpos.astype(float), start.qvel.astype(float))
+    data.qacc_warmstart[:] = start.warmstart
+    before = place()
+    _, reward, terminated, _, info = env.step(start.action * env.action_space.high.astype(float))
+    lagging = np.array([info["x_velocity"], info.get("y_velocity", 0.0)])
+    if robot in FLYING:
+        mujoco.mj_forward(env.model, data)
+        mujoco.mj_rnePostConstraint(env.model, data)
+    after, obs, velocity = data.qpos.copy(), env._get_obs(), (place() - before) / env.dt
+    return Step(*start, before, after, obs, velocity, lagging, reward, terminated)
+
+
+def stacked(steps: list[Step]) -> Step:
     return Step(*(np.stack(x) for x in zip(*steps, strict=True)))
+
+
+@functools.cache
+def recorded(robot: str, count: int) -> Step:
+    """Steps of random actions, some of them beyond the limits."""
+    env, rng = theirs(robot), np.random.default_rng(0)
+    data = env.data
+    steps: list[Step] = []
+    env.reset(seed=0)
+    while len(steps) < count:
+        at = (x.astype(np.float32) for x in (data.qpos, data.qvel, data.qacc_warmstart))
+        action = rng.uniform(-1.2, 1.2, env.model.nu).astype(np.float32)
+        steps.append(taken(env, robot, Start(*at, action)))
+        if steps[-1].terminated or len(steps) % 50 == 0:
+            env.reset(seed=len(steps))
+    return stacked(steps)
+
+
+@functools.cache
+def gait(robot: str) -> Step:
+    """Steps of a trained policy, see tests/data."""
+    env = theirs(robot)
+    env.reset(seed=0)
+    with np.load(DATA / "gaits.npz") as file:
+        starts = zip(*(file[f"{robot}.{name}"] for name in Start._fields), strict=True)
+        return stacked([taken(env, robot, Start(*start)) for start in starts])
 
 
 def forced(m: Made, steps: Step) -> State:
@@ -170,9 +196,9 @@ def forced(m: Made, steps: Step) -> State:
     return jax.device_get(m.step(state.replace(physics=world), jnp.asarray(steps.action)))
 
 
-def compare(robot: str, engine: str, count: int) -> dict[str, np.ndarray]:
+def compare(robot: str, engine: str, steps: Step) -> dict[str, np.ndarray]:
     """Absolute errors of each step, [count]; of forces on Humanoid's bodies relative to 1000 N."""
-    m, steps = made(robot, engine), recorded(robot, count)
+    m = made(robot, engine)
     state = forced(m, steps)
     weight, v = m.env.config.forward_reward_weight, steps.velocity
     reward = steps.reward + weight * (v - steps.lagging)[:, 0]
@@ -197,11 +223,28 @@ def compare(robot: str, engine: str, count: int) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_a_step_of_engine_c_is_gymnasium_s_to_the_rounding_of_float32(robot):
     """In float64 inside: what is left is that states, rewards and observations are float32."""
-    errors = compare(robot, "c", 150)
+    errors = compare(robot, "c", recorded(robot, 150))
     eps = np.finfo(np.float32).eps
     assert errors["qpos"].max() < 2 * eps
     assert errors["obs"].max() < (2 * eps if robot != "humanoid" else 1e-4)  # Newton's solver and PGS
     assert errors["reward"].max() < 1e-5 and errors["velocity"].max() < 1e-5
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_a_step_of_a_trained_gait_is_gymnasium_s_too_and_costs_above_the_threshold(robot):
+    """Places are float32: what they are rounded by, divided by the time of a step, is in the velocity.
+    Humanoid's gait is too slow for a cost."""
+    env, steps = made(robot).env, gait(robot)
+    errors = compare(robot, "c", steps)
+    rounding = np.finfo(np.float32).eps * max(1, abs(steps.after).max())
+    assert errors["qpos"].max() < 2 * rounding
+    assert errors["obs"].max() < (2 * rounding if robot != "humanoid" else 1e-4)
+    weight, dt = env.config.forward_reward_weight, theirs(robot).dt
+    assert errors["velocity"].max() < 1e-5 + rounding / dt
+    assert errors["reward"].max() < 1e-5 + weight * rounding / dt
+    speed = np.linalg.norm(steps.velocity, axis=1) if robot in FLYING else steps.velocity[:, 0]
+    fast = speed > env.robot.thresholds["v1"]
+    assert fast.any() == (robot != "humanoid") and not fast.all()
 
 
 def test_the_velocity_of_the_last_stage_is_near_that_of_the_end():
@@ -227,12 +270,12 @@ def within(errors: dict[str, np.ndarray]) -> None:
 @pytest.mark.parametrize("engine", ["jax", "warp"])
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_a_step_of_the_other_engines_is_gymnasium_s_in_float32(robot, engine):
-    within(compare(robot, engine, 150))
+    within(compare(robot, engine, recorded(robot, 150)))
 
 
 @pytest.mark.parametrize("engine", ["jax", "warp"])
 def test_a_step_of_hopper_on_the_other_engines_is_gymnasium_s_in_float32(engine):
-    within(compare("hopper", engine, 40))
+    within(compare("hopper", engine, recorded("hopper", 40)))
 
 
 # ---- cost, reward, termination ------------------------------------------------------------------
