@@ -6,6 +6,7 @@ episodes of 200 steps. Kept are 60 states, the solver's warm start and the actio
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -33,7 +34,8 @@ def recorded(run: Run) -> dict[str, np.ndarray]:
 
 def main() -> None:
     *runs, out = map(Path, sys.argv[1:])
-    np.savez_compressed(out, **{k: x for run in runs for k, x in recorded(Run(run)).items()})
+    found: dict[str, Any] = {k: x for run in runs for k, x in recorded(Run(run)).items()}
+    np.savez_compressed(out, **found)
 
 
 if __name__ == "__main__":

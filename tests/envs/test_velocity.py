@@ -166,9 +166,9 @@ def recorded(robot: str, count: int) -> Step:
     steps: list[Step] = []
     env.reset(seed=0)
     while len(steps) < count:
-        at = (x.astype(np.float32) for x in (data.qpos, data.qvel, data.qacc_warmstart))
-        action = rng.uniform(-1.2, 1.2, env.model.nu).astype(np.float32)
-        steps.append(taken(env, robot, Start(*at, action)))
+        action = rng.uniform(-1.2, 1.2, env.model.nu)
+        now = (data.qpos, data.qvel, data.qacc_warmstart, action)
+        steps.append(taken(env, robot, Start(*(x.astype(np.float32) for x in now))))
         if steps[-1].terminated or len(steps) % 50 == 0:
             env.reset(seed=len(steps))
     return stacked(steps)
