@@ -299,7 +299,7 @@ def throughput(path: Path) -> None:
         found: dict[str, dict[int, float]] = {}
         for row in benchmark_rows(file):
             whole = "peer" in row or ("cpu" in file and row["engine"] == "c") or whole_sweep(row)
-            if row["algo"] is None and whole:
+            if row["algo"] is None and whole and not row.get("vision"):
                 what = f"{row['peer']}: {row['env']}" if "peer" in row else row["env"]
                 points = found.setdefault(what, {})
                 points[row["num_envs"]] = row["env_steps_per_s"]  # the last, if measured again
