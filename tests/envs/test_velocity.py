@@ -176,10 +176,10 @@ def recorded(robot: str, count: int) -> Step:
 
 @functools.cache
 def gait(robot: str) -> Step:
-    """Steps of a trained policy, see tests/data."""
+    """Steps of a trained policy, see tests/data/README.md."""
     env = theirs(robot)
     env.reset(seed=0)
-    with np.load(DATA / "gaits.npz") as file:
+    with np.load(DATA / "velocity" / "gaits.npz") as file:
         starts = zip(*(file[f"{robot}.{name}"] for name in Start._fields), strict=True)
         return stacked([taken(env, robot, Start(*start)) for start in starts])
 

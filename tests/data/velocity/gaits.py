@@ -1,4 +1,4 @@
-"""Record states of trained gaits: python tests/data/gaits.py RUN... OUT.npz
+"""Record states of trained gaits: python tests/data/velocity/gaits.py RUN... OUT.npz
 
 Each RUN is one of a velocity task. Its policy drives the robot of Gymnasium, by mean actions, through
 episodes of 200 steps. Kept are 60 states, the solver's warm start and the action there, evenly spread.
