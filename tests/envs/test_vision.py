@@ -109,8 +109,8 @@ def test_pictures_are_those_of_opengl(display, monkeypatch, name):
     if name.startswith("doggo"):  # a film marks the button to press
         monkeypatch.setattr("jaxsafe.envs.view.stage.Stage.mark", lambda *args: None)
     renderer = Renderer(env, *SIZE, env.config.vision_camera)
-    states = jax.device_get(compiled(jax.vmap(env.reset))(jax.random.split(jax.random.key(1), 4)))
-    for i in range(4):
+    states = jax.device_get(compiled(jax.vmap(env.reset))(jax.random.split(jax.random.key(1), 20)))
+    for i in range(20):
         ours = states.obs["vision"][i].astype(int)
         theirs = renderer.frame(jax.tree.map(lambda x, i=i: x[i], states)).astype(int)
         assert ours.shape == theirs.shape == (40, 60, 3)
