@@ -108,8 +108,25 @@ def best() -> str:
         met += [f"`{env}`"] if made.ret >= known.ret else []
         cells = [f"{x.ret:.1f}, {x.cost:.0f} `{x.algo}`" for x in (known, made)]
         lines.append(f"| `{env}` | {' | '.join(cells)} | [{made.study}]({made.study}/README.md) |")
-    summary = f"Ours earns at least as much on {len(met)} of {len(TASKS)} tasks: {', '.join(met)}."
+    summary = f"Ours earn at least as much on {len(met)} of {len(TASKS)} tasks: {', '.join(met)}."
     return "\n".join([summary, "", *lines])
+
+
+def mean_actions(training: Sequence[Group], final: Sequence[Group]) -> str:
+    """By how much mean actions earn and cost more than the sampled ones of training, by task: means
+    over algorithms with a limit."""
+    before = {(g.env, g.name): g for g in training}
+    lines = ["| | algorithms | return | cost |", "|---|---:|---:|---:|"]
+    found: dict[str, list[tuple[float, float]]] = {}
+    for g in final:
+        if g.name not in (*FREE, *EARLY):
+            sampled = before[g.env, g.name]
+            change = g.ret.mean - sampled.ret.mean, g.cost.mean - sampled.cost.mean
+            found.setdefault(g.env, []).append(change)
+    means = {env: np.mean(changes, axis=0) for env, changes in found.items()}
+    for env, (ret, cost) in sorted(means.items(), key=lambda item: -item[1][1]):
+        lines.append(f"| `{env}` | {len(found[env])} | {ret:+.1f} | {cost:+.1f} |")
+    return "\n".join(lines)
 
 
 def apart(groups: Sequence[Group], known: Mapping[tuple[str, str], Published]) -> str:
@@ -419,6 +436,7 @@ def pages() -> dict[Path, str]:
             "outside": outside(groups, final),
             "held": held(groups, final),
         },
+        RESULTS / "causes" / "README.md": {"mean actions": mean_actions(groups, final)},
         RESULTS / "omnisafe" / "README.md": {
             "conventions": conventions(groups, group(theirs, ["algo.name"]))
         },

@@ -19,14 +19,14 @@ STEPS, EPISODE, KEPT = 600, 200, 60
 
 def recorded(run: Run) -> dict[str, np.ndarray]:
     robot = run.config["env"]["name"].removesuffix("_velocity")
-    env = gymnasium.make(f"{NAMES[robot]}-v4").unwrapped
-    data, rows, ended = env.data, [], True  # type: ignore[attr-defined]
+    env: Any = gymnasium.make(f"{NAMES[robot]}-v4").unwrapped
+    data, rows, ended = env.data, [], True
     for step in range(STEPS):
         if ended or step % EPISODE == 0:
             obs, _ = env.reset(seed=step)
         action = np.clip(run.policy(obs.astype(np.float32)), -1, 1)
         rows.append([np.float32(x) for x in (data.qpos, data.qvel, data.qacc_warmstart, action)])
-        obs, _, ended, _, _ = env.step(action * env.action_space.high)  # type: ignore[attr-defined]
+        obs, _, ended, _, _ = env.step(action * env.action_space.high)
     kept = zip(*rows[:: STEPS // KEPT], strict=True)
     names = ("qpos", "qvel", "warmstart", "action")
     return {f"{robot}.{name}": np.stack(x) for name, x in zip(names, kept, strict=True)}
