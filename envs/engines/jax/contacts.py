@@ -16,9 +16,9 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from mujoco.mjx import GeomType
 from mujoco.mjx._src import collision_driver, collision_primitive, math
 from mujoco.mjx._src.collision_types import GeomInfo
-from mujoco.mjx._src.types import GeomType
 
 from jaxsafe.envs.engines.jax import boxes, rods
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from mujoco import mjx
-from mujoco.mjx._src import forward, scan, sensor, smooth
+from mujoco.mjx._src import forward, scan
 
 from jaxsafe.config import ConfigError
 from jaxsafe.envs.engines.jax import contacts  # noqa: F401  (registers our collisions with MJX)
@@ -21,17 +21,17 @@ IN_IMPL = ("cinert", "cfrc_ext")  # fields of an engine's own part of MJX's data
 
 def forward_pass(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """`data` with what follows from its positions and velocities, to the accelerations."""
-    data = forward.fwd_velocity(model, forward.fwd_position(model, data))
-    data = forward.fwd_acceleration(model, forward.fwd_actuation(model, data))
+    data = mjx.fwd_velocity(model, mjx.fwd_position(model, data))
+    data = mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))
     return solve(model, data)
 
 
 def euler(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    return forward.euler(model, forward_pass(model, data))
+    return mjx.euler(model, forward_pass(model, data))
 
 
 def implicitfast(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    return forward.implicit(model, forward_pass(model, data))
+    return mjx.implicit(model, forward_pass(model, data))
 
 
 def runge_kutta(model: mjx.Model, data: mjx.Data) -> mjx.Data:
@@ -108,8 +108,8 @@ def runner(
 
     def readings(data: mjx.Data) -> Readings:
         if "cfrc_ext" in simulation.fields:
-            data = smooth.rne_postconstraint(model, data)
-        for sense in (sensor.sensor_pos, sensor.sensor_vel, sensor.sensor_acc):
+            data = mjx.rne_postconstraint(model, data)
+        for sense in (mjx.sensor_pos, mjx.sensor_vel, mjx.sensor_acc):
             data = sense(model, data)
         contact = data._impl.contact  # type: ignore[union-attr]
         first, second = contact.geom[:, 0], contact.geom[:, 1]

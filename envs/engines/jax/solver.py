@@ -25,7 +25,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from mujoco import mjx
-from mujoco.mjx._src import support
 
 from jaxsafe.envs.engines.batching import batched
 
@@ -78,7 +77,7 @@ class Point(NamedTuple):
 def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """`data` with its accelerations, the rows' forces, and what these do to the degrees of freedom."""
     impl: Any = data._impl
-    M = support.full_m(model, data) if support.is_sparse(model) else impl.M
+    M = mjx.full_m(model, data) if mjx.is_sparse(model) else impl.M
     problem = Problem(impl.efc_J, impl.efc_D, impl.efc_aref, M, data.qfrc_smooth, data.qacc_warmstart)
     end = batched(partial(minimise, rows(model, data)))(problem)
     return data.replace(

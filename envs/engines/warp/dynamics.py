@@ -29,26 +29,25 @@ import mujoco
 import numpy as np
 import warp as wp
 from mujoco.mjx.third_party import mujoco_warp
-from mujoco.mjx.third_party.mujoco_warp._src import collision_driver, sensor, smooth, types
 
 from jaxsafe.envs.engines.warp import pillars, solver
 from jaxsafe.envs.engines.warp.solver import THREADS, threads
 
-EULER, RK4 = types.IntegratorType.EULER, types.IntegratorType.RK4
+EULER, RK4 = mujoco_warp.IntegratorType.EULER, mujoco_warp.IntegratorType.RK4
 SHARED_MEMORY = 47 * 1024  # bytes of a block; Warp takes one more KiB
-vec10 = types.vec10
+vec10 = wp.types.vector(length=10, dtype=float)
 HERE = Path(__file__)
 DYNAMICS, LANES, ADVANCE = (
     HERE.with_name(f"{name}.cu").read_text() for name in ("dynamics", "lanes", "advance")
 )
-KINDS = ", ".join(f"{kind.name} = {int(kind)}" for kind in types.JointType)
-FULL = ", ".join(f"NO_{kind.name} = {int(kind)}" for kind in types.OverflowType)
+KINDS = ", ".join(f"{kind.name} = {int(kind)}" for kind in mujoco_warp.JointType)
+FULL = ", ".join(f"NO_{kind.name} = {int(kind)}" for kind in mujoco_warp.OverflowType)
 ENUMS = (
     f"constexpr int {KINDS}, {FULL}, "
-    f"ON_SITE = {int(types.TrnType.SITE)}, AFFINE = {int(types.BiasType.AFFINE)};\n"
+    f"ON_SITE = {int(mujoco_warp.TrnType.SITE)}, AFFINE = {int(mujoco_warp.BiasType.AFFINE)};\n"
 )
 READABLE = [  # sensors that need nothing which is not written
-    getattr(types.SensorType, name)
+    int(getattr(mujoco.mjtSensor, f"mjSENS_{name}"))
     for name in (
         "TOUCH", "ACCELEROMETER", "VELOCIMETER", "GYRO", "FORCE", "TORQUE", "MAGNETOMETER",
         "RANGEFINDER", "JOINTPOS", "JOINTVEL", "BALLQUAT", "BALLANGVEL", "JOINTLIMITPOS",
@@ -221,7 +220,7 @@ def tree(model: mujoco.MjModel) -> dict[str, np.ndarray]:
     for b in reversed(bodies):
         end[parent[b]] = max(end[parent[b]], end[b])
     first = model.jnt_dofadr[model.dof_jntid]
-    of_free = model.jnt_type[model.dof_jntid] == types.JointType.FREE
+    of_free = model.jnt_type[model.dof_jntid] == mujoco_warp.JointType.FREE
     straight = of_free & (np.arange(model.nv) < first + 3)
     before = np.where(of_free, first + 2, model.dof_parentid[first])
     root = model.body_rootid[model.geom_bodyid]
@@ -243,14 +242,16 @@ def sizes_of(model: mujoco.MjModel) -> tuple[int, int, int, int]:
 def uncovered(model: mujoco.MjModel, m: Any, d: Any) -> list[str]:
     """What the kernels are not for, in a few words each: they are for the integrators Euler and RK4,
     motors on joints and sites, linear springs and dampers, and what the solver is for."""
-    turns = np.isin(model.jnt_type, (types.JointType.FREE, types.JointType.BALL))
+    joint, trn = mujoco_warp.JointType, mujoco_warp.TrnType
+    bias_type, gain_type = mujoco_warp.BiasType, mujoco_warp.GainType
+    turns = np.isin(model.jnt_type, (joint.FREE, joint.BALL))
     at = model.actuator_trnid[:, 0]
-    on_joint = model.actuator_trntype <= types.TrnType.JOINTINPARENT  # the same for hinges and slides
-    on_site = (model.actuator_trntype == types.TrnType.SITE) & (model.actuator_trnid[:, 1] < 0)
+    on_joint = model.actuator_trntype <= trn.JOINTINPARENT  # the same for hinges and slides
+    on_site = (model.actuator_trntype == trn.SITE) & (model.actuator_trnid[:, 1] < 0)
     bias = model.actuator_biastype
-    motors = on_joint & ~turns[np.where(on_joint, at, 0)] & (bias <= types.BiasType.AFFINE)
-    thrusters = on_site & (bias == types.BiasType.NONE)
-    linear = (motors | thrusters).all() and (model.actuator_gaintype == types.GainType.FIXED).all()
+    motors = on_joint & ~turns[np.where(on_joint, at, 0)] & (bias <= bias_type.AFFINE)
+    thrusters = on_site & (bias == bias_type.NONE)
+    linear = (motors | thrusters).all() and (model.actuator_gaintype == gain_type.FIXED).all()
     shared = 4 * shared_size(*sizes_of(model)) * (THREADS // lanes_of(sizes_of(model)))
     batched = [getattr(m, name) for name in System.vars if hasattr(m, name)]
     batched = [x for x in batched if x.ndim == 2]
@@ -258,7 +259,7 @@ def uncovered(model: mujoco.MjModel, m: Any, d: Any) -> list[str]:
     stiff = m.jnt_stiffness.numpy()[0, turns].any()
     found = {
         "an integrator other than Euler and RK4": m.opt.integrator not in (EULER, RK4),
-        "disabled features": m.opt.disableflags & ~int(types.DisableBit.SENSOR),
+        "disabled features": m.opt.disableflags & ~int(mujoco_warp.DisableBit.SENSOR),
         "enabled features": m.opt.enableflags,
         "no collisions": not m.opt.run_collision_detection,
         "sensors of forces between bodies": m.opt.run_rne_postconstraint,
@@ -332,7 +333,7 @@ def lanes_of(sizes: tuple[int, ...]) -> int:
 def forward(m: Any, d: Any) -> None:
     """In place of MuJoCo Warp's, for data that was adopted."""
     plan = getattr(d, "dynamics", None)
-    sensors = not m.opt.disableflags & types.DisableBit.SENSOR
+    sensors = not m.opt.disableflags & mujoco_warp.DisableBit.SENSOR
     if plan is None or (sensors and not plan.readable):
         mujoco_warp.forward(m, d)
         return
@@ -344,19 +345,19 @@ def forward(m: Any, d: Any) -> None:
         inputs=[plan.system, sensors],
         block_dim=threads(d),
     )
-    collision_driver.collision(m, d)
+    mujoco_warp.collision(m, d)
     if plan.pillars:
         plan.pillars.contacts(d.nworld)
     solver.make_constraint(m, d)
     if sensors:
         d.sensordata.zero_()
-        sensor.sensor_pos(m, d)
-        sensor.sensor_vel(m, d)
+        mujoco_warp.sensor_pos(m, d)
+        mujoco_warp.sensor_vel(m, d)
     solver.solve(m, d)
     if sensors:
         if m.sensor_rne_postconstraint:
-            smooth.rne_postconstraint(m, d)
-        sensor.sensor_acc(m, d, skip_rne_postconstraint=True)
+            mujoco_warp.rne_postconstraint(m, d)
+        mujoco_warp.sensor_acc(m, d, skip_rne_postconstraint=True)
 
 
 def step(m: Any, d: Any) -> None:

@@ -11,6 +11,7 @@ A pillar is an upright cylinder of a mocap body, with ends out of the boxes' rea
 # Kernels are Warp's language in Python's syntax, which no type checker of Python knows:
 # pyright: reportIndexIssue=false, reportAssignmentType=false, reportGeneralTypeIssues=false
 # pyright: reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false
+# pyright: reportInvalidTypeForm=false
 
 import dataclasses
 from collections.abc import Sequence
@@ -19,13 +20,14 @@ from typing import Any
 import mujoco
 import numpy as np
 import warp as wp
-from mujoco.mjx.third_party.mujoco_warp._src import types
+from mujoco.mjx.third_party import mujoco_warp
 from mujoco.mjx.third_party.mujoco_warp._src.collision_core import (
     contact_material_params,
     write_contact,
 )
 from mujoco.mjx.third_party.mujoco_warp._src.math import make_frame
 
+vec5 = wp.types.vector(length=5, dtype=float)
 FLAT = wp.constant(0.02)  # rad that a side may lean and still lie flat
 TINY = wp.constant(1e-6)  # m, an edge whose shadow is a point
 
@@ -126,15 +128,15 @@ class Geoms:
     geom_priority: wp.array[int]
     geom_solmix: wp.array2d[float]
     geom_solref: wp.array2d[wp.vec2]
-    geom_solimp: wp.array2d[types.vec5]
+    geom_solimp: wp.array2d[vec5]
     geom_friction: wp.array2d[wp.vec3]
     geom_adhesion: wp.array2d[float]
     pair_dim: wp.array[int]
     pair_solref: wp.array2d[wp.vec2]
     pair_solreffriction: wp.array2d[wp.vec2]
-    pair_solimp: wp.array2d[types.vec5]
+    pair_solimp: wp.array2d[vec5]
     pair_adhesion: wp.array2d[float]
-    pair_friction: wp.array2d[types.vec5]
+    pair_friction: wp.array2d[vec5]
     geom_xpos: wp.array2d[wp.vec3]
     geom_xmat: wp.array2d[wp.mat33]
 
@@ -147,10 +149,10 @@ class Contacts:
     pos: wp.array[wp.vec3]
     frame: wp.array[wp.mat33]
     includemargin: wp.array[float]
-    friction: wp.array[types.vec5]
+    friction: wp.array[vec5]
     solref: wp.array[wp.vec2]
     solreffriction: wp.array[wp.vec2]
-    solimp: wp.array[types.vec5]
+    solimp: wp.array[vec5]
     dim: wp.array[int]
     geom: wp.array[wp.vec2i]
     efc_address: wp.array2d[int]
@@ -219,7 +221,7 @@ def adopt(model: mujoco.MjModel, m: Any, d: Any, upright: Sequence[str]) -> Pill
         model: what `m` and `d` were made of.
         upright: the names of the pillars' bodies.
     """
-    cylinder, box = (int(t) for t in (types.GeomType.CYLINDER, types.GeomType.BOX))
+    cylinder, box = (int(t) for t in (mujoco_warp.GeomType.CYLINDER, mujoco_warp.GeomType.BOX))
     stands = (np.abs(model.geom_quat[:, 1:3]) < 1e-6).all(1)
     named = np.isin(model.geom_bodyid, [model.body(name).id for name in upright])
     fixed = model.body_mocapid[model.geom_bodyid] >= 0
@@ -229,7 +231,7 @@ def adopt(model: mujoco.MjModel, m: Any, d: Any, upright: Sequence[str]) -> Pill
     first, second = given.T
     either = pillar[first] & plain[second] | plain[first] & pillar[second]
     ours = either & (ids == -1).all(1)  # neither a pair with settings of its own nor a sensor's
-    if m.opt.broadphase != types.BroadphaseType.NXN or not ours.any():
+    if m.opt.broadphase != mujoco_warp.BroadphaseType.NXN or not ours.any():
         return None
     device = d.qacc.device
     m.nxn_geom_pair_filtered = wp.array(given[~ours], dtype=wp.vec2i, device=device)

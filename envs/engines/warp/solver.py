@@ -34,14 +34,15 @@ from typing import Any
 
 import mujoco
 import warp as wp
-from mujoco.mjx.third_party.mujoco_warp._src import constraint, solver, types
+from mujoco.mjx.third_party import mujoco_warp
+from mujoco.mjx.third_party.mujoco_warp._src import constraint, types
 
 THREADS = 32  # of a block: a warp
 REGISTERS = 128  # of a thread, for 16 blocks a multiprocessor
 MOST = 32  # degrees of freedom: beyond them MuJoCo Warp's J is sparse
 
-theirs = solver.solve
-their_constraints = constraint.make_constraint
+theirs = mujoco_warp.solve
+their_constraints = mujoco_warp.make_constraint
 vec5 = wp.types.vector(length=5, dtype=float)
 SOURCE = "".join(Path(__file__).with_name(name).read_text() for name in ("lanes.cu", "newton.cu"))
 
@@ -187,7 +188,7 @@ class Workspace:
 
 def uncovered(m: Any, d: Any) -> list[str]:
     """What the kernel is not for in a model with the options that `m` has now, in a few words each."""
-    opt, off = m.opt, types.DisableBit
+    opt, off = m.opt, mujoco_warp.DisableBit
     batched = (opt.tolerance, opt.ls_tolerance, opt.timestep, opt.impratio_invsqrt)
     found = {
         f"{m.nv} degrees of freedom": not 0 < m.nv <= MOST or m.is_sparse,
@@ -195,12 +196,12 @@ def uncovered(m: Any, d: Any) -> list[str]:
         "flexible bodies": m.nflex > 0,
         "adhesion": m.flg_adhesion or m.actuator_trntype_body_adr.size > 0,
         "surfaces that move": m.flg_surfacevel,
-        "a solver other than Newton's": opt.solver != types.SolverType.NEWTON,
-        "elliptic friction cones": opt.cone != types.ConeType.PYRAMIDAL,
-        "a discrete integrator": opt.integrator == types.IntegratorType.DISCRETE,
+        "a solver other than Newton's": opt.solver != mujoco_warp.SolverType.NEWTON,
+        "elliptic friction cones": opt.cone != mujoco_warp.ConeType.PYRAMIDAL,
+        "a discrete integrator": opt.integrator == mujoco_warp.IntegratorType.DISCRETE,
         "noslip iterations": opt.noslip_iterations != 0,
         "no warmstart": opt.disableflags & off.WARMSTART,
-        "sleeping bodies": opt.enableflags & types.EnableBit.SLEEP,
+        "sleeping bodies": opt.enableflags & mujoco_warp.EnableBit.SLEEP,
         "options that differ between worlds": any(x.shape[0] != 1 for x in batched),
     }
     return [name for name, is_so in found.items() if is_so]
@@ -222,7 +223,7 @@ def adopt(model: mujoco.MjModel, m: Any, d: Any) -> bool:
     dim = min([*model.geom_condim, *model.pair_dim], default=1)
     fewest = max(1, 2 * (dim - 1))  # rows of a contact
     room = -(-d.njmax // fewest // 32) * 32  # few kernels for many scenes
-    off = types.DisableBit
+    off = mujoco_warp.DisableBit
     some = {
         off.EQUALITY: model.neq,
         off.FRICTIONLOSS: m.dof_frictionloss.numpy().any() or model.ntendon,
@@ -248,7 +249,7 @@ def make_constraint(m: Any, d: Any) -> None:
     opt = dataclasses.replace(m.opt, disableflags=m.opt.disableflags | work.never)
     their_constraints(dataclasses.replace(m, opt=opt), d)
     work.count.zero_()
-    if m.opt.disableflags & (types.DisableBit.CONTACT | types.DisableBit.CONSTRAINT):
+    if m.opt.disableflags & (mujoco_warp.DisableBit.CONTACT | mujoco_warp.DisableBit.CONSTRAINT):
         return
     contact = d.contact
     wp.launch(
@@ -286,7 +287,7 @@ def solve(m: Any, d: Any) -> None:
     p = Problem()
     p.iterations, p.ls_iterations = m.opt.iterations, m.opt.ls_iterations
     p.tolerance, p.ls_tolerance = m.opt.tolerance, m.opt.ls_tolerance
-    p.full = int(types.OverflowType.ITERATIONS)
+    p.full = int(mujoco_warp.OverflowType.ITERATIONS)
     p.begin, p.column, p.place = m.M_mulm_rowadr, m.M_mulm_col, m.M_mulm_madr
     for name in ("body_rootid", "body_isdofancestor", "dof_bodyid", "geom_bodyid"):
         setattr(p, name, getattr(m, name))
