@@ -377,14 +377,21 @@ def collect(
     return collecting.write(out, [*map(Ingredient, opened, shares)], count, seed, sampled)
 
 
-def evaluate(run: Run | str | Path, episodes: int = 100, seed: int = 1, setting: int = 0) -> Scores:
-    """Fresh whole episodes of a run's deterministic policies, scripts/evaluate.py as a function.
+def evaluate(
+    run: Run | str | Path,
+    episodes: int = 100,
+    seed: int = 1,
+    setting: int = 0,
+    sampled: bool = False,
+) -> Scores:
+    """Fresh whole episodes of a run's policies, scripts/evaluate.py as a function.
 
     Args:
         run: a run, or its folder.
         episodes: of each seed.
         seed: of the episodes; every policy meets the same.
         setting: which one, of a run that trained several side by side.
+        sampled: whether actions are sampled, as in training, or the mean ones.
 
     Returns:
         Printed, a table. `scores.rows` has an estimate (mean, low, high: the 95 % interval
@@ -405,7 +412,7 @@ def evaluate(run: Run | str | Path, episodes: int = 100, seed: int = 1, setting:
     setting = convert(setting, Index, "setting")
     if not setting < (count := len(run.settings.configs)):
         raise ConfigError(f"setting {setting}: the run has {count}, from 0")
-    return evaluation.evaluate(run._opened, episodes, seed)[setting]
+    return evaluation.evaluate(run._opened, episodes, seed, sampled=sampled)[setting]
 
 
 def render(

@@ -38,6 +38,9 @@ def command() -> int:
         default=100,
         help="episodes for each seed of the run (default 100)",
     )
+    parser.add_argument(
+        "--sampled", action="store_true", help="sample actions instead of taking their mean"
+    )
     args = parser.parse_args()
     use_compilation_cache()
     run = open_run(args.run.expanduser(), args.code)
@@ -46,12 +49,13 @@ def command() -> int:
     limit = f" | cost limit {limits_in_words(limits_of(settings.algo))}" if alone else ""
     print(
         f"{settings.env_name} | {settings.algo_name} | "
-        f"{settings.train.num_seeds} x {args.episodes} episodes, deterministic policy{limit}",
+        f"{settings.train.num_seeds} x {args.episodes} episodes, "
+        f"{'sampled' if args.sampled else 'mean'} actions{limit}",
         flush=True,
     )
     with Interrupts(functools.partial(print, flush=True)) as stop:
         stop.nothing_to_save = "stopped"
-        scores = evaluate(run, args.episodes, args.seed)
+        scores = evaluate(run, args.episodes, args.seed, sampled=args.sampled)
     for s in scores:
         if not alone:
             print(f"\n{s.name} | cost limit {limits_in_words(s.limits)}")

@@ -30,15 +30,17 @@ class Scores(NamedTuple):
         return table(self.rows)
 
 
-def evaluate(run: RunPolicies, num: int, seed: int, data: PyTree = ()) -> list[Scores]:
-    """`num` fresh episodes of each seed in each setting.
+def evaluate(
+    run: RunPolicies, num: int, seed: int, data: PyTree = (), sampled: bool = False
+) -> list[Scores]:
+    """`num` fresh episodes of each seed in each setting, with mean actions or `sampled` ones.
 
     Of a run on a data set there are DSRL's scores too and, with `data`, the data's own episodes.
     """
     settings = run.settings
     keys = keys_of_episodes(seed, num, settings.train.num_seeds, len(settings.configs))
     memory.check_episodes(run.env, num, len(keys))
-    episodes = make_evaluation(run.algo, keys)(run.learned)
+    episodes = make_evaluation(run.algo, keys, sampled)(run.learned)
     examined = settings.row.examine(run.algo, run.learned, keys)
     tables = list(run_folder.by_setting(run_folder.read_metrics(run.folder)).values())
     cost_names = run.algo.task(jax.tree.map(lambda x: x[0], run.learned)).cost_names

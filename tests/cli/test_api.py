@@ -26,6 +26,7 @@ from jaxsafe.learn.treatments import penalty
 from jaxsafe.report.evaluation import evaluate
 from jaxsafe.run import checkpoint, programs, progress, run_folder
 from jaxsafe.run.arguments import compose
+from jaxsafe.run.evaluate import run_episodes
 from jaxsafe.run.plain import to_plain
 from jaxsafe.run.settings import Settings, nested, settings_from_options
 from jaxsafe.run.sweep_plan import Sweep, plan
@@ -247,6 +248,13 @@ def test_evaluation_is_that_of_the_script(run):
     for bad in ({"episodes": 0}, {"seed": -1}, {"setting": 1}):
         with pytest.raises(jaxsafe.ConfigError, match=r"expected|has 1"):
             jaxsafe.evaluate(run, **bad)
+
+
+def test_sampled_actions_are_evaluated_in_the_same_episodes(run):
+    mean, sampled = (jaxsafe.evaluate(run, episodes=3, sampled=x) for x in (False, True))
+    played = run_episodes(run._opened.algo, run._opened.learned, 3, seed=1, sampled=True)
+    np.testing.assert_allclose(sampled.seeds["return"], played.ret.mean(1), rtol=1e-6)
+    assert sampled.seeds["return"] != mean.seeds["return"]
 
 
 def test_what_cannot_be_filmed_is_refused(run):
