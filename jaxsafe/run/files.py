@@ -9,6 +9,8 @@ This guards against what lies in a folder, not against a process that changes it
 
 import contextlib
 import csv
+import errno
+import fcntl
 import io
 import json
 import lzma
@@ -81,6 +83,28 @@ def make_folder(folder: Path, *names: str) -> Path:
     path = inside(folder, *names)
     path.mkdir(parents=True, exist_ok=True)
     return path
+
+
+@contextlib.contextmanager
+def held(folder: Path) -> Iterator[None]:
+    """The folder for one process alone. The system lets go of it if the process dies.
+
+    Nothing is held where the file system cannot lock a folder, as on some networks.
+
+    Raises:
+        ConfigError: another process holds it.
+    """
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        if error.errno == errno.EWOULDBLOCK:
+            os.close(descriptor)
+            raise ConfigError(f"another process is training in {folder}") from error
+    try:
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def below(folder: Path, most: int = 100_000) -> list[str]:

@@ -1,5 +1,6 @@
 """A run from its settings to its folder: where it trains, that it fits, and the training itself."""
 
+import contextlib
 import datetime
 import json
 import math
@@ -173,8 +174,28 @@ def run(session: Session, report: Reporter, finish: Finish) -> int:
     """Train, then `finish`. Returns the exit status: 0, or 130 if the user stopped it.
 
     Raises:
+        ConfigError: another process is training in the folder.
         divergence.Diverged: the run learns no more.
     """
+    with held(session.folder) if distributed.leads() else contextlib.nullcontext():
+        return run_alone(session, report, finish)
+
+
+def held(folder: Path) -> contextlib.AbstractContextManager[None]:
+    """`files.held` of a run folder, which is made if it is not there.
+
+    Raises:
+        checkpoint.NotSaved: the disk failed.
+        ConfigError: as there.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise checkpoint.NotSaved(f"cannot write to {folder}: {error.strerror}") from error
+    return files.held(folder)
+
+
+def run_alone(session: Session, report: Reporter, finish: Finish) -> int:
     settings, program, train = session.settings, session.program, session.settings.train
     hooks = hooks_of(session, report)
     if distributed.leads():
@@ -237,7 +258,6 @@ def write_head(session: Session) -> None:
     """
     folder, train = session.folder, session.settings.train
     try:
-        folder.mkdir(parents=True, exist_ok=True)
         run_folder.write_config(folder, session.settings.plain())
         data = None if train.dataset is None else dataset.sha256(train.dataset)
         run_folder.append_versions(folder, device_name(), engine_of(session.env), data)

@@ -37,6 +37,7 @@ from jaxsafe.learn.conventions import conventions
 from jaxsafe.run import (
     arguments,
     checkpoint,
+    files,
     help,
     hydra_jobs,
     loop,
@@ -291,6 +292,17 @@ def test_a_folder_with_a_run_is_not_overwritten_nor_resumed_with_other_settings(
     other = settings.settings_from_config(run_folder.read_config(run) | {"resume": str(run), "seed": 5})
     with pytest.raises(ConfigError, match=r"seed=5 but .* was trained with 0"):
         session.choose_folder(other, None, print)
+
+
+def test_a_run_has_one_process_at_a_time(finished, tmp_path, capsys):
+    run = shutil.copytree(finished, tmp_path / "run")
+    before = (run / "versions.json").read_bytes()
+    resume = ("train", f"resume={run}", TOY, f"total_steps={41 * STEPS}")
+    with files.held(run):  # as a second process would; it lets go when that ends, however it ends
+        assert typed(*resume) == 2
+    assert f"another process is training in {run}" in capsys.readouterr().err
+    assert (run / "versions.json").read_bytes() == before
+    assert typed(*resume) == 0
 
 
 def test_resume_true_finds_the_newest_unfinished_run_of_the_same_settings(tmp_path, monkeypatch):
