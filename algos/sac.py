@@ -179,15 +179,27 @@ PARALLEL: dict[str, Any] = {
 }  # fmt: skip
 SAC_PARALLEL: dict[str, Any] = PARALLEL | {"policy_delay": 2}
 
+# OmniSafe's rate of policies on navigation tasks, for batches 16 times as large
+NAVIGATION_RATE: dict[str, Any] = {"lr": 16 * 5e-6, "lr_decay": False}
+# and its temperature there: a goal is worth 1, and a step some hundredths
+COLD: dict[str, Any] = {"alpha_init": 1e-5, "alpha_lr": 0.0}
 
-def priced_parallel(parallel: dict[str, Any]) -> dict[str, dict[str, Any]]:
+
+def priced_parallel(
+    parallel: dict[str, Any], price: dict[str, Any], temperature: dict[str, Any] | None = None
+) -> dict[str, dict[str, Any]]:
     """`parallel` as presets of an algorithm with a price, for velocity tasks and for navigation.
 
     On velocity tasks a policy answers a price within some hundred gradient steps, and a price that
     waits longer swings. On navigation tasks the cost of two episodes, which are 2,000 steps, is mostly
-    chance, so there the price moves every 20,000 steps: see docs/results/price_clock.
+    chance. So there `price` is OmniSafe's, and moves every 20,000 steps: see docs/results/price_clock.
     """
-    return {"parallel": parallel | {"dual_every": 2000}, "parallel_navigation": parallel}
+    critics = "cost_reduce", "cost_floor"  # these stay ours
+    slow = {name: value for name, value in price.items() if name not in critics}
+    return {
+        "parallel": parallel | {"dual_every": 2000},
+        "parallel_navigation": parallel | slow | NAVIGATION_RATE | (temperature or {}),
+    }
 
 
 # 16 gradient steps for each step of 1,024 environments: it learns from fewer steps, and takes more time
@@ -236,6 +248,7 @@ ROWS = {
             "omnisafe_navigation": NAVIGATION,
             "parallel": SAC_PARALLEL,
             "frequent": FREQUENT,
+            "navigation": COLD,
         },
         total_steps=5_000_000,
         holds="nothing",
@@ -249,7 +262,8 @@ ROWS = {
         {
             "omnisafe": OMNISAFE | LAG,
             "omnisafe_navigation": NAVIGATION | LAG_NAVIGATION,
-            **priced_parallel(SAC_PARALLEL),
+            **priced_parallel(SAC_PARALLEL, LAG_NAVIGATION, COLD),
+            "navigation": COLD,
         },
         total_steps=5_000_000,
         omnisafe="SACLag",
@@ -262,7 +276,8 @@ ROWS = {
         {
             "omnisafe": OMNISAFE | PID,
             "omnisafe_navigation": NAVIGATION | PID_NAVIGATION,
-            **priced_parallel(SAC_PARALLEL),
+            **priced_parallel(SAC_PARALLEL, PID_NAVIGATION, COLD),
+            "navigation": COLD,
         },
         total_steps=5_000_000,
         omnisafe="SACPID",

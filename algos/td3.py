@@ -207,7 +207,7 @@ def published(base: dict[str, Any], navigation: dict[str, Any] | None = None) ->
     return {
         "omnisafe": omnisafe | base,
         "omnisafe_navigation": omnisafe | rates | (base if navigation is None else navigation),
-        **(sac.priced_parallel(sac.PARALLEL) if base else {"parallel": sac.PARALLEL}),
+        **(sac.priced_parallel(sac.PARALLEL, navigation) if navigation else {"parallel": sac.PARALLEL}),
     }
 
 

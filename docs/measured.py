@@ -113,19 +113,26 @@ def best() -> str:
 
 
 def mean_actions(training: Sequence[Group], final: Sequence[Group]) -> str:
-    """By how much mean actions earn and cost more than the sampled ones of training, by task: means
-    over algorithms with a limit."""
+    """By how much mean actions earn and cost more than the sampled ones of training, and the share of
+    episodes over the limit with each, by task: means over algorithms with a limit."""
+
+    def share(g: Group, name: str) -> float:
+        return 100 * float(np.mean([run.values[name].mean() for run in g.runs]))
+
     before = {(g.env, g.name): g for g in training}
-    lines = ["| | algorithms | return | cost |", "|---|---:|---:|---:|"]
-    found: dict[str, list[tuple[float, float]]] = {}
+    lines = ["| | algorithms | return | cost | over the limit, sampled | mean actions |"]
+    lines.append("|---|---:|---:|---:|---:|---:|")
+    found: dict[str, list[tuple[float, ...]]] = {}
     for g in final:
         if g.name not in (*FREE, *EARLY):
             sampled = before[g.env, g.name]
             change = g.ret.mean - sampled.ret.mean, g.cost.mean - sampled.cost.mean
-            found.setdefault(g.env, []).append(change)
+            shares = share(sampled, "violation rate"), share(g, "final violation rate")
+            found.setdefault(g.env, []).append((*change, *shares))
     means = {env: np.mean(changes, axis=0) for env, changes in found.items()}
-    for env, (ret, cost) in sorted(means.items(), key=lambda item: -item[1][1]):
-        lines.append(f"| `{env}` | {len(found[env])} | {ret:+.1f} | {cost:+.1f} |")
+    for env, (ret, cost, *shares) in sorted(means.items(), key=lambda item: -item[1][1]):
+        of_all = " | ".join(f"{x:.0f}%" for x in shares)
+        lines.append(f"| `{env}` | {len(found[env])} | {ret:+.1f} | {cost:+.1f} | {of_all} |")
     return "\n".join(lines)
 
 
