@@ -158,6 +158,13 @@ def work(study: Study, args: argparse.Namespace, train: Callable[[list[str], Pla
             unfinished.append(name)
             return
         folder = runs / name
+        try:
+            with files.held(folder) if folder.exists() else contextlib.nullcontext():
+                pass
+        except ConfigError as error:  # a second command on the same study
+            unfinished.append(name)
+            print(f"{name}: {error}", flush=True)
+            return
         status = train(study.command(run), Place(folder, gpu, late))
         minutes = f"{(time.monotonic() - start) / 60:.1f} minutes"
         if status in STOPPED:

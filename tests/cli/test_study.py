@@ -19,7 +19,7 @@ from jaxsafe.config import ConfigError
 from jaxsafe.report import plots, studies, study_files
 from jaxsafe.report.published import Published
 from jaxsafe.report.read import read, read_one
-from jaxsafe.run import run_folder
+from jaxsafe.run import files, run_folder
 from jaxsafe.run.arguments import compose
 from jaxsafe.run.checkpoint import Progress
 
@@ -250,6 +250,25 @@ def test_an_interrupted_study_continues_with_what_is_left(toy, tmp_path, monkeyp
     )
     for name in ("toy-trade_off.png", "toy-curves1.png"):
         assert f"(../images/{name})" in text and (toy.folder.parent / "images" / name).exists()
+
+
+def test_a_run_that_another_process_trains_is_left_to_it(toy, tmp_path, monkeypatch, capsys):
+    runs, asked = tmp_path / "runs", []
+
+    def train(options: list[str], place: command.Place) -> int:
+        asked.append(place.folder.name)
+        trained(place.folder, options)
+        return 0
+
+    busy = runs / "toy" / "point_goal1-cpo"
+    busy.mkdir(parents=True)
+    with files.held(busy):
+        assert call(monkeypatch, toy.folder, "--runs", runs, train=train) == 130
+    out = capsys.readouterr().out
+    assert f"point_goal1-cpo: another process is training in {busy}\n" in out
+    assert "left to do: point_goal1-cpo\n" in out
+    assert asked == ["point_goal1-ppo_lag-algo.dual_lr_0.2"]
+    assert [row["algo"] for row in study_files.read(toy.folder).rows] == ["ppo_lag"] * 2
 
 
 def test_a_command_ends_quietly_where_nobody_reads_its_output(toy):
