@@ -102,7 +102,7 @@ PRESETS = {  # all but `fast`, which has no settings of its own
     "frequent": "longer rollouts or more gradient steps: Walker2d, Swimmer, Humanoid",
     "parallel": "OmniSafe's replay ratio, on a GPU",
     "parallel_navigation": "the same with OmniSafe's slower policy and price of Goal",
-    "navigation": "OmniSafe's temperature of Goal, for Safety Gym's tasks",
+    "navigation": "OmniSafe's temperature of Goal",
     "true_model": "plans in the simulator, not in learned models",
     "cpu": "for two cores and half an hour",
     "proprio": "DreamerV3's settings of vectors",
