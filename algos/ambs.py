@@ -490,13 +490,13 @@ class Course(NamedTuple):
     failed: jax.Array
 
 
-def course(player: Player, key: jax.Array) -> Course:
-    """An episode of sampled actions."""
+def course(player: Player, key: jax.Array, sampled: bool) -> Course:
+    """An episode of mean or of `sampled` actions, the one that evaluation plays with this key."""
     reset_key, act_key = jax.random.split(key)
     env, cfg = player.task, player.learned.config
 
     def step(now: Playing, t: jax.Array) -> tuple[Playing, Course]:
-        sample_key = jax.random.fold_in(act_key, t)
+        sample_key = jax.random.fold_in(act_key, t) if sampled else None
         action, carry, said = player.decide(now.carry, now.state, sample_key)
         state = env.step(now.state, action)
         found = Course(
@@ -534,15 +534,15 @@ def brier_score(found: Course, horizon: int) -> jax.Array:
     return jnp.where(counts.any(), total / jnp.maximum(counts.sum(), 1), jnp.nan)
 
 
-def examine(algo: Algorithm, learned: PyTree, keys: jax.Array) -> dict[str, np.ndarray]:
-    """What the shield does in episodes of sampled actions, and what they are without it: float [S, N]
-    by name, of the episodes of `keys` [S, N], by the S policies in `learned`."""
+def examine(algo: Algorithm, learned: PyTree, keys: jax.Array, sampled: bool) -> dict[str, np.ndarray]:
+    """What the shield does, and what episodes are without it: float [S, N] by name, of the episodes of
+    `keys` [S, N], by the S policies in `learned`, with mean or with `sampled` actions."""
     delta, horizon = learned.config.delta, learned.config.shield_horizon
 
     def of_one(learned: PyTree, keys: jax.Array, delta: jax.Array) -> dict[str, jax.Array]:
         learned = dataclasses.replace(learned, config=dataclasses.replace(learned.config, delta=delta))
         player = Player(algo.policy, learned, algo.task(learned))
-        found = jax.vmap(lambda key: course(player, key))(keys)
+        found = jax.vmap(lambda key: course(player, key, sampled))(keys)
         steps = jnp.maximum(found.alive.sum(1), 1)
         return {
             "override rate": found.overruled.sum(1) / steps,

@@ -28,8 +28,9 @@ class Row(NamedTuple):
     lever: options with which it learns Lever, the small exact problem of tests/toys.py, if its
         defaults do not.
     note: note(cfg), a line to print before training: what its settings promise; '' for nothing.
-    examine: examine(algo, learned, keys), what else evaluation measures: name -> float [S, N], of the
-        episodes of `keys` [S, N], by the S policies in `learned`.
+    examine: examine(algo, learned, keys, sampled), what else evaluation measures: name -> float [S, N],
+        of the episodes of `keys` [S, N], by the S policies in `learned`, with mean or with `sampled`
+        actions.
     check: check(cfg, data) raises ConfigError for settings, or a data set, that cannot serve. `data` is
         () where there is none.
     """
@@ -44,4 +45,4 @@ class Row(NamedTuple):
     lever: Mapping[str, Any] = NOTHING
     check: Callable[[Any, Any], None] = lambda cfg, data: None
     note: Callable[[Any], str] = lambda cfg: ""
-    examine: Callable[[Algorithm, PyTree, jax.Array], dict[str, np.ndarray]] = lambda *_: {}
+    examine: Callable[[Algorithm, PyTree, jax.Array, bool], dict[str, np.ndarray]] = lambda *_: {}

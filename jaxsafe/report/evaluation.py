@@ -41,7 +41,7 @@ def evaluate(
     keys = keys_of_episodes(seed, num, settings.train.num_seeds, len(settings.configs))
     memory.check_episodes(run.env, num, len(keys))
     episodes = make_evaluation(run.algo, keys, sampled)(run.learned)
-    examined = settings.row.examine(run.algo, run.learned, keys)
+    examined = settings.row.examine(run.algo, run.learned, keys, sampled)
     tables = list(run_folder.by_setting(run_folder.read_metrics(run.folder)).values())
     cost_names = run.algo.task(jax.tree.map(lambda x: x[0], run.learned)).cost_names
     seeds, by_setting = settings.train.num_seeds, []

@@ -25,6 +25,7 @@ from jaxsafe.learn.sequences import SequenceBatch
 from jaxsafe.learn.world_model import Dreams, dream, dream_returns, world_of
 from jaxsafe.nn.gaussian import Gaussian
 from jaxsafe.nn.rssm import Latent
+from jaxsafe.run.evaluate import episode
 from jaxsafe.types import Algorithm
 
 CFG = ambs.AMBSConfig(discount=1 - 1 / 333, rule="hoeffding", shield_rollouts=512, delta=0.1)
@@ -521,6 +522,23 @@ def test_an_evaluation_takes_the_sampled_actions_that_training_takes():
 
 
 # ---- evaluation --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sampled", [False, True])
+def test_the_shield_is_examined_in_the_episodes_of_evaluation(sampled):
+    algo, learned = newborn()
+    player = Player(algo.policy, learned, algo.task(learned))
+    keys = jax.random.split(jax.random.key(3), 3)
+
+    @partial(jax.jit, compiler_options=FAST)
+    def both(keys):
+        examined = jax.vmap(lambda key: ambs.course(player, key, sampled))(keys)
+        return examined, jax.vmap(lambda key: episode(player, key, sampled=sampled))(keys)
+
+    examined, evaluated = both(keys)
+    np.testing.assert_allclose(examined.reward.sum(1), evaluated.ret, atol=1e-5)
+    np.testing.assert_array_equal(examined.alive.sum(1), evaluated.length)
+    assert len({*evaluated.ret.tolist()}) > 1
 
 
 def test_the_brier_score_by_hand():
