@@ -245,7 +245,8 @@ def test_evaluation_is_that_of_the_script(run):
     assert scores == expected
     assert len(scores.seeds["return"]) == 2
     assert str(scores).splitlines()[1].startswith("return ")
-    for bad in ({"episodes": 0}, {"seed": -1}, {"setting": 1}):
+    wrong: list[dict[str, Any]] = [{"episodes": 0}, {"seed": -1}, {"setting": 1}]
+    for bad in wrong:
         with pytest.raises(jaxsafe.ConfigError, match=r"expected|has 1"):
             jaxsafe.evaluate(run, **bad)
 
