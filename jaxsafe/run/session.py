@@ -177,8 +177,9 @@ def run(session: Session, report: Reporter, finish: Finish) -> int:
         ConfigError: another process is training in the folder.
         divergence.Diverged: the run learns no more.
     """
+    hooks = hooks_of(session, report)  # what it refuses leaves no folder
     with held(session.folder) if distributed.leads() else contextlib.nullcontext():
-        return run_alone(session, report, finish)
+        return run_alone(session, report, finish, hooks)
 
 
 def held(folder: Path) -> contextlib.AbstractContextManager[None]:
@@ -195,9 +196,8 @@ def held(folder: Path) -> contextlib.AbstractContextManager[None]:
     return files.held(folder)
 
 
-def run_alone(session: Session, report: Reporter, finish: Finish) -> int:
+def run_alone(session: Session, report: Reporter, finish: Finish, hooks: loop.Hooks) -> int:
     settings, program, train = session.settings, session.program, session.settings.train
-    hooks = hooks_of(session, report)
     if distributed.leads():
         write_head(session)
         if train.logger == "wandb":
