@@ -60,6 +60,7 @@ def select_rows(mask: jax.Array, new: PyTree, old: PyTree) -> PyTree:
 
 
 def all_finite(tree: PyTree) -> jax.Array:
+    """Whether all numbers of `tree` are, bool []."""
     # Small leaves as one array: of hundreds, XLA makes a program that grows with their square. Large
     # ones alone: to join them is a copy on a CPU. x * 0 is 0, or NaN where x is not finite.
     floats = [x.ravel() for x in jax.tree.leaves(tree) if jnp.issubdtype(x.dtype, jnp.floating)]

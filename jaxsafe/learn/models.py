@@ -20,10 +20,18 @@ import jax.numpy as jnp
 import optax
 
 from jaxsafe.config import Amount, Bounds, ConfigError, Iterations, Rate, Units, Weight, config
-from jaxsafe.learn.batch import device_count, device_key, pmean, psum, select_rows
+from jaxsafe.learn.batch import (
+    all_finite,
+    device_count,
+    device_key,
+    pmean,
+    psum,
+    select,
+    select_rows,
+)
 from jaxsafe.learn.next_step_rollout import Stepping, arrival_record
 from jaxsafe.learn.replay import Record, Span, held
-from jaxsafe.learn.steps import Trainable, descend
+from jaxsafe.learn.steps import Trainable
 from jaxsafe.nn.ensemble import (
     Ensemble,
     Scale,
@@ -73,6 +81,11 @@ class EnsembleConfig:
         """What the ensemble predicts beside the next observation."""
         return ()
 
+    @property
+    def fit_dtype(self) -> str:
+        """What hidden layers are computed in while the ensemble is fitted."""
+        return "float32"
+
 
 @config
 class ModelConfig(EnsembleConfig):
@@ -84,14 +97,18 @@ class ModelConfig(EnsembleConfig):
     # Whether the model learns the cost. If not, the environment computes it from the observation, as
     # those of Goal do with env.observation=coordinates. OmniSafe learns it in velocity tasks.
     learn_cost: bool = True
-    # What the model's hidden layers are computed in while it predicts. It is always fitted in float32.
-    # bfloat16, which has 8 bits, halves what a GPU has to move for thousands of plans. On an H100 or
-    # H200 with Warp networks and draw are one kernel then, with other random numbers.
+    # What the model's hidden layers are computed in. bfloat16, which has 8 bits, halves what a GPU has
+    # to move. On an H100 or H200 with Warp networks and draw are one kernel then, with other random
+    # numbers.
     model_dtype: Literal["float32", "bfloat16"] = "float32"
 
     @property
     def told(self) -> tuple[str, ...]:
         return ("reward", "cost") if self.learn_cost else ("reward",)
+
+    @property
+    def fit_dtype(self) -> str:
+        return self.model_dtype
 
 
 class Prediction(NamedTuple):
@@ -338,18 +355,20 @@ def fit(
     def epoch(now: Fit) -> Fit:
         epoch_key = jax.random.fold_in(key, now.epochs)
 
-        def step(i: jax.Array, moved: tuple[Trainable, jax.Array]) -> tuple[Trainable, jax.Array]:
-            nets, skipped = moved
+        def step(i: jax.Array, nets: Trainable) -> Trainable:
             drawn = jax.random.randint(
                 jax.random.fold_in(epoch_key, i), batch, 0, jnp.maximum(train.count, 1)
             )
             x, y = transitions_at(ring, train.flat[drawn], cfg)
-            grads = jax.grad(ensemble_loss)(nets.params, scale, x, y, cfg.weight_decay)
-            params, state, skip = descend(optimiser, *nets, pmean(grads, axis_name))
-            return Trainable(params, state), skipped + skip
+            grads = jax.grad(ensemble_loss)(nets.params, scale, x, y, cfg.weight_decay, cfg.fit_dtype)
+            change, state = optimiser.update(pmean(grads, axis_name), nets.opt_state)
+            return Trainable(optax.apply_updates(nets.params, change), state)
 
-        start = Trainable(now.ensemble, now.opt_state), now.skipped
-        (ensemble, opt_state), skipped = jax.lax.fori_loop(0, steps, step, start)
+        start = Trainable(now.ensemble, now.opt_state)
+        moved = jax.lax.fori_loop(0, steps, step, start)
+        # A gradient that is not finite stays in Adam's moments. To look for it once spares kernels.
+        finite = all_finite(moved)
+        ensemble, opt_state = select(finite, moved, start)
         error = errors(ensemble)
         better = error < BETTER * now.error
         return Fit(
@@ -359,7 +378,7 @@ def fit(
             error=jnp.where(better, error, now.error),
             stale=jnp.where(better.any(), 0, now.stale + 1),
             epochs=now.epochs + 1,
-            skipped=skipped,
+            skipped=now.skipped + jnp.where(finite, 0, steps),
         )
 
     none, old = jnp.int32(0), model.params.ensemble

@@ -107,7 +107,12 @@ def draw(
 
 
 def ensemble_loss(
-    ensemble: Ensemble, scale: Scale, x: jax.Array, y: jax.Array, weight_decay: jax.Array | float
+    ensemble: Ensemble,
+    scale: Scale,
+    x: jax.Array,
+    y: jax.Array,
+    weight_decay: jax.Array | float,
+    hidden_dtype: str = "float32",
 ) -> jax.Array:
     """The sum over models of
 
@@ -116,7 +121,7 @@ def ensemble_loss(
     for inputs `x` [M, B, I] and targets `y` [M, B, K]. decay_l is `weight_decay` times 1/4, 1/2, 3/4,
     and 3/4 again for each further layer but the last, whose share is 1.
     """
-    dist = outputs_of(ensemble, scale, x)
+    dist = outputs_of(ensemble, scale, x, hidden_dtype)
     errors = (dist.mean - y) ** 2 * jnp.exp(-2 * dist.log_std) + 2 * dist.log_std
     loss = errors.mean((1, 2)).sum() + PRESSURE * (ensemble.high - ensemble.low).sum()
     shares = [min(0.25 * (i + 1), 0.75) for i in range(len(ensemble.layers) - 1)] + [1.0]

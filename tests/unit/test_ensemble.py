@@ -221,3 +221,30 @@ def test_a_model_is_put_back_to_its_best():
         np.testing.assert_array_equal(a, b)
     assert metrics["train/model_error"] == before["train/model_error"]
     assert metrics["train/model_epochs"] == before["train/model_epochs"] + 3
+
+
+def test_an_epoch_with_a_gradient_that_is_not_finite_moves_nothing():
+    cfg = dataclasses.replace(Config(), models=1, max_epochs=1, epoch_steps=5)
+    x, y = draw(jax.random.key(0), (64, ENVS))
+    span = Span(jnp.int32(0), jnp.int32(64))
+    before = init_model(jax.random.key(1), LINE, cfg)
+    after, metrics = fit(before, ring_of(x, 1e30 * y), span, jax.random.key(2), cfg)
+    assert metrics["train/nonfinite"] == 5
+    start = before.params.ensemble, before.opt_state
+    end = after.params.ensemble, after.opt_state
+    for a, b in zip(jax.tree.leaves(start), jax.tree.leaves(end), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_fit_in_bfloat16_moves_float32_weights_by_nearly_the_same():
+    ensemble = init_ensemble(jax.random.key(0), 3, 2, (32, 32), 1)
+    x, y = jax.random.normal(jax.random.key(1), (2, 3, 256, 2))
+    losses = [
+        jax.value_and_grad(ensemble_loss)(ensemble, unscaled(2), x, y[..., :1], 1e-4, dtype)
+        for dtype in ("float32", "bfloat16")
+    ]
+    (exact, grads), (near, near_grads) = losses
+    assert 0 < abs(near - exact) < 0.01 * exact
+    for a, b in zip(jax.tree.leaves(grads), jax.tree.leaves(near_grads), strict=True):
+        assert b.dtype == jnp.float32
+        np.testing.assert_allclose(b, a, atol=0.02 * np.abs(a).max())
