@@ -290,19 +290,21 @@ def dreamt(env: Env, learned: Learned, latent: Latent, proposed: jax.Array, key:
     rollouts = (cfg.shield_rollouts,)
     start = jax.tree.map(lambda x: jnp.broadcast_to(x, (*rollouts, *x.shape)), latent)
 
-    def step(now: Latent, x: tuple[jax.Array, jax.Array]) -> tuple[Latent, Any]:
+    def step(now: Latent, x: tuple[jax.Array, jax.Array]) -> tuple[Latent, jax.Array]:
         h, key = x
-        act_key, model_key, hit_key, end_key = jax.random.split(key, 4)
+        act_key, model_key = jax.random.split(key)
         action = chosen(env, learned, "actor", now, act_key)
         action = jnp.where((h == 0) & cfg.verify_action, proposed, action)
         after: Any = world.apply(params["model"], now, action, model_key, method="imagine")
-        says = read(world, params["model"], after.features)
-        hit = jax.random.bernoulli(hit_key, 1 - says["safe"])
-        least = jax.random.uniform(end_key, hit.shape) if cfg.verdict == "drawn" else 0.5
-        return after, (clipped(says["cost"], cfg), says["cont"] > least, hit)
+        return after, after.features
 
-    found = jax.lax.scan(step, start, (jnp.arange(steps), jax.random.split(key, steps)))
-    last, (cost, alive, hit) = found
+    dream_key, hit_key, end_key = jax.random.split(key, 3)
+    keys = jax.random.split(dream_key, steps)
+    last, features = jax.lax.scan(step, start, (jnp.arange(steps), keys))
+    says = read(world, params["model"], features)  # of all steps at once
+    hit = jax.random.bernoulli(hit_key, 1 - says["safe"])
+    least = jax.random.uniform(end_key, hit.shape) if cfg.verdict == "drawn" else 0.5
+    cost, alive = clipped(says["cost"], cfg), says["cont"] > least
     return Dreamt(cost, alive, safety_value(params, last.features, cfg), hit)
 
 

@@ -422,8 +422,8 @@ def test_on_a_known_chain_it_overrules_where_the_bound_says(monkeypatch, verdict
     monkeypatch.setattr(ambs, "safety_value", lambda params, features, cfg: jnp.zeros(len(features)))
 
     def says(world, params, x):
-        bad = x[:, 0] == 5
-        return {"cost": 10.0 * bad, "safe": 1.0 - bad, "cont": jnp.ones(len(x))}
+        bad = x[..., 0] == 5
+        return {"cost": 10.0 * bad, "safe": 1.0 - bad, "cont": jnp.ones(bad.shape)}
 
     monkeypatch.setattr(ambs, "read", says)
     learned = Learned(cfg, {"model": ()}, (), ())
