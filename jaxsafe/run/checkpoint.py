@@ -227,16 +227,18 @@ def load(
 ) -> tuple[dict[str, np.ndarray], Manifest]:
     """The newest sound checkpoint under `folder`, as {leaf name: array}."""
     problems = []
+    warn = warn or (lambda line: print(line, file=sys.stderr))
     for path in checkpoints(folder):
         try:
             manifest = read_manifest(path)
             verify(path, manifest)
-            return read_leaves(path, manifest), manifest
+            arrays = read_leaves(path, manifest)
         except Exception as error:  # Orbax and TensorStore raise many kinds
             problems.append(f"{path} is corrupt ({reason(error)})")
-            (warn or (lambda line: print(line, file=sys.stderr)))(
-                f"warning: {problems[-1]}; trying an older one"
-            )
+            continue
+        for problem in problems:
+            warn(f"warning: {problem}; taking an older one")
+        return arrays, manifest
     raise CheckpointError("; ".join(problems) or f"no checkpoint in {folder}")
 
 
@@ -277,8 +279,8 @@ def verify(path: Path, manifest: Manifest) -> None:
     larger than their arrays, which fit this machine."""
     present = set(files.below(path)) - {"manifest.json"}
     if present != set(manifest.files):
-        odd = sorted(present ^ set(manifest.files))
-        raise CheckpointError(f"missing or unknown file {odd[0]}")
+        odd = min(present ^ set(manifest.files))
+        raise CheckpointError(f"{'unknown' if odd in present else 'missing'} file {odd}")
     size, room = size_of(manifest.leaves), host_memory()
     if size > room:
         raise CheckpointError(f"its arrays need {size:.1e} bytes, this machine has {room:.1e}")

@@ -54,12 +54,14 @@ def choose_folder(settings: Settings, job: int | None, say: Callable[[str], None
     """The folder to train in. `job` is the number of a multirun's job.
 
     Raises:
-        ConfigError: it holds another run, or this one and `resume` is not set.
+        ConfigError: it holds another run, or this one and `resume` is not set or it has lost its
+            checkpoints.
     """
     train = settings.train
     if isinstance(train.resume, str):
         folder = Path(train.resume).expanduser()
         check_same_run(settings, folder)
+        check_goes_on(folder, say)
         return folder
     home = Path("runs") / settings.label
     if train.run_dir is None:
@@ -80,6 +82,7 @@ def choose_folder(settings: Settings, job: int | None, say: Callable[[str], None
         raise ConfigError(f"run_dir={folder} is not a folder")
     if files.there(folder / "config.yaml") and train.resume:
         check_same_run(settings, folder)
+        check_goes_on(folder, say)
     elif checkpoint.checkpoints(files.inside(folder, "checkpoints")):
         raise ConfigError(
             f"{folder} already holds a run: continue it with resume=true, or choose another run_dir"
@@ -87,6 +90,21 @@ def choose_folder(settings: Settings, job: int | None, say: Callable[[str], None
     elif train.resume:
         say(f"nothing to resume in {folder}: starting there")
     return folder
+
+
+def check_goes_on(folder: Path, say: Callable[[str], None]) -> None:
+    """Raise ConfigError if the run in `folder` has lost its checkpoints. One that was killed before its
+    first has none yet, and starts from the beginning."""
+    store, policies = (
+        checkpoint.checkpoints(files.inside(folder, x)) for x in ("checkpoints", "policy")
+    )
+    if policies and not store:
+        raise ConfigError(
+            f"{folder} has no checkpoint to go on from, only a policy; init_from={folder} begins a new "
+            "run with it"
+        )
+    if not store:
+        say(f"no checkpoint in {folder} yet: starting from the beginning")
 
 
 def agree_on_folder(settings: Settings, job: int | None, say: Callable[[str], None]) -> Path:

@@ -1,5 +1,7 @@
 """Runs with a replay: stopped, killed, resumed, and too large."""
 
+import shutil
+
 import numpy as np
 import pytest
 from shell import TOY, assert_same_run, start, typed, wait_for
@@ -71,8 +73,30 @@ def test_a_kept_replay_that_is_missing_is_one_line(tmp_path, capsys):
         max((kept / "state").rglob("*"), key=lambda file: file.stat().st_size).unlink()
     capsys.readouterr()
     assert typed("train", *args, f"total_steps={4 * STEPS}", "resume=true") == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("error: ") and "is corrupt (missing or unknown file" in line
+    said = capsys.readouterr()
+    (line,) = said.err.splitlines()
+    assert line.startswith("error: ") and "is corrupt (missing file state/" in line
+    assert "warning" not in said.out
+
+
+def test_a_run_that_has_lost_its_checkpoints_is_not_begun_anew_over_its_metrics(tmp_path, capsys):
+    run = tmp_path / "run"
+    args = (*SAC, f"run_dir={run}", "eval_episodes=0")
+    assert typed("train", *args, f"total_steps={3 * STEPS}") == 0
+    shutil.rmtree(run / "checkpoints")
+    before = (run / "metrics.csv").read_bytes()
+    capsys.readouterr()
+    for resume in (f"run_dir={run}", "resume=true"), (f"resume={run}",):
+        assert typed("train", *SAC, "eval_episodes=0", f"total_steps={4 * STEPS}", *resume) == 2
+        said = capsys.readouterr()
+        (line,) = (said.out + said.err).splitlines()
+        assert line.startswith(
+            f"error: {run} has no checkpoint to go on from, only a policy; init_from="
+        )
+    assert (run / "metrics.csv").read_bytes() == before
+    shutil.rmtree(run / "policy")  # as of one that was killed before its first checkpoint
+    assert typed("train", *args, f"total_steps={4 * STEPS}", "resume=true") == 0
+    assert f"no checkpoint in {run} yet: starting from the beginning" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
