@@ -138,6 +138,54 @@ def test_it_acts_by_its_policy_until_there_is_a_certificate_and_then_within_it()
     assert (jnp.abs(act(free, beyond)) > 0).all() and (jnp.abs(act(free, within)) > 0).all()
 
 
+def steady(learned):
+    """`learned` with a policy that takes 0, but for noise of less than 1e-4."""
+    actor = jax.tree.map(jnp.zeros_like, learned.params["actor"])
+    last = sorted(actor["params"])[-1]
+    bias = jnp.array([0.0, 0.0, -10.0, -10.0])
+    actor["params"][last] = actor["params"][last] | {"bias": bias}
+    return dataclasses.replace(learned, params=learned.params | {"actor": actor})
+
+
+def test_exploration_keeps_to_the_certificate_and_is_random_in_a_third_of_the_environments():
+    algo, start = begun()
+    learner, free = crabs.crabs(Corridor()), steady(algo.learned(start(jnp.zeros(()))))
+    safe = jax.tree.map(jnp.zeros_like, free.params["safe"])
+    scale = safe.model.scale.replace(std=jnp.ones(6))
+    # what the certificate's own policy does: 0.25 of the first action
+    actor = jax.tree.map(jnp.zeros_like, free.params["actor"])
+    last = sorted(actor["params"])[-1]
+    actor["params"][last]["bias"] = actor["params"][last]["bias"].at[0].set(jnp.arctanh(0.25))
+    safe = safe.replace(model=safe.model.replace(scale=scale), actor=actor)
+    bound = dataclasses.replace(free, params=free.params | {"safe": safe, "certified": jnp.ones(())})
+    within = jnp.broadcast_to(Corridor().reset(jax.random.key(0)).obs, (6, 4))
+    explore = jax.jit(learner.explore)
+    key, remaining = jax.random.key(1), jnp.ones(())
+
+    action = explore(bound, within, key, remaining)
+    assert (jnp.abs(action[jnp.array([0, 1, 3, 4])]) < 1e-3).all()
+    assert (jnp.abs(action[jnp.array([2, 5])]) > 1e-2).all()
+    # where no action helps, all take the certificate's own
+    np.testing.assert_allclose(
+        explore(bound, within.at[:, 1].set(0.49), key, remaining), [[0.25, 0.0]] * 6, atol=1e-6
+    )
+    # without a certificate nothing is random beyond the policy's noise
+    assert (jnp.abs(explore(free, within, key, remaining)) < 1e-3).all()
+    assert learner.random_start(free) and not learner.random_start(bound)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("certified", [0.0, 1.0])
+def test_a_run_that_starts_with_a_certificate_does_not_begin_with_random_actions(certified):
+    (algo, start), update = begun(), compiled()
+    ts = start(jnp.float32(-1e5))
+    learned = steady(algo.learned(ts))
+    params = ts.params | {"actor": learned.params["actor"], "certified": jnp.float32(certified)}
+    ring = update(dataclasses.replace(ts, params=params), at(0))[0].replay
+    taken = ring.action[jnp.array([0, 1, 3, 4]), :4]  # of environments that are not random later
+    assert (jnp.abs(taken).max() < 1e-3) == bool(certified)
+
+
 # ---- a gradient step by hand -------------------------------------------------------------------
 
 GAINS = np.array([[0.1], [0.4]])  # of the models, by which the second action moves y
