@@ -187,7 +187,9 @@ def from_minari(path: str, source: Source) -> DataSet:
 
 def checked(path: str, name: str, x: np.ndarray, axes: int, like: np.ndarray) -> np.ndarray:
     """`x` as float32, if it is numbers of so many axes and as many as `like`."""
-    if x.dtype.kind not in "biuf" or x.ndim != axes or x.shape[:1] != like.shape[:1] or not len(x):
+    if x.ndim == axes and not len(x):
+        raise ConfigError(f"dataset={path}: {name} is empty")
+    if x.dtype.kind not in "biuf" or x.ndim != axes or x.shape[:1] != like.shape[:1]:
         shape = "[n, size]" if axes == 2 else "[n]"
         raise ConfigError(
             f"dataset={path}: {name} is {x.dtype}{list(x.shape)}, expected numbers {shape}, with "
@@ -220,6 +222,10 @@ def opened(path: str, file: Path) -> Iterator[Source]:
     except ConfigError:
         raise
     except BROKEN as error:
+        if not hdf5 and not zipfile.is_zipfile(file):
+            raise ConfigError(
+                f"dataset={path} is neither .hdf5 nor .npz, by how it begins and ends"
+            ) from error
         kind = ".hdf5" if hdf5 else ".npz"
         raise ConfigError(f"dataset={path} cannot be read as {kind}: {one_line(error)}") from error
 
@@ -313,6 +319,10 @@ def found(path: str) -> Path:
     if file.is_dir():
         places = (file / "main_data.hdf5", file / "data" / "main_data.hdf5")
         file = next((place for place in places if place.is_file()), file)
+    if file.is_dir():
+        raise ConfigError(
+            f"dataset={path} is a folder without main_data.hdf5, as Minari has it; expected a file"
+        )
     if not file.is_file():
         raise ConfigError(f"dataset={path}: there is no such file")
     return file

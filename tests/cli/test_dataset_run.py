@@ -189,6 +189,7 @@ def test_a_lone_seed_without_environments_does_not_split_over_devices(data, monk
         ("costs", np.full(100, np.nan), "costs holds numbers that are not finite"),
         ("costs", np.full(100, 1e300), "costs holds numbers that are not finite"),
         ("costs", np.full(100, "1"), "costs is <U1"),
+        ("observations", np.zeros((0, 4)), "observations is empty"),
         ("costs", np.array([{}] * 100), "cannot be read as .npz: Object arrays cannot be loaded"),
     ],
 )
@@ -206,12 +207,18 @@ def test_wrong_arrays_are_one_line(tmp_path, data, name, array, message):
 def test_a_file_of_another_kind_is_one_line(tmp_path, content):
     path = tmp_path / "data.npz"
     path.write_bytes(content)
-    with pytest.raises(ConfigError, match="cannot be read as"):
+    with pytest.raises(ConfigError, match=r"is neither \.hdf5 nor \.npz"):
         read_dataset(str(path))
     with path.open("wb") as file:
         np.save(file, np.zeros(3))
-    with pytest.raises(ConfigError, match="cannot be read as"):
+    with pytest.raises(ConfigError, match=r"is neither \.hdf5 nor \.npz"):
         read_dataset(str(path))
+    path = tmp_path / "data.hdf5"
+    path.write_bytes(dataset.HDF5 + b" torn")
+    with pytest.raises(ConfigError, match=r"cannot be read as \.hdf5"):
+        read_dataset(str(path))
+    with pytest.raises(ConfigError, match=r"is a folder without main_data\.hdf5"):
+        read_dataset(str(tmp_path))
 
 
 def test_members_share_one_copy_of_the_data_and_nothing_of_it_is_given_up(data):

@@ -157,8 +157,8 @@ def dense(params):
 
 
 def drawn_batch() -> Transitions:
-    """A plain step, one of two steps, one that terminated, one that was truncated, which bootstraps
-    like any other, and one that does not count."""
+    """A plain step, one of two steps, one that terminated, one that did not, as where time runs out,
+    and one that does not count."""
     rng = np.random.default_rng(0)
     cost = rng.uniform(size=5)
     fields: dict[str, Any] = {
@@ -367,7 +367,23 @@ def value(earned: np.ndarray, discount: float, circle: bool) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    "name, circle, n_step", [("sac", False, 1), ("td3_lag", True, 3), ("ddpg_lag", False, 2)]
+    "name, circle, n_step",
+    [
+        ("sac", False, 1),
+        ("td3_lag", True, 3),
+        ("ddpg_lag", False, 2),
+        *(
+            pytest.param(name, circle, n_step, marks=pytest.mark.slow)
+            for name, circle, n_step in [
+                ("sac_lag", True, 2),
+                ("sac_pid", False, 3),
+                ("td3", True, 1),
+                ("td3_pid", False, 2),
+                ("ddpg", True, 3),
+                ("ddpg_pid", True, 1),
+            ]
+        ),
+    ],
 )
 def test_the_critics_find_the_values_of_a_chain(name, circle, n_step):
     """Episodes of the circle are cut after 2 steps, which takes nothing from their values."""
@@ -378,7 +394,8 @@ def test_the_critics_find_the_values_of_a_chain(name, circle, n_step):
         "discount": 0.5, "cost_discount": 0.75, "critic_lr": 0.02, "tau": 0.2, "n_step": n_step,
         "replay_ratio": 32,
     }  # fmt: skip
-    settings |= {"alpha_init": 1e-6, "alpha_lr": 0.0} if name == "sac" else {"policy_delay": 1}
+    quiet = {"alpha_init": 1e-6, "alpha_lr": 0.0}
+    settings |= quiet if name.startswith("sac") else {"policy_delay": 1}
     row = ALGOS[name]
     cfg, algo = row.config(**settings), row.make(env)
 
@@ -393,7 +410,7 @@ def test_the_critics_find_the_values_of_a_chain(name, circle, n_step):
     for critic, values in expected.items():
         for action in (-0.9, 0.0, 0.9):
             q = q_values(ts.params[critic], jnp.eye(3), jnp.full((3, 1), action), ts.config)
-            np.testing.assert_allclose(q, np.stack([values] * len(q)), atol=2e-2)
+            np.testing.assert_allclose(q, np.stack([values] * len(q)), atol=1e-2)
     assert metrics["train/nonfinite"].sum() == 0
 
 

@@ -99,6 +99,20 @@ def lowest(params):
 # ---- the contract ------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("name", [x for x in NAMES if hasattr(ALGOS[x].config, "cost_limits")])
+def test_each_of_several_constraints_has_critics_and_a_price(name):
+    algo, cfg = ALGOS[name].make(Ticker()), ALGOS[name].config
+    cfg = cfg(**TINY, cost_limits={"b": 1.0, "a": 20.0})
+    ts = jax.eval_shape(lambda: algo.init(jax.random.key(0), cfg, START))
+    after, metrics = jax.eval_shape(algo.update, ts, START)
+    assert jax.tree.structure(ts) == jax.tree.structure(after)
+    assert jax.tree.leaves(ts) == jax.tree.leaves(after)
+    assert all(x.shape[0] == 2 for x in jax.tree.leaves(ts.params["critic_c"]))
+    for cost in ("a", "b"):
+        assert {f"train/lam_{cost}", f"train/cost_estimate_{cost}"} <= {*metrics}
+    assert "train/lam" not in metrics
+
+
 @dataclass(frozen=True)
 class Free(Corridor):
     """Corridor without a cost, as Goal 0 has none."""
