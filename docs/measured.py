@@ -13,7 +13,7 @@ from typing import NamedTuple
 import matplotlib.pyplot as plt
 import numpy as np
 
-from jaxsafe.report import plots, stats, studies
+from jaxsafe.report import plots, scores, stats, studies
 from jaxsafe.report.comparison_tables import SCORES, aggregates
 from jaxsafe.report.group import Group, group, ordered, suite
 from jaxsafe.report.published import Published, beside, read_published
@@ -411,6 +411,24 @@ def attempts() -> str:
     return "\n".join(lines)
 
 
+def dsrl() -> str:
+    """DSRL's normalised scores of the final policies, by task, algorithm and the share of `ppo_lag`."""
+    cells: dict[tuple[str, str], dict[str, str]] = {}
+    for run in read([RESULTS / "offline"]):
+        if run.config["total_updates"] > 1e5 or "final return" not in run.values:
+            continue
+        ret = scores.dsrl_return(run.env, run.values["final return"].mean())
+        cost = scores.dsrl_cost(run.values["final cost"].mean(), 25.0)
+        shown = f"**{ret:.2f}, {cost:.1f}**" if cost <= 1 else f"{ret:.2f}, {cost:.1f}"
+        row = cells.setdefault((run.env, run.config["algo.name"]), {})
+        row[Path(run.config["dataset"]).stem] = shown
+    shares = ("0.25", "0.50", "0.75")
+    lines = [f"| | | {' | '.join(shares)} |", "|---|---|" + "---:|" * len(shares)]
+    for (env, algo), row in sorted(cells.items()):
+        lines.append(f"| `{env}` | `{algo}` | {' | '.join(row.get(x, '') for x in shares)} |")
+    return "\n".join(lines)
+
+
 def devices() -> str:
     """The same training on one, two and four GPUs."""
     lines = ["| GPUs | environments of a seed | estimated return | estimated cost | seconds |"]
@@ -454,6 +472,7 @@ def pages() -> dict[Path, str]:
         },
         RESULTS / "first_attempts" / "README.md": {"attempts": attempts()},
         RESULTS / "devices" / "README.md": {"devices": devices()},
+        RESULTS / "offline" / "README.md": {"normalised": dsrl()},
         HERE.parent / "README.md": {"held": held(groups, final)},
         HERE / "benchmark.md": {"speeds": algorithm_speeds()},
         HERE / "performance.md": {
