@@ -149,7 +149,8 @@ def steady(learned):
 
 def test_exploration_keeps_to_the_certificate_and_is_random_in_a_third_of_the_environments():
     algo, start = begun()
-    learner, free = crabs.crabs(Corridor()), steady(algo.learned(start(jnp.zeros(()))))
+    learner: Any = crabs.crabs(Corridor())
+    free = steady(algo.learned(start(jnp.zeros(()))))
     safe = jax.tree.map(jnp.zeros_like, free.params["safe"])
     scale = safe.model.scale.replace(std=jnp.ones(6))
     # what the certificate's own policy does: 0.25 of the first action
