@@ -418,7 +418,8 @@ def test_on_a_known_chain_it_overrules_where_the_bound_says(monkeypatch, verdict
     known = {"shield_steps": 15, "shield_horizon": 15, "delta": 0.8}
     cfg = dataclasses.replace(CFG, verdict=verdict, **known)
     monkeypatch.setattr(ambs, "world_of", lambda *_: chain)
-    monkeypatch.setattr(ambs, "chosen", lambda *_: jnp.zeros(2))
+    dreamer = {"actor": jnp.zeros(2)}  # the task's policy alone dreams
+    monkeypatch.setattr(ambs, "chosen", lambda env, learned, name, *_: dreamer[name])
     monkeypatch.setattr(ambs, "safety_value", lambda params, features, cfg: jnp.zeros(len(features)))
 
     def says(world, params, x):
@@ -483,6 +484,31 @@ def test_the_executed_action_is_one_of_the_two_and_is_what_is_remembered():
     alone = acted(jnp.float32(jnp.inf), dataclasses.replace(state, obs=others))
     np.testing.assert_array_equal(alone[0][0], task[0])
     assert (alone[0][1:] != task[1:]).any()
+
+
+def test_the_safe_policy_acts_where_the_shield_overrules_and_the_tasks_policy_elsewhere():
+    (algo, learned), env = newborn(), Corridor()
+    state = env.reset(jax.random.key(1))
+    actors = {
+        "actor": learned.params["actor"],
+        "safe": jax.tree.map(lambda x: x + 0.3, learned.params["actor"]),
+    }
+    learned = dataclasses.replace(learned, params=learned.params | actors)
+
+    @jax.jit
+    def acted(delta):
+        at = dataclasses.replace(learned.config, delta=delta, eps=jnp.float32(0))
+        player = Player(algo.policy, dataclasses.replace(learned, config=at), env)
+        action, memory, said = player.decide(player.begin(), state, None)
+        latent = memory.latent
+        of_both = {name: ambs.chosen(env, learned, name, latent, None) for name in actors}
+        return action, said["overruled"], of_both
+
+    for delta, name in ((jnp.inf, "actor"), (-1.0, "safe")):
+        action, overruled, of_both = acted(jnp.float32(delta))
+        assert overruled == (name == "safe")
+        np.testing.assert_allclose(action, of_both[name], atol=1e-6)
+        assert jnp.abs(of_both["actor"] - of_both["safe"]).max() > 1e-2
 
 
 def test_an_evaluation_takes_the_sampled_actions_that_training_takes():
