@@ -412,13 +412,13 @@ def attempts() -> str:
 
 
 def dsrl() -> str:
-    """DSRL's normalised scores of the final policies, by task, algorithm and the share of `ppo_lag`."""
+    """DSRL's normalised scores after 1e5 updates, by task, algorithm and the share of `ppo_lag`."""
     cells: dict[tuple[str, str], dict[str, str]] = {}
     for run in read([RESULTS / "offline"]):
         if run.config["total_updates"] > 1e5 or "final return" not in run.values:
             continue
         ret = scores.dsrl_return(run.env, run.values["final return"].mean())
-        cost = scores.dsrl_cost(run.values["final cost"].mean(), 25.0)
+        cost = scores.dsrl_cost(run.values["final cost"].mean(), run.config["algo.cost_limit"])
         shown = f"**{ret:.2f}, {cost:.1f}**" if cost <= 1 else f"{ret:.2f}, {cost:.1f}"
         row = cells.setdefault((run.env, run.config["algo.name"]), {})
         row[Path(run.config["dataset"]).stem] = shown
