@@ -2,6 +2,7 @@
 
 import dataclasses
 from functools import cache, partial
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -13,15 +14,17 @@ from compiling import FAST
 from toys import START, Corridor, Ticker
 
 from jaxsafe.algos import ALGOS, dreamer
-from jaxsafe.learn import world_model
+from jaxsafe.learn import dreaming, world_model
 from jaxsafe.learn.acting import Player
-from jaxsafe.learn.dreaming import Behaviour, Outcome, Range, dreaming_learner, moved
+from jaxsafe.learn.dreaming import Behaviour, Outcome, Range, Scene, dreaming_learner, moved
 from jaxsafe.learn.learner import GradientStep
 from jaxsafe.learn.next_step_rollout import collect_records, started
 from jaxsafe.learn.replay import Record, Source, Span
 from jaxsafe.learn.rollout import init_rollout
 from jaxsafe.learn.sequences import SequenceBatch, drawn_sequences
+from jaxsafe.learn.world_model import Dreams
 from jaxsafe.nn import coders, rssm, two_hot
+from jaxsafe.nn.gaussian import Gaussian
 
 FLOAT32 = {jnp.dtype("float32")}
 THREE: dict[str, Any] = dreamer.LEVER | {"num_envs": 3, "replay_ratio": 16, "stagger": False}
@@ -91,7 +94,7 @@ def test_the_divergence_of_latents_is_summed_over_them():
     assert rssm.kl(p, p) == 0
 
 
-# ---- returns, percentiles, steps ---------------------------------------------------------------
+# ---- returns, weights, percentiles, steps ------------------------------------------------------------
 
 
 def test_the_returns_of_dreams_by_hand():
@@ -100,6 +103,60 @@ def test_the_returns_of_dreams_by_hand():
     args = (jnp.array(x) for x in (reward, value, cont))
     got = world_model.dream_returns(*args, discount=0.5, decay=0.75)
     np.testing.assert_allclose(got, [[4.1875], [4.5]])
+
+
+def test_a_dream_weighs_how_likely_it_still_goes_on():
+    """k_0 is what happened, 1 or 0, and not what a head says. Then 0.5 k of each state."""
+
+    class Fading:
+        def apply(self, params, *args, method):
+            return getattr(self, method)(*args)
+
+        def imagine(self, latent, action, key):
+            return rssm.Latent(latent.deter + 1, latent.stoch)
+
+        def read(self, features):
+            k = jnp.array([0.9, 0.8, 0.25])[features[..., 0].astype(int)]
+            return {"cont": jnp.log(k / (1 - k))[..., None]}
+
+    def stands(params, features):
+        return Gaussian(jnp.zeros((*features.shape[:-1], 1)), jnp.zeros((*features.shape[:-1], 1)))
+
+    world: Any = Fading()
+    cfg = dreamer.DreamerConfig(imagine_steps=2, discount=0.5)
+    start = rssm.Latent(jnp.zeros((2, 1)), jnp.zeros((2, 1)))
+    args = world, {}, stands, (), start, jnp.array([1.0, 0.0]), jax.random.key(0), cfg
+    dreams = world_model.dream(*args)
+    np.testing.assert_allclose(dreams.weight, [[1, 0], [0.4, 0], [0.4 * 0.125, 0]], rtol=1e-5)
+    np.testing.assert_allclose(dreams.read["cont"], [[1, 0], [0.8, 0.8], [0.25, 0.25]], rtol=1e-5)
+
+
+def test_actors_and_critics_learn_from_a_dream_as_much_as_it_weighs(monkeypatch):
+    """And dreams begin at all rows of the batch, with k_0 = 0 where an episode failed."""
+    keys = jax.random.split(jax.random.key(0), 6)
+    advantage, log_prob, entropy, of_critic = (jax.random.normal(key, (2, 6)) for key in keys[:4])
+    weight = jax.random.uniform(keys[4], (3, 6))
+    cfg, no = dreamer.DreamerConfig(entropy_coef=0.5), jnp.zeros((3, 2), bool)
+    zeros, failed = jnp.zeros((3, 2)), no.at[1, 0].set(True)
+    rows = Record(
+        zeros[..., None], zeros[..., None], zeros, zeros, zeros[..., None], no, failed, failed
+    )
+    share = jnp.array([0.75, 0.25])  # of the two sequences
+    latents = rssm.Latent(jax.random.normal(keys[5], (3, 2, 5)), jnp.zeros((3, 2, 4)))
+    unused: Any = None
+    scene = Scene(Corridor(), unused, {"model": ()}, SequenceBatch(rows, share), latents, (), cfg, None)
+    dreams = Dreams(zeros, advantage, log_prob, entropy, {}, weight)
+    each = jnp.tile(share, 3) / 3  # of a dream: those of the first rows come first
+    loss = -(weight[:2] * (advantage * log_prob + 0.5 * entropy) * each).sum() / 2
+    np.testing.assert_allclose(scene.actor_loss(dreams, advantage), loss, rtol=1e-5)
+    monkeypatch.setattr(Scene, "_loss", lambda *args: of_critic)
+    loss = (weight[:2] * of_critic * each).sum() / 2
+    np.testing.assert_allclose(scene.critic_loss({}, "critic_r", dreams, zeros), loss, rtol=1e-5)
+    monkeypatch.setattr(dreaming, "dream", lambda *args: args)
+    asked: Any = scene.dream((), keys[0])
+    start, alive = asked[4:6]
+    np.testing.assert_array_equal(start.deter, latents.deter.reshape(6, 5))
+    np.testing.assert_array_equal(alive, [1, 1, 0, 1, 1, 1])
 
 
 def test_returns_are_scaled_by_their_running_percentiles_but_not_magnified_beyond_the_least_scale():
@@ -138,7 +195,10 @@ def test_steps_rise_to_the_learning_rate_and_forget_the_size_of_gradients():
 
 class Glass:
     """A model one can look through: its latent is the observation, what was observed before, and the
-    action in between. It stands for `WorldModel` in `filtered` and in the policy."""
+    action in between. It foretells the clock of `Ticker` from what was observed before, and the reward
+    of `Echo`. It stands for `WorldModel` in the loss, in `filtered` and in the policy."""
+
+    decoder = SimpleNamespace(loss=lambda decoded, obs: ((decoded - obs) ** 2).sum(-1))
 
     def apply(self, params: Any, *args: Any, method: str) -> Any:
         return getattr(self, method)(*args)
@@ -152,6 +212,17 @@ class Glass:
     def observe(self, latent, action, embedded, key):
         before = jnp.concatenate([latent.stoch, action], -1)
         return rssm.Latent(before, embedded)
+
+    def decode(self, latent):
+        return latent.stoch
+
+    def beliefs(self, deter, embedded):
+        """What is believed of the clock, of two classes, before and after it is seen."""
+        of_clock = [jnp.stack([clock, -clock], -1) for clock in (deter[..., 1] + 1, embedded[..., 1])]
+        return [jax.nn.log_softmax(x[..., None, :]) for x in of_clock]
+
+    def read(self, features):
+        return {"reward": echoed(rssm.Latent(features[..., :4], features[..., 4:]))}
 
 
 GLASS: Any = Glass()
@@ -219,6 +290,32 @@ def test_a_reward_meets_the_latent_of_the_observation_that_it_came_with():
     np.testing.assert_array_equal(cont, ~rows.terminated)
     ends = world_model.goes_on(rows, dataclasses.replace(cfg, limit_ends=True))
     np.testing.assert_array_equal(ends, ~rows.last)
+
+
+def test_the_model_s_loss_meets_each_row_with_its_own_latent(monkeypatch):
+    """Through `Glass` nothing is left to learn of `Echo` but where a memory begins: there the clock was
+    believed to be 1. A target, an observation or a belief a step off is noticed."""
+    rows: Any = recorded(Echo(episode_length=5, lives=(3, 9)), 24)
+    starts = rows.first.at[0].set(True)
+    known: Any = rows.replace(reward=jnp.where(starts, 0.0, rows.reward))
+    monkeypatch.setattr(world_model, "head_loss", lambda outputs, target: (outputs - target) ** 2)
+    weight = jnp.array([0.5, 0.25, 0.25])
+    cfg = dreamer.DreamerConfig(free_nats=0.0)
+
+    def losses(**changes: Any) -> dict[str, jax.Array]:
+        of: Any = known.replace(**changes)
+        args = SequenceBatch(of, weight), {"reward": of.reward}, jax.random.key(0), cfg
+        return world_model.model_loss(GLASS, {}, *args)[1][1]
+
+    found = losses()
+    np.testing.assert_allclose(found["train/model_reward_loss"], 0, atol=1e-6)
+    np.testing.assert_array_equal(found["train/model_obs_loss"], 0)
+    believed, seen = GLASS.beliefs(jnp.zeros((*starts.shape, 4)), rows.obs)
+    nats = rssm.kl(seen, believed)
+    expected = (weight * jnp.where(starts, nats, 0.0).mean(0)).sum()
+    np.testing.assert_allclose(found["train/model_kl"], expected, rtol=1e-4)
+    late = losses(reward=jnp.roll(known.reward, 1, axis=0))
+    assert late["train/model_reward_loss"] > 1
 
 
 def test_the_policy_remembers_what_the_model_learns_from():
