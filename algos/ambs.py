@@ -127,8 +127,8 @@ class AMBSConfig(dreamer.ForesightConfig):
 # ---- what a violation is -----------------------------------------------------------------------
 
 
-def violated(env: Env, rows: Costs, cfg: Any) -> jax.Array:
-    """Where a row has a violation, bool [...].
+def labelled(env: Env, cfg: Any) -> list[int]:
+    """Which of the environment's costs are violations.
 
     Raises:
         ConfigError: a label that the environment does not have.
@@ -137,9 +137,14 @@ def violated(env: Env, rows: Costs, cfg: Any) -> jax.Array:
         if name not in env.cost_names:
             hint = nearest(name, env.cost_names) if env.cost_names else "; the environment has none"
             raise ConfigError(f"labels: unknown cost {name!r}{hint}")
+    return [env.cost_names.index(name) for name in cfg.labels]
+
+
+def violated(env: Env, rows: Costs, cfg: Any) -> jax.Array:
+    """Where a row has a violation, bool [...]."""
     if not cfg.labels:
         return rows.cost > 0
-    return (rows.costs[..., [env.cost_names.index(name) for name in cfg.labels]] > 0).any(-1)
+    return (rows.costs[..., labelled(env, cfg)] > 0).any(-1)
 
 
 def targets(env: Env, rows: Record, cfg: Any) -> dict[str, jax.Array]:
@@ -438,8 +443,9 @@ def overruled_from(cfg: Any) -> int:
     return int(np.append(decides, True).argmax())
 
 
-def check(cfg: Any, data: Any = ()) -> None:
-    """Raise ConfigError for a shield that would always act, or never."""
+def check(cfg: Any, env: Env, data: Any = ()) -> None:
+    """Raise ConfigError for a shield that would always act, or never, and for labels that are no costs."""
+    labelled(env, cfg)
     if cfg.shield == "dreams" and cfg.verdict == "summed" and cfg.discount == 1:
         raise ConfigError(
             "discount=1: expected less, as verdict=summed tells steps within shield_horizon by it"

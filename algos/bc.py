@@ -137,7 +137,7 @@ def safe_episodes(data: DataSet, cfg: Any) -> Callable[[jax.Array], jax.Array]:
     return draw
 
 
-def check_safe(cfg: Any, data: Any) -> None:
+def check_safe(cfg: Any, env: Env, data: Any) -> None:
     """Raise ConfigError for a data set without a safe episode."""
     episodes = need_episodes(data, "bc_safe learns from whole episodes")
     costs = np.asarray(episodes.cost)[np.asarray(episodes.whole)]

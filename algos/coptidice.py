@@ -181,7 +181,7 @@ def learner(env: Env) -> Learner:
     return Learner(init=init, act=act, step=step)
 
 
-def check(cfg: Any, data: Any) -> None:
+def check(cfg: Any, env: Env, data: Any) -> None:
     need_episodes(data, "coptidice learns from the first observations of episodes")
 
 

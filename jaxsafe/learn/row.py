@@ -7,7 +7,7 @@ from typing import Any, Literal, NamedTuple
 import jax
 import numpy as np
 
-from jaxsafe.types import Algorithm, PyTree
+from jaxsafe.types import Algorithm, Env, PyTree
 
 NOTHING: Mapping[str, Any] = MappingProxyType({})
 
@@ -31,8 +31,8 @@ class Row(NamedTuple):
     examine: examine(algo, learned, keys, sampled), what else evaluation measures: name -> float [S, N],
         of the episodes of `keys` [S, N], by the S policies in `learned`, with mean or with `sampled`
         actions.
-    check: check(cfg, data) raises ConfigError for settings, or a data set, that cannot serve. `data` is
-        () where there is none.
+    check: check(cfg, env, data) raises ConfigError for settings, or a data set, that cannot serve.
+        `data` is () where there is none.
     """
 
     config: type[Any]
@@ -43,6 +43,6 @@ class Row(NamedTuple):
     total_steps: int = 10_000_000
     holds: Literal["average", "episode", "nothing"] = "average"
     lever: Mapping[str, Any] = NOTHING
-    check: Callable[[Any, Any], None] = lambda cfg, data: None
+    check: Callable[[Any, Env, Any], None] = lambda cfg, env, data: None
     note: Callable[[Any], str] = lambda cfg: ""
     examine: Callable[[Algorithm, PyTree, jax.Array, bool], dict[str, np.ndarray]] = lambda *_: {}

@@ -168,7 +168,7 @@ def prepare(settings: Settings) -> tuple[Env, Program]:
     if train.dataset is not None:
         data = dataset.read_dataset(train.dataset, env.episode_length)
     for cfg in settings.configs:
-        settings.row.check(cfg, data)
+        settings.row.check(cfg, env, data)
     program = build(env, settings.row.make, settings.configs, train, data)
     check_state_memory(program, train)
     return env, program

@@ -151,6 +151,7 @@ def test_a_label_that_the_environment_does_not_have_is_refused_in_a_line(capsys,
     args = ("algo.labels=[walls]", "total_steps=64", f"run_dir={tmp_path / 'run'}")
     assert typed("train", *AMBS, *args) == 2
     assert "labels: unknown cost 'walls'; did you mean 'wall'?" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
 
 
 def test_on_a_cpu_the_defaults_name_the_preset_for_it(monkeypatch):

@@ -1,6 +1,7 @@
 """One command, `jaxsafe`, for all that the scripts do."""
 
 import importlib
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -85,3 +86,11 @@ def test_python_m_jaxsafe_is_the_command(tmp_path):
         [sys.executable, "-m", "jaxsafe", "plott"], cwd=tmp_path, capture_output=True, text=True
     )
     assert (done.returncode, done.stdout) == (2, "") and "did you mean 'plot'" in done.stderr
+
+
+def test_an_opengl_that_there_is_not_is_one_line():
+    env = os.environ | {"MUJOCO_GL": "vulkan"}
+    command = [sys.executable, "-m", "jaxsafe", "train", "env=point_goal1"]
+    done = subprocess.run(command, env=env, capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+    assert "MUJOCO_GL=vulkan: MuJoCo does not load" in done.stderr

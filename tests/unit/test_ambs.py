@@ -89,9 +89,9 @@ def test_the_exact_bound_allows_more_than_hoeffdings(rollouts, allowed):
      ({"discount": 1.0}, "discount=1: expected less")],
 )  # fmt: skip
 def test_a_shield_that_always_or_never_acts_is_refused(options, told):
-    ambs.check(CFG)
+    ambs.check(CFG, Corridor())
     with pytest.raises(ConfigError, match=told):
-        ambs.check(dataclasses.replace(CFG, **options))
+        ambs.check(dataclasses.replace(CFG, **options), Corridor())
 
 
 @pytest.mark.parametrize("hazard, share, summed", [(0.01, 0.26, False), (0.03, 0.6, True)])
@@ -312,7 +312,7 @@ def test_labels_say_which_costs_are_violations():
     np.testing.assert_array_equal(both["cost"], [0, 10, 10])
     np.testing.assert_array_equal(both["safe"], [1, 0, 0])
     with pytest.raises(ConfigError, match="labels: unknown cost 'wal'; did you mean 'wall'"):
-        ambs.violated(env, rows, labelled(labels=("wal",)))
+        ambs.check(labelled(labels=("wal",)), env)
 
 
 # ---- the penalties -----------------------------------------------------------------------------

@@ -399,7 +399,7 @@ def test_limits_of_named_costs_are_held_apart():
 )
 def test_what_needs_episodes_says_so(name, cfg):
     with pytest.raises(ConfigError, match="the data set has no timeouts"):
-        ALGOS[name].check(cfg(), random_data()._replace(episodes=()))
+        ALGOS[name].check(cfg(), Corridor(), random_data()._replace(episodes=()))
 
 
 def test_bc_safe_draws_from_whole_episodes_within_the_limit_alone():
@@ -416,7 +416,7 @@ def test_bc_safe_draws_from_whole_episodes_within_the_limit_alone():
     assert np.unique(np.asarray(bc.safe_episodes(data, cfg)(jax.random.key(0)))).tolist() == [3, 4, 5]
     data = data._replace(episodes=data.episodes._replace(cost=np.full(4, 9.0)))
     with pytest.raises(ConfigError, match="no episode of at most that; the least costs 9"):
-        bc.check_safe(cfg, data)
+        bc.check_safe(cfg, Corridor(), data)
 
 
 # ---- optima -------------------------------------------------------------------------------------
