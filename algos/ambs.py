@@ -444,7 +444,7 @@ def overruled_from(cfg: Any) -> int:
 
 
 def check(cfg: Any, env: Env, data: Any = ()) -> None:
-    """Raise ConfigError for a shield that would always act, or never, and for labels that are no costs."""
+    """Raise ConfigError for unknown labels, and for a shield that would always act, or never."""
     labelled(env, cfg)
     if cfg.shield == "dreams" and cfg.verdict == "summed" and cfg.discount == 1:
         raise ConfigError(
