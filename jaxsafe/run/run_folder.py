@@ -23,7 +23,7 @@ import shlex
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -78,8 +78,7 @@ def append_versions(folder: Path, device: str, engine: str | None, dataset: str 
     """Add this start of the run to versions.json, with the SHA-256 of its data set."""
     now = {
         "time": datetime.datetime.now().astimezone().isoformat(timespec="seconds"),
-        # as it was typed: `hydra_jobs` adds the ++ that Hydra needs
-        "command": shlex.join([Path(sys.executable).name, *(x.removeprefix("++") for x in sys.argv)]),
+        "command": command(sys.argv),
         "commit": commit(),
         "device": device,
         "engine": engine,
@@ -90,6 +89,14 @@ def append_versions(folder: Path, device: str, engine: str | None, dataset: str 
         **{name: installed(name) for name in PACKAGES},
     }
     files.write(folder / "versions.json", json.dumps([*starts(folder), now], indent=1))
+
+
+def command(argv: Sequence[str]) -> str:
+    """What was typed: `hydra_jobs` adds the ++ that Hydra needs, and `jaxsafe` its own name."""
+    script, *words = (x.removeprefix("++") for x in argv)
+    if script.startswith("jaxsafe "):  # the command `jaxsafe train`
+        return f"{script} {shlex.join(words)}"
+    return shlex.join([Path(sys.executable).name, script, *words])
 
 
 def starts(folder: Path) -> list[dict[str, Any]]:

@@ -169,3 +169,9 @@ def test_the_command_of_a_run_is_recorded_as_it_was_typed(tmp_path, monkeypatch)
     run_folder.append_versions(tmp_path, "cpu", None)
     (start,) = json.loads((tmp_path / "versions.json").read_text())
     assert start["command"].endswith(" train.py algo=cpo algo.cost_limits.hazards=5")
+
+
+def test_the_command_jaxsafe_is_recorded_without_python():
+    assert run_folder.command(["jaxsafe train", "env=point_goal1", "tag=a b"]) == (
+        "jaxsafe train env=point_goal1 'tag=a b'"
+    )
