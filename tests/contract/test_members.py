@@ -1,14 +1,18 @@
 """Seeds and settings side by side, and one seed on two devices, are what lone runs are."""
 
-import os
-import subprocess
-import sys
+from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from learners import compiled, member, members, on_policy_names, others_slowly
+from toys import START, Corridor, updated
+from two_devices import agree, on_two_devices, split
+
+from jaxsafe.algos import ALGOS
+from jaxsafe.learn.estimates import Signals, scaled
 
 ONE_OF_EACH_STEP = ["cpo", "ppo_simmer_pid", "trpo_pid"]
 OTHERS = [name for name in on_policy_names() if name not in [*ONE_OF_EACH_STEP, "cup"]]
@@ -36,65 +40,46 @@ def test_seeds_and_cost_limits_side_by_side_are_the_lone_ones(name):
     assert together.config.cost_limit.tolist() == limits.tolist()
 
 
-SHARDED = """
-import sys; sys.path.insert(0, sys.argv[1])
-import jax, jax.numpy as jnp, numpy as np
-from jax.sharding import AxisType, PartitionSpec as P
-from compiling import FAST, keep_programs
-from toys import START, Corridor, updated
-from jaxsafe.algos import ALGOS
-from jaxsafe.learn.estimates import Signals, scaled
+def devices_agree(*names):
+    for name in names:
+        devices_agree_on(*name.split(":"))
+        print(name, "ok")
 
-keep_programs()
-mesh = jax.make_mesh((2,), ("devices",), axis_types=(AxisType.Auto,))
-def split(fn):
-    def one(x):
-        return jax.tree.map(lambda y: y[None], fn(jax.tree.map(lambda y: y[0], x)))
-    spec = P("devices")
-    sharded = jax.shard_map(one, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
-    return jax.jit(sharded, compiler_options=FAST)
 
-for name in sys.argv[2:]:
-    entry, trunk = ALGOS[name.split(":")[0]], name.partition(":")[2] or "separate"
+def devices_agree_on(name, trunk="separate"):
+    """And rewards and costs are scaled alike on one device and on two."""
+    entry = ALGOS[name]
     algo = entry.make(Corridor(), "devices")
-    sizes = dict(num_envs=4, horizon=10, minibatches=2, hidden=(4,), critic_epochs=2)
+    sizes = {"num_envs": 4, "horizon": 10, "minibatches": 2, "hidden": (4,), "critic_epochs": 2}
     cfg = entry.config(**sizes, reward_normalize=True, trunk=trunk)
-    keys = jnp.stack([jax.random.key(0)] * 2)
-    ts = split(lambda key: algo.init(key, cfg, START))(keys)
+    ts: Any = split(lambda key: algo.init(key, cfg, START))(jnp.stack([jax.random.key(0)] * 2))
     update = split(updated(algo))
     for _ in range(2):
         ts, metrics = update(ts)
         statistics = (ts.normaliser, ts.signal_normaliser, ts.lost_time)
-        shared = (ts.params, ts.opt_state, ts.dual, statistics, metrics)
-        for x in jax.tree.leaves(shared):
-            np.testing.assert_array_equal(x[0], x[1])  # the devices agree
+        agree((ts.params, ts.opt_state, ts.dual, statistics, metrics))
         obs = np.asarray(ts.rollout.state.obs)
         assert (obs[0] != obs[1]).any()  # on environments of their own
-    print(name, "ok")
+    keys = jax.random.split(
+        jax.random.key(1)
+    )  # rewards and costs of 2 x 4 environments, by both at once
+    reward, cost = (jax.random.normal(key, (2, 10, 4)) for key in keys)
 
-keys = jax.random.split(jax.random.key(1))  # rewards and costs of 2 x 4 environments, by both at once
-reward, cost = (jax.random.normal(key, (2, 10, 4)) for key in keys)
-def of(ts, reward, cost, axis_name=None):
-    return scaled(Signals(reward, cost, ts.signal_normaliser), ts.config, axis_name)
-halves = split(lambda x: of(*x, "devices"))((ts, reward, cost))
-one, flat = jax.tree.map(lambda x: x[0], ts), lambda x: jnp.concatenate(list(x), 1)
-whole = of(one, flat(reward), flat(cost))
-np.testing.assert_allclose(flat(halves[0]), whole[0], rtol=1e-4, atol=1e-5)
-for x, y in zip(jax.tree.leaves(halves[2]), jax.tree.leaves(whole[2])):
-    np.testing.assert_allclose(x[0], y, rtol=1e-5)
-    np.testing.assert_array_equal(x[0], x[1])
-assert whole[2].count == one.signal_normaliser.count + 80
-print("learned ok")
-"""
+    def of(axis_name, ts, reward, cost):
+        return scaled(Signals(reward, cost, ts.signal_normaliser), ts.config, axis_name)
+
+    halves = split(partial(of, "devices"))(ts, reward, cost)
+    one, flat = jax.tree.map(lambda x: x[0], ts), lambda x: jnp.concatenate(list(x), 1)
+    whole = of(None, one, flat(reward), flat(cost))
+    np.testing.assert_allclose(flat(halves[0]), whole[0], rtol=1e-4, atol=1e-5)
+    agree(halves[2])
+    for x, y in zip(jax.tree.leaves(halves[2]), jax.tree.leaves(whole[2]), strict=True):
+        np.testing.assert_allclose(x[0], y, rtol=1e-5)
+    assert whole[2].count == one.signal_normaliser.count + 80
 
 
 @pytest.mark.parametrize(
     "names", [[*ONE_OF_EACH_STEP, "cup", "p3o:shared"], pytest.param(OTHERS, marks=pytest.mark.slow)]
 )
 def test_two_devices_keep_the_same_parameters(names):
-    env = os.environ | {"JAX_NUM_CPU_DEVICES": "2", "JAX_PLATFORMS": "cpu"}
-    here = os.path.dirname(os.path.dirname(__file__))
-    command = [sys.executable, "-c", SHARDED, here, *names]
-    out = subprocess.run(command, env=env, capture_output=True, text=True)
-    assert out.returncode == 0, out.stderr[-3000:]
-    assert out.stdout.split() == [word for name in [*names, "learned"] for word in (name, "ok")]
+    assert on_two_devices(devices_agree, *names) == [f"{name} ok" for name in names]

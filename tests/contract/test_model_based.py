@@ -1,9 +1,6 @@
 """What every planning algorithm must do, on toys."""
 
 import dataclasses
-import os
-import subprocess
-import sys
 from functools import cache
 from typing import Any
 
@@ -14,6 +11,7 @@ import pytest
 from compiling import FAST
 from learners import at, copy, member, two_members
 from toys import START, Corridor, Lever
+from two_devices import on_two_devices, replays_apart
 
 from jaxsafe.algos import ALGOS
 from jaxsafe.config import ConfigError
@@ -232,45 +230,12 @@ def test_a_constrained_planner_holds_the_limit_and_earns_most_of_what_it_allows(
 
 # ---- devices -------------------------------------------------------------------------------------
 
-DEVICES = """
-import sys; sys.path.insert(0, sys.argv[1])
-import jax, jax.numpy as jnp, numpy as np
-from jax.sharding import AxisType, PartitionSpec as P
-from compiling import FAST, keep_programs
-from toys import Corridor
-sys.path.insert(0, sys.argv[1] + "/contract")
-from test_model_based import ALGOS, START, at, settings_of
 
-keep_programs()
-mesh = jax.make_mesh((2,), ("devices",), axis_types=(AxisType.Auto,))
-def split(fn):
-    def one(x, iteration):
-        return jax.tree.map(lambda y: y[None], fn(jax.tree.map(lambda y: y[0], x), iteration))
-    spec = P("devices")
-    sharded = jax.shard_map(one, mesh=mesh, in_specs=(spec, P()), out_specs=spec, check_vma=False)
-    return jax.jit(sharded, compiler_options=FAST)
-
-for name in sys.argv[2:]:
-    algo, cfg = ALGOS[name].make(Corridor(), "devices"), settings_of(name)
-    keys = jnp.stack([jax.random.key(0)] * 2)
-    ts = split(lambda key, shared: algo.init(key, cfg, shared))(keys, START)
-    update = split(algo.update)
-    for i in range(4):
-        ts, metrics = update(ts, at(i))
-        for x in jax.tree.leaves((ts.params, ts.opt_state, ts.dual, ts.lost_time, metrics)):
-            np.testing.assert_array_equal(x[0], x[1])  # the devices agree
-    rings = np.asarray(ts.replay.obs)
-    assert rings.shape[1] == 4 and (rings[0] != rings[1]).any()  # each with a ring of its own
-    print(name, "ok")
-"""
+def devices_agree(*names):
+    for name in names:
+        replays_apart(name, settings_of(name), at)
 
 
 @pytest.mark.slow
 def test_two_devices_keep_the_same_parameters():
-    env = os.environ | {"JAX_NUM_CPU_DEVICES": "2", "JAX_PLATFORMS": "cpu"}
-    here = os.path.dirname(os.path.dirname(__file__))
-    names = ["safe_loop", "cap_pets"]
-    command = [sys.executable, "-c", DEVICES, here, *names]
-    out = subprocess.run(command, env=env, capture_output=True, text=True)
-    assert out.returncode == 0, out.stderr[-3000:]
-    assert out.stdout.split() == [word for name in names for word in (name, "ok")]
+    assert on_two_devices(devices_agree, "safe_loop", "cap_pets") == ["safe_loop ok", "cap_pets ok"]

@@ -1,9 +1,6 @@
 """What every off-policy algorithm must do, on toys, and SAC's equations by hand."""
 
 import dataclasses
-import os
-import subprocess
-import sys
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -15,6 +12,7 @@ import pytest
 from compiling import FAST
 from learners import at, copy, member
 from toys import START, Arriving, Corridor, Lever, Ticker
+from two_devices import agree, on_two_devices, split
 
 from jaxsafe.algos import ALGOS
 from jaxsafe.config import ConfigError
@@ -450,71 +448,48 @@ def test_the_mean_of_two_cost_critics_is_near_the_truth_and_the_larger_above_it(
 
 # ---- devices -----------------------------------------------------------------------------------
 
-DEVICES = """
-import sys; sys.path.insert(0, sys.argv[1])
-import jax, jax.numpy as jnp, numpy as np
-from jax.sharding import AxisType, PartitionSpec as P
-from compiling import FAST, keep_programs
-from toys import START, Lever
-from jaxsafe.algos import ALGOS
-from jaxsafe.types import Shared
 
-keep_programs()
-UPDATES = 40
-
-def split(fn, devices=2):
-    def one(x):
-        return jax.tree.map(lambda y: y[None], fn(jax.tree.map(lambda y: y[0], x)))
-    spec = P("devices")
-    parts = {"devices": jax.devices()[:devices], "axis_types": (AxisType.Auto,)}
-    mesh = jax.make_mesh((devices,), ("devices",), **parts)
-    sharded = jax.shard_map(one, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
-    return jax.jit(sharded, compiler_options=FAST)
-
-def training(name, axis_name, num_envs, updates):
+def on_levers(name, axis_name, num_envs):
+    """key -> a train state and the metrics of 40 updates."""
     algo = ALGOS[name].make(Lever(), axis_name)
-    sizes = dict(num_envs=num_envs, learn_every=4)
+    sizes: dict[str, Any] = {"num_envs": num_envs, "learn_every": 4}
     if name != "sac":
-        sizes |= dict(cost_limit=1e3, lam_init=0.0)  # the price stays 0
+        sizes |= {"cost_limit": 1e3, "lam_init": 0.0}  # the price stays 0
     cfg = ALGOS[name].config(**{**ALGOS[name].lever, **sizes})
+
     def train(key):
         ts = algo.init(key, cfg, START)
-        return jax.lax.scan(lambda ts, i: algo.update(ts, Shared(i)), ts, jnp.arange(updates))
+        return jax.lax.scan(lambda ts, i: algo.update(ts, Shared(i)), ts, jnp.arange(40))
+
     return train
 
-for name in sys.argv[2:]:
-    keys = jnp.stack([jax.random.key(0)] * 2)
-    ts, metrics = split(training(name, "devices", 16, UPDATES))(keys)  # one seed, 2 x 16 environments
-    for x in jax.tree.leaves((ts.params, ts.opt_state, ts.normaliser, ts.lost_time, metrics)):
-        np.testing.assert_array_equal(x[0], x[1])  # the devices agree
+
+def seeds_and_devices(name):
+    same = jnp.stack([jax.random.key(0)] * 2)
+    ts, metrics = split(on_levers(name, "devices", 16))(same)  # one seed, 2 x 16 environments
+    agree((ts.params, ts.opt_state, ts.normaliser, ts.lost_time, metrics))
     rings = np.asarray(ts.replay.obs)
     assert rings.shape[1] == 16 and (rings[0] != rings[1]).any()  # each with a ring of its own
-    alone = split(training(name, None, 32, UPDATES), devices=1)
-    late = [np.asarray(m["train/return"])[..., -10:].mean() for m in (metrics, alone(keys[:1])[1])]
+    alone = split(on_levers(name, None, 32), devices=1)
+    late = [np.asarray(m["train/return"])[..., -10:].mean() for m in (metrics, alone(same[:1])[1])]
     assert min(late) > 17 and abs(late[0] - late[1]) < 1, late
     print(name, "one seed ok")
     keys = jax.random.split(jax.random.key(1))  # two seeds, one a device
-    both = split(training(name, None, 32, UPDATES))
+    both = split(on_levers(name, None, 32))
     here, there = both(keys), both(keys[::-1])
     for i in range(2):  # neither the neighbour nor the device matters, bit for bit
-        for x, y in zip(*(jax.tree.leaves(run[0].params) for run in (here, there))):
+        for x, y in zip(*(jax.tree.leaves(run[0].params) for run in (here, there)), strict=True):
             np.testing.assert_array_equal(x[i], y[1 - i])
         lone = alone(keys[i : i + 1])  # another program, which XLA fuses otherwise: alike at first
         x, y = (run[1]["train/critic_loss"] for run in (here, lone))
         np.testing.assert_allclose(x[i, :6], y[0, :6], rtol=1e-3)
     print(name, "two seeds ok")
-"""
 
 
 @pytest.mark.parametrize("name", ["sac", pytest.param("td3_lag", marks=pytest.mark.slow)])
 def test_one_seed_over_two_devices_learns_alike_and_two_seeds_are_the_lone_ones(name):
-    env = os.environ | {"JAX_NUM_CPU_DEVICES": "2", "JAX_PLATFORMS": "cpu"}
-    here = os.path.dirname(os.path.dirname(__file__))
-    out = subprocess.run(
-        [sys.executable, "-c", DEVICES, here, name], env=env, capture_output=True, text=True
-    )
-    assert out.returncode == 0, out.stderr[-3000:]
-    assert out.stdout.splitlines() == [f"{name} {what} ok" for what in ("one seed", "two seeds")]
+    said = on_two_devices(seeds_and_devices, name)
+    assert said == [f"{name} {what} ok" for what in ("one seed", "two seeds")]
 
 
 @pytest.mark.parametrize("name", QUICK)
