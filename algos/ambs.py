@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsafe.algos import dreamer
-from jaxsafe.config import Amount, Bounds, ConfigError, Iterations, Share, Weight, config, nearest
+from jaxsafe.config import Bounds, ConfigError, Iterations, Share, Weight, config, nearest
 from jaxsafe.learn.acting import Learned, Player, Playing
 from jaxsafe.learn.constraints import Costs
 from jaxsafe.learn.dreaming import (
@@ -105,7 +105,8 @@ class AMBSConfig(dreamer.ForesightConfig):
     shield: Literal["dreams", "true_dynamics"] = "dreams"
     # By which bound it decides. hoeffding: as in the paper. binomial: exact, so fewer dreams do.
     rule: Literal["hoeffding", "binomial"] = "binomial"
-    shield_rollouts: Amount = 64  # m, dreams of the shield at each step. The paper has 512.
+    # m, dreams of the shield at each step. The paper has 512.
+    shield_rollouts: Annotated[int, Bounds(1, 2**16)] = 64
     shield_horizon: Iterations = 30  # T, steps within which a violation counts, as in the paper.
     # H, steps of the shield's dreams with verdict=summed, as in the paper.
     shield_steps: Iterations = 15
