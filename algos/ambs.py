@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsafe.algos import dreamer
-from jaxsafe.config import Bounds, ConfigError, Iterations, Share, Weight, config, nearest
+from jaxsafe.config import Bounds, ConfigError, Iterations, Share, Weight, config
 from jaxsafe.learn.acting import Learned, Player, Playing
-from jaxsafe.learn.constraints import Costs
+from jaxsafe.learn.constraints import Costs, check_cost_names, signal
 from jaxsafe.learn.dreaming import (
     Behaviour,
     Memory,
@@ -105,7 +105,8 @@ class AMBSConfig(dreamer.ForesightConfig):
     shield: Literal["dreams", "true_dynamics"] = "dreams"
     # By which bound it decides. hoeffding: as in the paper. binomial: exact, so fewer dreams do.
     rule: Literal["hoeffding", "binomial"] = "binomial"
-    # m, dreams of the shield at each step. The paper has 512.
+    # m, dreams of the shield at each step. The paper has 512. More than 65,536 are beyond what 32 bits
+    # tell of the exact bound.
     shield_rollouts: Annotated[int, Bounds(1, 2**16)] = 64
     shield_horizon: Iterations = 30  # T, steps within which a violation counts, as in the paper.
     # H, steps of the shield's dreams with verdict=summed, as in the paper.
@@ -128,24 +129,10 @@ class AMBSConfig(dreamer.ForesightConfig):
 # ---- what a violation is -----------------------------------------------------------------------
 
 
-def labelled(env: Env, cfg: Any) -> list[int]:
-    """Which of the environment's costs are violations.
-
-    Raises:
-        ConfigError: a label that the environment does not have.
-    """
-    for name in cfg.labels:
-        if name not in env.cost_names:
-            hint = nearest(name, env.cost_names) if env.cost_names else "; the environment has none"
-            raise ConfigError(f"labels: unknown cost {name!r}{hint}")
-    return [env.cost_names.index(name) for name in cfg.labels]
-
-
 def violated(env: Env, rows: Costs, cfg: Any) -> jax.Array:
     """Where a row has a violation, bool [...]."""
-    if not cfg.labels:
-        return rows.cost > 0
-    return (rows.costs[..., labelled(env, cfg)] > 0).any(-1)
+    costs = signal(env, rows, cfg.labels)
+    return (costs > 0).any(-1) if cfg.labels else costs > 0
 
 
 def targets(env: Env, rows: Record, cfg: Any) -> dict[str, jax.Array]:
@@ -446,7 +433,7 @@ def overruled_from(cfg: Any) -> int:
 
 def check(cfg: Any, env: Env, data: Any = ()) -> None:
     """Raise ConfigError for unknown labels, and for a shield that would always act, or never."""
-    labelled(env, cfg)
+    check_cost_names("labels", cfg.labels, env)
     if cfg.shield == "dreams" and cfg.verdict == "summed" and cfg.discount == 1:
         raise ConfigError(
             "discount=1: expected less, as verdict=summed tells steps within shield_horizon by it"

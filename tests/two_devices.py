@@ -1,8 +1,10 @@
 """Claims about two devices, in a process that has two.
 
-def claim(*names): ...
+def claim(*names):
+    ...
+    print(name, "ok")
 
-assert on_two_devices(claim, "ambs") == ["ambs ok"]  # what it prints
+assert on_two_devices(claim, "ambs") == ["ambs ok"]
 """
 
 import inspect
@@ -19,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from compiling import FAST, keep_programs
 from jax.sharding import AxisType, PartitionSpec
+from learners import at
 from toys import START, Corridor
 
 from jaxsafe.algos import ALGOS
@@ -27,10 +30,15 @@ HERE = Path(__file__).parent
 
 
 def on_two_devices(claim: Callable[..., None], *names: str) -> list[str]:
-    """The lines that `claim(*names)` prints, a function of a module of tests."""
+    """Run `claim(*names)`, a function at the top of a test module, in a process with two devices.
+
+    Returns the lines that it prints.
+    """
     file = Path(inspect.getfile(claim))
+    path = os.pathsep.join([str(HERE), str(HERE.parent), os.environ.get("PYTHONPATH", "")])
+    env = os.environ | {"JAX_NUM_CPU_DEVICES": "2", "JAX_PLATFORMS": "cpu", "PYTHONPATH": path}
+    env.pop("PJRT_NPROC", None)  # of this process, which has one device
     command = [sys.executable, __file__, str(file.parent), file.stem, claim.__name__, *names]
-    env = os.environ | {"JAX_NUM_CPU_DEVICES": "2", "JAX_PLATFORMS": "cpu"}
     out = subprocess.run(command, env=env, capture_output=True, text=True)
     assert out.returncode == 0, out.stderr[-3000:]
     return out.stdout.splitlines()
@@ -50,20 +58,18 @@ def split(fn: Callable, devices: int = 2) -> Callable:
 
 
 def agree(tree: Any) -> None:
-    """Hold that both devices have the same."""
+    """Assert that both devices have the same arrays."""
     for x in jax.tree.leaves(tree):
         np.testing.assert_array_equal(x[0], x[1])
 
 
-def replays_apart(name: str, cfg: Any, at: Callable[[int], Any]) -> None:
-    """Hold of an algorithm with a replay that devices keep the same parameters, each with a ring of its
-    own. `at` gives what an update is told of its iteration."""
+def same_parameters_own_replays(name: str, cfg: Any) -> None:
+    """Assert that two devices keep the same parameters, and each a replay of its own."""
     algo = ALGOS[name].make(Corridor(), "devices")
     ts = split(lambda key: algo.init(key, cfg, START))(jnp.stack([jax.random.key(0)] * 2))
     update = split(algo.update)
     for i in range(4):
-        now = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * 2), at(i))
-        ts, metrics = update(ts, now)
+        ts, metrics = update(ts, jax.tree.map(lambda x: jnp.stack([x, x]), at(i)))
         agree((ts.params, ts.opt_state, ts.dual, ts.lost_time, metrics))
     rings = np.asarray(ts.replay.obs)
     assert rings.shape[1] == cfg.num_envs and (rings[0] != rings[1]).any()
@@ -71,7 +77,7 @@ def replays_apart(name: str, cfg: Any, at: Callable[[int], Any]) -> None:
 
 
 if __name__ == "__main__":
-    folder, module, name, *words = sys.argv[1:]
-    sys.path += [str(HERE), folder]
+    folder, module, function, *words = sys.argv[1:]
+    sys.path.append(folder)
     keep_programs()
-    getattr(import_module(module), name)(*words)
+    getattr(import_module(module), function)(*words)

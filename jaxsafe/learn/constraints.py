@@ -63,11 +63,12 @@ def limits_in_words(limits: dict[str, float]) -> str:
     return ", ".join(f"{name} {most:.9g}".lstrip() for name, most in limits.items()) or "-"
 
 
-def check_cost_names(names: Iterable[str], env: Env) -> None:
+def check_cost_names(option: str, names: Iterable[str], env: Env) -> None:
+    """Raise ConfigError for a cost, named by an option, that the environment does not have."""
     for name in names:
         if name not in env.cost_names:
             hint = nearest(name, env.cost_names) if env.cost_names else "; the environment has none"
-            raise ConfigError(f"cost_limits: unknown cost {name!r}{hint}")
+            raise ConfigError(f"{option}: unknown cost {name!r}{hint}")
 
 
 class Costs(Protocol):

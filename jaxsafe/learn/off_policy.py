@@ -124,7 +124,7 @@ def off_policy(
     def init(key: jax.Array, cfg: Any, shared: Shared) -> TrainState:
         rows = timetable_of(cfg, axis_name).ring
         names = treatment.constrained_costs(cfg)
-        check_cost_names(names, env)
+        check_cost_names("cost_limits", names, env)
         cfg = jax.tree.map(jnp.float32, cfg)
         params_key, stepping_key, key = jax.random.split(key, 3)
         rollout = init_rollout(env, device_key(stepping_key, axis_name), cfg.num_envs, cfg.stagger)

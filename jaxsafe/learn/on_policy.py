@@ -309,7 +309,7 @@ def on_policy_loop(env: Env, method: Method, axis_name: str | None) -> Algorithm
         dual = method.init_dual(cfg)
         wrapped = augmentation.wrap(env, cfg, dual)
         names = constrained_costs(cfg)
-        check_cost_names(names, env)
+        check_cost_names("cost_limits", names, env)
         rollout = init_rollout(wrapped, device_key(rollout_key, axis_name), cfg.num_envs, cfg.stagger)
         obs = jax.tree.map(operator.itemgetter(0), rollout.state.obs)
         check_observation(obs, cfg)

@@ -78,7 +78,7 @@ def append_versions(folder: Path, device: str, engine: str | None, dataset: str 
     """Add this start of the run to versions.json, with the SHA-256 of its data set."""
     now = {
         "time": datetime.datetime.now().astimezone().isoformat(timespec="seconds"),
-        "command": command(sys.argv),
+        "command": typed_command(sys.argv),
         "commit": commit(),
         "device": device,
         "engine": engine,
@@ -91,12 +91,12 @@ def append_versions(folder: Path, device: str, engine: str | None, dataset: str 
     files.write(folder / "versions.json", json.dumps([*starts(folder), now], indent=1))
 
 
-def command(argv: Sequence[str]) -> str:
-    """What was typed: `hydra_jobs` adds the ++ that Hydra needs, and `jaxsafe` its own name."""
-    script, *words = (x.removeprefix("++") for x in argv)
-    if script.startswith("jaxsafe "):  # the command `jaxsafe train`
-        return f"{script} {shlex.join(words)}"
-    return shlex.join([Path(sys.executable).name, script, *words])
+def typed_command(argv: Sequence[str]) -> str:
+    """The command as it was typed. `hydra_jobs` adds ++ to words, and `jaxsafe train` is one word."""
+    words = [x.removeprefix("++") for x in argv]
+    if words and words[0].startswith("jaxsafe "):
+        return f"{words[0]} {shlex.join(words[1:])}"
+    return shlex.join([Path(sys.executable).name, *words])
 
 
 def starts(folder: Path) -> list[dict[str, Any]]:

@@ -370,7 +370,7 @@ def changed_options(options: dict[str, Any], entry: EnvEntry) -> dict[str, Any]:
 
 def make_env(settings: Settings) -> Env:
     env = settings.env_entry.make(**changed_options(settings.env_options, settings.env_entry))
-    check_cost_names(limits_by_name(settings.algo), env)
+    check_cost_names("cost_limits", limits_by_name(settings.algo), env)
     return env
 
 

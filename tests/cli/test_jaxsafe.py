@@ -88,9 +88,16 @@ def test_python_m_jaxsafe_is_the_command(tmp_path):
     assert (done.returncode, done.stdout) == (2, "") and "did you mean 'plot'" in done.stderr
 
 
-def test_an_opengl_that_there_is_not_is_one_line():
+def test_a_missing_opengl_is_reported_in_one_line(tmp_path):
     env = os.environ | {"MUJOCO_GL": "vulkan"}
-    command = [sys.executable, "-m", "jaxsafe", "train", "env=point_goal1"]
-    done = subprocess.run(command, env=env, capture_output=True, text=True)
-    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
-    assert "MUJOCO_GL=vulkan: MuJoCo does not load" in done.stderr
+
+    def said(*words):
+        command = [sys.executable, "-m", "jaxsafe", *words]
+        where = {"cwd": tmp_path, "env": env, "timeout": 60}
+        done = subprocess.run(command, capture_output=True, text=True, **where)
+        return done.returncode, done.stdout, done.stderr
+
+    status, out, err = said("plot", "nowhere")
+    assert (status, out, err.count("\n")) == (2, "", 1)
+    assert "MUJOCO_GL=vulkan: MuJoCo does not load" in err
+    assert said("--version") == (0, f"jaxsafe {__version__}\n", "")

@@ -11,7 +11,7 @@ import pytest
 from compiling import FAST
 from learners import at, copy, member, two_members
 from toys import START, Corridor, Ledge, Lever
-from two_devices import on_two_devices, replays_apart
+from two_devices import on_two_devices, same_parameters_own_replays
 
 from jaxsafe.algos import ALGOS, ambs
 from jaxsafe.config import ConfigError
@@ -262,7 +262,7 @@ def test_a_shield_keeps_from_a_ledge_that_dreamer_goes_beyond():
 
 
 def devices_agree(name):
-    replays_apart(name, settings_of(name), at)
+    same_parameters_own_replays(name, settings_of(name))
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import FAST
 from learners import compiled, member, members, on_policy_names, others_slowly
 from toys import START, Corridor, updated
 from two_devices import agree, on_two_devices, split
@@ -47,7 +48,6 @@ def devices_agree(*names):
 
 
 def devices_agree_on(name, trunk="separate"):
-    """And rewards and costs are scaled alike on one device and on two."""
     entry = ALGOS[name]
     algo = entry.make(Corridor(), "devices")
     sizes = {"num_envs": 4, "horizon": 10, "minibatches": 2, "hidden": (4,), "critic_epochs": 2}
@@ -60,22 +60,36 @@ def devices_agree_on(name, trunk="separate"):
         agree((ts.params, ts.opt_state, ts.dual, statistics, metrics))
         obs = np.asarray(ts.rollout.state.obs)
         assert (obs[0] != obs[1]).any()  # on environments of their own
-    keys = jax.random.split(
-        jax.random.key(1)
-    )  # rewards and costs of 2 x 4 environments, by both at once
+
+
+def signals_are_scaled_alike():
+    """By two devices with four environments each, and by one with all eight."""
+    algo = ALGOS["ppo_lag"].make(Corridor())
+    cfg = ALGOS["ppo_lag"].config(num_envs=4, horizon=10, minibatches=2, reward_normalize=True)
+    one: Any = jax.jit(lambda key: algo.init(key, cfg, START), compiler_options=FAST)(jax.random.key(0))
+    keys = jax.random.split(jax.random.key(1))
     reward, cost = (jax.random.normal(key, (2, 10, 4)) for key in keys)
 
-    def of(axis_name, ts, reward, cost):
-        return scaled(Signals(reward, cost, ts.signal_normaliser), ts.config, axis_name)
+    def scale(axis_name, reward, cost):
+        return scaled(Signals(reward, cost, one.signal_normaliser), one.config, axis_name)
 
-    halves = split(partial(of, "devices"))(ts, reward, cost)
-    one, flat = jax.tree.map(lambda x: x[0], ts), lambda x: jnp.concatenate(list(x), 1)
-    whole = of(None, one, flat(reward), flat(cost))
+    def flat(x):
+        return jnp.concatenate(list(x), 1)
+
+    halves, whole = (
+        split(partial(scale, "devices"))(reward, cost),
+        scale(None, flat(reward), flat(cost)),
+    )
     np.testing.assert_allclose(flat(halves[0]), whole[0], rtol=1e-4, atol=1e-5)
     agree(halves[2])
     for x, y in zip(jax.tree.leaves(halves[2]), jax.tree.leaves(whole[2]), strict=True):
         np.testing.assert_allclose(x[0], y, rtol=1e-5)
     assert whole[2].count == one.signal_normaliser.count + 80
+    print("ok")
+
+
+def test_two_devices_scale_signals_as_one_does():
+    assert on_two_devices(signals_are_scaled_alike) == ["ok"]
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import pytest
 from compiling import FAST
 from learners import at, copy, member, two_members
 from toys import START, Corridor, Lever
-from two_devices import on_two_devices, replays_apart
+from two_devices import on_two_devices, same_parameters_own_replays
 
 from jaxsafe.algos import ALGOS
 from jaxsafe.config import ConfigError
@@ -233,7 +233,7 @@ def test_a_constrained_planner_holds_the_limit_and_earns_most_of_what_it_allows(
 
 def devices_agree(*names):
     for name in names:
-        replays_apart(name, settings_of(name), at)
+        same_parameters_own_replays(name, settings_of(name))
 
 
 @pytest.mark.slow

@@ -467,7 +467,7 @@ def test_coptidice_finds_the_visits_of_the_linear_program():
     w = np.asarray(coptidice.inverse_slope(jnp.array(e / cfg.alpha)))
     np.testing.assert_allclose(w / 4, best, atol=0.02 * best.max())
     np.testing.assert_allclose(metrics["train/cost_estimate"][-1], 10 * limit, rtol=0.02)
-    # the policy's mean is that of the signs that the program has from each state
+    # in each state the policy's mean is the mean action of the program's visits
     visits = best.reshape(2, 2)
     assert (visits.min(1) > 0.02).any()  # in some state it takes both
     acts = learner.act(Learned(cfg, nets.params, (), ()), jnp.eye(2), None)[:, 0]

@@ -172,6 +172,6 @@ def test_the_command_of_a_run_is_recorded_as_it_was_typed(tmp_path, monkeypatch)
 
 
 def test_the_command_jaxsafe_is_recorded_without_python():
-    assert run_folder.command(["jaxsafe train", "env=point_goal1", "tag=a b"]) == (
+    assert run_folder.typed_command(["jaxsafe train", "env=point_goal1", "tag=a b"]) == (
         "jaxsafe train env=point_goal1 'tag=a b'"
     )

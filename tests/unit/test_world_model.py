@@ -94,7 +94,7 @@ def test_the_divergence_of_latents_is_summed_over_them():
     assert rssm.kl(p, p) == 0
 
 
-# ---- returns, weights, percentiles, steps ------------------------------------------------------------
+# ---- returns, weights, percentiles, steps ---------------------------------------------------------
 
 
 def test_the_returns_of_dreams_by_hand():
@@ -132,15 +132,17 @@ def test_a_dream_weighs_how_likely_it_still_goes_on():
 
 
 def test_actors_and_critics_learn_from_a_dream_as_much_as_it_weighs(monkeypatch):
-    """And dreams begin at all rows of the batch, with k_0 = 0 where an episode failed."""
+    """And dreams begin at all rows of the batch, with k_0 = 0 where an episode failed, and 1 where it
+    ran out of time."""
     keys = jax.random.split(jax.random.key(0), 6)
     advantage, log_prob, entropy, of_critic = (jax.random.normal(key, (2, 6)) for key in keys[:4])
     weight = jax.random.uniform(keys[4], (3, 6))
     cfg, no = dreamer.DreamerConfig(entropy_coef=0.5), jnp.zeros((3, 2), bool)
-    zeros, failed = jnp.zeros((3, 2)), no.at[1, 0].set(True)
+    zeros = jnp.zeros((3, 2))
     rows = Record(
-        zeros[..., None], zeros[..., None], zeros, zeros, zeros[..., None], no, failed, failed
-    )
+        obs=zeros[..., None], action=zeros[..., None], reward=zeros, cost=zeros, costs=zeros[..., None],
+        first=no, terminated=no.at[1, 0].set(True), truncated=no.at[1, 1].set(True),
+    )  # fmt: skip
     share = jnp.array([0.75, 0.25])  # of the two sequences
     latents = rssm.Latent(jax.random.normal(keys[5], (3, 2, 5)), jnp.zeros((3, 2, 4)))
     unused: Any = None
@@ -152,9 +154,13 @@ def test_actors_and_critics_learn_from_a_dream_as_much_as_it_weighs(monkeypatch)
     monkeypatch.setattr(Scene, "_loss", lambda *args: of_critic)
     loss = (weight[:2] * of_critic * each).sum() / 2
     np.testing.assert_allclose(scene.critic_loss({}, "critic_r", dreams, zeros), loss, rtol=1e-5)
-    monkeypatch.setattr(dreaming, "dream", lambda *args: args)
-    asked: Any = scene.dream((), keys[0])
-    start, alive = asked[4:6]
+
+    def asked(world, params, policy, actor, start, alive, *_):
+        return start, alive
+
+    monkeypatch.setattr(dreaming, "dream", asked)
+    found: Any = scene.dream((), keys[0])
+    start, alive = found
     np.testing.assert_array_equal(start.deter, latents.deter.reshape(6, 5))
     np.testing.assert_array_equal(alive, [1, 1, 0, 1, 1, 1])
 
