@@ -59,7 +59,9 @@ PRICED = [name for name in AVERAGE if "dual_lr" in options_of(name)]
 
 @pytest.mark.parametrize("name", slow_but(QUICK, [name for name in AVERAGE if name not in PRICED]))
 def test_constrained_algorithms_earn_what_the_limit_allows(name):
-    ret, cost = late(train(name)[2])
+    """A controller's first price is too high, and swings as it falls: hence a longer run and mean."""
+    iterations, window = (160, 60) if "pid_ki" in options_of(name) else (100, 30)
+    ret, cost = late(train(name, iterations)[2], window)
     assert (cost < LIMIT * 1.1).all()
     assert (ret > 0.9 * BEST).all()
 
