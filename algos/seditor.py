@@ -53,6 +53,13 @@ class SEditorConfig(LagrangianConfig, PriceClockConfig, OffPolicyConfig):
         minimise_lam    (cost_limit - J_c) lam,   lam = softplus(l),  by Adam
         Q' <- Q' + tau (Q - Q')
 
+    Without an editor (`edit=none`) one policy acts, a = u, and
+
+        maximise_pi     E[(Q_r(s, a) - lam Q_c(s, a)) / (1 + lam) + alpha_1 H(pi)]
+
+    Then alpha_1 H(pi) counts as reward in G_r and against cost in G_c. That is the authors'
+    SAC-Lagrangian.
+
     Q_r is the smaller of two critics' values and Q_c the larger, and so are their targets', which take
     actions that both policies draw anew. Both policies are Beta distributions. While one is trained,
     the other is fixed. TD(lambda) returns run over replayed sequences of `n_step` + 1 rows. Rewards and
@@ -119,7 +126,8 @@ class SEditorConfig(LagrangianConfig, PriceClockConfig, OffPolicyConfig):
     # a - u, the paper's SEditor-L2. reward: nothing; the editor earns Q_r(s, a) itself.
     distance: Literal["hinge", "action", "reward"] = "hinge"
     # How the change is applied. add: as in the paper. overwrite: a = v, an ablation of the authors.
-    edit: Literal["add", "overwrite"] = "add"
+    # none: a = u. There is no editor, and the proposer itself pays: the authors' SAC-Lagrangian.
+    edit: Literal["add", "overwrite", "none"] = "add"
     # Whether the mean is taken from rewards and costs before they are scaled, as in the authors' code.
     # Where episodes can fail, a failure is then worth as much as going on at the mean.
     centre: bool = True
@@ -172,7 +180,7 @@ soft_lagrangian = Treatment(
 
 class Edited(NamedTuple):
     """Proposals and what the editor makes of them, float [..., A]; the log probabilities of the
-    proposals and of the changes, float [...]."""
+    proposals and of the changes, float [...]. Without an editor nothing is changed, for sure."""
 
     proposal: jax.Array
     action: jax.Array
@@ -191,9 +199,11 @@ def editor_of(editor: PyTree, obs: jax.Array, proposal: jax.Array, cfg: Any) -> 
 
 
 def edited(proposer: PyTree, editor: PyTree, obs: jax.Array, key: jax.Array, cfg: Any) -> Edited:
-    """Both policies' draws for `obs` [..., O]."""
+    """Both policies' draws for `obs` [..., O]. Without an editor, `editor` is ()."""
     proposal_key, change_key = jax.random.split(key)
     proposal, log_prob = beta_sample(beta_policy(proposer, obs, cfg), proposal_key)
+    if cfg.edit == "none":
+        return Edited(proposal, proposal, log_prob, jnp.zeros_like(log_prob))
     change, log_prob_change = beta_sample(editor_of(editor, obs, proposal, cfg), change_key)
     return Edited(proposal, edit(proposal, change, cfg), log_prob, log_prob_change)
 
@@ -204,6 +214,8 @@ def act(learned: Learned, obs: jax.Array, key: jax.Array | None) -> jax.Array:
     if key is not None:
         return edited(params["proposer"], params["editor"], obs, key, cfg).action
     proposal = beta_mode(beta_policy(params["proposer"], obs, cfg))
+    if cfg.edit == "none":
+        return proposal
     return edit(proposal, beta_mode(editor_of(params["editor"], obs, proposal, cfg)), cfg)
 
 
@@ -225,14 +237,10 @@ def init_small_critics(key: jax.Array, critics: PyTree, cfg: Any) -> PyTree:
 def optimisers(cfg: Any, share: jax.Array | float) -> dict[str, optax.GradientTransformation]:
     policy, critic = (adam(lr * share, cfg, EPS) for lr in (cfg.lr, cfg.critic_lr))
     temperature = optax.adam(cfg.alpha_lr, eps=EPS)
-    return {
-        "proposer": policy,
-        "editor": policy,
-        "critic_r": critic,
-        "critic_c": critic,
-        "log_alpha": temperature,
-        "log_alpha_editor": temperature,
-    }
+    rules = {"proposer": policy, "critic_r": critic, "critic_c": critic, "log_alpha": temperature}
+    if cfg.edit == "none":
+        return rules
+    return rules | {"editor": policy, "log_alpha_editor": temperature}
 
 
 def reward_value(params: dict[str, PyTree], obs: jax.Array, action: jax.Array, cfg: Any) -> jax.Array:
@@ -241,12 +249,21 @@ def reward_value(params: dict[str, PyTree], obs: jax.Array, action: jax.Array, c
 
 
 def proposer_gain(
-    proposer: PyTree, params: dict[str, PyTree], obs: jax.Array, key: jax.Array, cfg: Any
+    proposer: PyTree,
+    params: dict[str, PyTree],
+    dual: Any,
+    obs: jax.Array,
+    key: jax.Array,
+    cfg: Any,
 ) -> tuple[jax.Array, jax.Array]:
     """What the proposer climbs at `obs` [..., O], float [...], and the log probabilities."""
     found = edited(proposer, params["editor"], obs, key, cfg)
-    q_r = reward_value(params, obs, found.action, cfg)
-    return q_r - jnp.exp(params["log_alpha"]) * found.log_prob, found.log_prob
+    if cfg.edit == "none":
+        q_r, q_c = with_reduced_cost(params, obs, found.action, constrained_costs(cfg), cfg)
+        worth = soft_lagrangian.advantage(dual, smallest(q_r), q_c)
+    else:
+        worth = reward_value(params, obs, found.action, cfg)
+    return worth - jnp.exp(params["log_alpha"]) * found.log_prob, found.log_prob
 
 
 def editor_gain(
@@ -292,16 +309,17 @@ def seditor_learner(env: Env) -> Learner:
             name: init_small_critics(key, critics[name], cfg)
             for name, key in zip(critics, keys[4:], strict=True)
         }
-        trained = critics | {
+        networks = critics | {
             "proposer": init_beta(keys[0], obs_size, action_size, cfg),
             "editor": init_beta(keys[1], obs_size + action_size, action_size, cfg),
             "log_alpha": jnp.log(cfg.alpha_init),
             "log_alpha_editor": jnp.log(cfg.alpha_init),
         }
         rules = optimisers(cfg, 1.0)
-        opt_state: dict[str, Any] = {name: rules[name].init(x) for name, x in trained.items()}
+        opt_state: dict[str, Any] = {name: rule.init(networks[name]) for name, rule in rules.items()}
         opt_state["moments"] = no_moments(1 + max(len(names), 1))
-        return Trainable(trained | {"targets": critics}, opt_state)
+        trained = {name: networks[name] for name in rules}
+        return Trainable({"editor": ()} | trained | {"targets": critics}, opt_state)
 
     def step(
         nets: Trainable, batch: SequenceBatch, at: GradientStep, cfg: Any, axis_name: str | None
@@ -323,6 +341,10 @@ def seditor_learner(env: Env) -> Learner:
         def mean_step(x: jax.Array) -> jax.Array:
             return (counted * x).sum()
 
+        def heat(log_prob: jax.Array, min_prob: jax.Array | float) -> jax.Array:
+            """What a temperature's logarithm is pulled by: entropy beyond its target."""
+            return -mean(jax.lax.stop_gradient(log_prob) + size * jnp.log(2 * min_prob))
+
         # rewards and costs
         charged = signal(env, rows, names)
         paid = jnp.concatenate([rows.reward[..., None], charged.reshape(*rows.reward.shape, -1)], -1)
@@ -333,6 +355,11 @@ def seditor_learner(env: Env) -> Learner:
         # targets
         found = edited(params["proposer"], params["editor"], rows.obs, target_key, cfg)
         next_q, next_c = with_reduced_cost(targets, rows.obs, found.action, names, cfg)
+        if cfg.edit == "none":
+            bonus = -jnp.exp(params["log_alpha"]) * found.log_prob  # alpha H where the step led to
+            bonus = jnp.where(rows.terminated, 0.0, bonus)
+            reward += cfg.discount * bonus
+            cost -= cfg.cost_discount * bonus.reshape(*bonus.shape, *(1,) * (cost.ndim - bonus.ndim))
 
         def returns(earned: jax.Array, value: jax.Array, discount: jax.Array) -> jax.Array:
             return lambda_returns(
@@ -348,30 +375,33 @@ def seditor_learner(env: Env) -> Learner:
             loss_r = mean_step(((q - y_r) ** 2).sum(0))
             loss_c = each(mean_step, names)(((q_c - y_c) ** 2).sum(0))
 
-            gain, log_prob = proposer_gain(trained["proposer"], params, rows.obs, proposer_key, cfg)
-            gain_e, drawn, lost = editor_gain(
-                trained["editor"], params, at.dual, rows.obs, editor_key, cfg
+            gain, log_prob = proposer_gain(
+                trained["proposer"], params, at.dual, rows.obs, proposer_key, cfg
             )
-            sure, sure_e = map(jax.lax.stop_gradient, (log_prob, drawn.log_prob_change))
-            aims = (size * jnp.log(2 * x) for x in (cfg.min_prob, cfg.editor_min_prob))
-            heat, heat_e = (-mean(x + aim) for x, aim in zip((sure, sure_e), aims, strict=True))
-            temperature = trained["log_alpha"] * heat + trained["log_alpha_editor"] * heat_e
-
+            total = loss_r + loss_c.sum() - mean(gain)
+            total += trained["log_alpha"] * heat(log_prob, cfg.min_prob)
             metrics = {
                 "train/critic_loss": loss_r,
                 "train/critic_loss_c": loss_c,
                 "train/q": mean_step(q.mean(0)),
                 "train/q_c": each(mean_step, names)(q_c.mean(0)),
                 "train/actor_loss": -mean(gain),
-                "train/editor_loss": -mean(gain_e),
-                "train/entropy": -mean(sure),
-                "train/entropy_editor": -mean(sure_e),
+                "train/entropy": -mean(log_prob),
                 "train/alpha": jnp.exp(params["log_alpha"]),
-                "train/alpha_editor": jnp.exp(params["log_alpha_editor"]),
-                "train/edit": mean(jnp.abs(drawn.action - drawn.proposal).mean(-1)),
-                "train/edit_loss": mean(lost),
             }
-            total = loss_r + loss_c.sum() - mean(gain) - mean(gain_e) + temperature
+            if cfg.edit != "none":
+                gain, drawn, lost = editor_gain(
+                    trained["editor"], params, at.dual, rows.obs, editor_key, cfg
+                )
+                total -= mean(gain)
+                total += trained["log_alpha_editor"] * heat(drawn.log_prob_change, cfg.editor_min_prob)
+                metrics |= {
+                    "train/editor_loss": -mean(gain),
+                    "train/entropy_editor": -mean(drawn.log_prob_change),
+                    "train/alpha_editor": jnp.exp(params["log_alpha_editor"]),
+                    "train/edit": mean(jnp.abs(drawn.action - drawn.proposal).mean(-1)),
+                    "train/edit_loss": mean(lost),
+                }
             return total, jax.lax.stop_gradient(metrics)
 
         rules = optimisers(cfg, at.remaining if cfg.lr_decay else 1.0)

@@ -422,11 +422,15 @@ PRICED = [name for name in NAMES if ALGOS[name].holds == "average"]
 
 
 @pytest.mark.parametrize(
-    "name, updates",
-    [("sac_lag", 300), *(pytest.param(name, 400, marks=pytest.mark.slow) for name in PRICED)],
+    "name, updates, settings",
+    [
+        ("sac_lag", 300, {}),
+        *(pytest.param(name, 400, {}, marks=pytest.mark.slow) for name in PRICED),
+        pytest.param("seditor", 700, {"edit": "none"}, marks=pytest.mark.slow),
+    ],
 )
-def test_a_price_holds_the_limit_on_average(name, updates):
-    metrics = trained(name, updates, cost_limit=LIMIT)
+def test_a_price_holds_the_limit_on_average(name, updates, settings):
+    metrics = trained(name, updates, cost_limit=LIMIT, **settings)
     late = slice(-updates // 2, None)
     ret, cost = (np.asarray(metrics[f"train/{k}"])[:, late].mean(1) for k in ("return", "cost"))
     assert (cost < LIMIT * 1.1).all() and (cost > LIMIT * 0.8).all()

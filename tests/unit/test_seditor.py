@@ -19,6 +19,7 @@ from toys import START, Lever, momentum
 
 from jaxsafe.algos import ALGOS, seditor
 from jaxsafe.config import ConfigError
+from jaxsafe.learn.acting import Learned
 from jaxsafe.learn.critics import Values
 from jaxsafe.learn.learner import GradientStep
 from jaxsafe.learn.normalise import averaged, no_moments, standard
@@ -183,7 +184,7 @@ def test_the_proposer_feels_its_own_action_and_what_the_editor_makes_of_it():
     def slope(proposer, editor):
         def gain(proposer):
             given = params | {"editor": editor}
-            return seditor.proposer_gain(proposer, given, obs, jax.random.key(1), cfg)[0].mean()
+            return seditor.proposer_gain(proposer, given, None, obs, jax.random.key(1), cfg)[0].mean()
 
         return jax.grad(gain)(proposer)["params"]["Dense_0"]["bias"]
 
@@ -216,7 +217,7 @@ def test_the_editor_brings_unsafe_proposals_to_the_bound_as_the_price_grows(hill
     def train(lam):
         def loss(own, key):
             given = params | jax.lax.stop_gradient(own)
-            of_proposer, _ = seditor.proposer_gain(own["proposer"], given, obs, key, CFG)
+            of_proposer, _ = seditor.proposer_gain(own["proposer"], given, None, obs, key, CFG)
             of_editor, *_ = seditor.editor_gain(own["editor"], given, Price(lam), obs, key, CFG)
             return -of_proposer.mean() - of_editor.mean()
 
@@ -428,7 +429,7 @@ def test_each_network_moves_along_its_own_objective_alone():
         p = before.params
 
         def proposer(net):
-            return mean(seditor.proposer_gain(net, p, seen.obs, proposer_key, cfg)[0])
+            return mean(seditor.proposer_gain(net, p, dual, seen.obs, proposer_key, cfg)[0])
 
         def editor(net):
             return mean(seditor.editor_gain(net, p, dual, seen.obs, editor_key, cfg)[0])
@@ -488,6 +489,89 @@ def test_each_network_moves_along_its_own_objective_alone():
         np.testing.assert_allclose(
             after.opt_state[name][0].mu, 0.1 * (metrics[entropy] - aim), rtol=1e-5
         )
+
+
+@pytest.mark.parametrize("failed", [False, True])
+def test_without_an_editor_one_policy_pays_and_its_entropy_counts_in_all_returns(failed):
+    """Linear critics by hand: alpha H is reward and takes away from cost, but not beyond a failure. The
+    policy's momentum is a tenth of the gradient of what it earns less what it pays."""
+    cfg = jax.tree.map(
+        jnp.float32,
+        dataclasses.replace(CFG, edit="none", n_step=3, batch_size=8, max_grad_norm=float("inf"),
+                            discount=0.9, cost_discount=0.8, td_lambda=0.0, alpha_init=0.5,
+                            concentration_clip=float("inf")),
+    )  # fmt: skip
+    learner, batch = seditor.seditor_learner(Lever()), batch_of(jax.random.key(5))
+    if failed:
+        ended = dataclasses.replace(batch.rows, terminated=batch.rows.truncated)
+        batch = batch._replace(rows=ended)
+    dual = seditor.init_soft_multiplier(dataclasses.replace(cfg, lam_init=jnp.float32(2)))
+    at = GradientStep(jnp.int32(0), jnp.float32(1), jax.random.key(7), dual)
+    seen, (target_key, proposer_key, _) = batch.rows, jax.random.split(at.key, 3)
+
+    @functools.partial(jax.jit, compiler_options=EXACT)
+    def run(key):
+        before = learner.init(key, 2, 2, cfg)
+        params = before.params
+
+        def earned(net):
+            action, log_prob = beta.beta_sample(
+                beta.beta_policy(net, seen.obs, cfg), jax.random.split(proposer_key)[0]
+            )
+            inputs = jnp.concatenate([seen.obs, action], -1)
+            q, q_c = (
+                jnp.einsum("tbi,cij->ctb", inputs, x["kernel"]) + x["bias"][:, :, None]
+                for x in (params[name]["params"]["Dense_0"] for name in ("critic_r", "critic_c"))
+            )
+            gain = (jnp.minimum(*q) - 2 * jnp.maximum(*q_c)) / 3 - 0.5 * log_prob
+            return (batch.weight * gain.mean(0)).sum()
+
+        drawn = beta.beta_sample(
+            beta.beta_policy(params["proposer"], seen.obs, cfg), jax.random.split(target_key)[0]
+        )
+        return (
+            before,
+            *learner.step(before, batch, at, cfg, None),
+            jax.grad(earned)(params["proposer"]),
+            drawn,
+        )
+
+    before, after, metrics, slope, (action, log_prob) = run(jax.random.key(6))
+    assert before.params["editor"] == () and "log_alpha_editor" not in before.params
+    assert "train/edit" not in metrics and "train/alpha_editor" not in metrics
+    for x, y in zip(jax.tree.leaves(slope), jax.tree.leaves(momentum(after, "proposer")), strict=True):
+        np.testing.assert_allclose(-0.1 * x, y, rtol=1e-3, atol=1e-6)
+        assert jnp.abs(y).max() > 1e-5
+
+    moments = averaged(no_moments(2), jnp.stack([seen.reward, seen.cost], -1), batch.weight, None)
+    paid = standard(moments, jnp.stack([seen.reward, seen.cost], -1), centre=True)
+    pair, taken = (np.concatenate([seen.obs, x], -1) for x in (action, seen.action))
+    counts = np.array([[0.5, 0.5, 0]] * 3) * np.asarray(batch.follows)
+    counts /= counts.sum()
+    goes_on = 1.0 - np.asarray(seen.terminated[1:])
+    bonus = -0.5 * np.asarray(log_prob)[1:]
+    for name, kind, discount, sign, pick in (
+        ("critic_r", 0, 0.9, 1, np.min), ("critic_c", 1, 0.8, -1, np.max)
+    ):  # fmt: skip
+        dense = before.params["targets"][name]["params"]["Dense_0"]
+        value = pick(np.einsum("tbi,cij->ctb", pair, dense["kernel"]) + dense["bias"][:, :, None], 0)
+        y = np.asarray(paid[1:, :, kind]) + discount * goes_on * (value[1:] + sign * bonus)
+        own = before.params[name]["params"]["Dense_0"]
+        error = np.einsum("tbi,cij->ctb", taken[:3], own["kernel"]) + own["bias"][:, :, None] - y
+        loss = (counts * (error**2).sum(0)).sum()
+        np.testing.assert_allclose(metrics["train/critic_loss" + "_c" * kind], loss, rtol=1e-4)
+
+
+def test_without_an_editor_the_mode_of_the_only_policy_acts():
+    cfg = dataclasses.replace(CFG, edit="none")
+    bias = jnp.array([1.0, 3.0])
+    net = {"params": {"Dense_0": {"kernel": jnp.zeros((1, 2)), "bias": bias}}}
+    learned = Learned(cfg, {"proposer": net, "editor": ()}, (), ())
+    found = seditor.act(learned, jnp.zeros((1, 1)), None)
+    up, down = 1 + np.log1p(np.exp(bias))
+    np.testing.assert_allclose(found, [[2 * (up - 1) / (up + down - 2) - 1]], rtol=1e-5)
+    many = seditor.act(learned, jnp.zeros((4000, 1)), jax.random.key(0))
+    np.testing.assert_allclose(many.mean(), 2 * up / (up + down) - 1, atol=0.03)
 
 
 def test_the_published_settings_are_one_step_of_1024_sequences_for_160_environment_steps():

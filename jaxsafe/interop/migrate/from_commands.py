@@ -3,9 +3,9 @@
     jaxsafe migrate ambs "python train.py --task safetygym_Safexp-PointGoal1-v0 --run.steps 500000"
     jaxsafe migrate alf "python -m alf.bin.train --conf seditor_safety_gym_conf.py --conf_param=..."
 
-SEditor's config becomes `algo=seditor`, and its config without an editor `algo=sac_lag`, each on
-SEditor's own tasks. A command of AMBS becomes `algo=ambs` with the preset of its penalty, and pictures
-or vectors, as its configs say.
+SEditor's config becomes `algo=seditor`, and its config without an editor has `algo.edit=none` beside
+it, each on SEditor's own tasks. A command of AMBS becomes `algo=ambs` with the preset of its penalty,
+and pictures or vectors, as its configs say.
 Source: the READMEs and configs of sacktock/AMBS @5184901 and hnyu/seditor @f78b720.
 """
 
@@ -28,7 +28,7 @@ PICTURES: dict[str, Any] = {  # AMBS's safetygym_vision, which sees nothing else
 }  # fmt: skip
 STEPS: dict[str, Any] = {"total_steps": 5_000_000}  # of SEditor's configs for Safety Gym
 EDITED = STEPS | {"algo": "seditor", "preset": "published"}
-ALONE = STEPS | {"algo": "sac_lag", "num_envs": 32, "algo.cost_limit": 0.5}  # 5e-4 a step, of 1,000
+ALONE = EDITED | {"algo.edit": "none"}
 
 
 def never(value: Any) -> bool:
@@ -135,12 +135,10 @@ def alf(command: str) -> Migrated:
             "env=car_racing1 show the road as numbers"
         )
     found, lines = turned(flags, ALF)
-    if "seditor" in conf.rpartition("/")[2]:
-        lines.append(Line("conf", conf, "algo=seditor preset=published"))
-        return migrated(EDITED | found, lines, "create_environment.env_name")
-    note = "algo=sac_lag, with a Gaussian policy, targets of one step and rewards as they are"
-    lines.append(Line("conf", conf, note, True))
-    return migrated(ALONE | found, lines, "create_environment.env_name")
+    options = EDITED if "seditor" in conf.rpartition("/")[2] else ALONE
+    said = "algo=seditor preset=published" + (" algo.edit=none" if options is ALONE else "")
+    lines.append(Line("conf", conf, said))
+    return migrated(options | found, lines, "create_environment.env_name")
 
 
 def flags_of(command: str) -> list[tuple[str, str]]:
