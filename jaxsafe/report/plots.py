@@ -241,14 +241,9 @@ def learning(groups: Sequence[Group]) -> Figure:
                     column = run_folder.estimate_of(name) if guess else name
                     values = np.concatenate([stretches(run.table, column, edges) for run in g.runs])
                     label = f"{g.name}, {ESTIMATED}" if guess else g.name
-                    band(
-                        axes,
-                        name,
-                        edges[1:],
-                        values,
-                        label,
-                        **looks[g.name] | ({"ls": "--"} if guess else {}),
-                    )
+                    style = looks[g.name] | ({"ls": "--"} if guess else {})
+                    if np.isfinite(values).any():
+                        band(axes, name, edges[1:], values, label, **style)
         limits = [g.cost_limit for g in shown]
         for g in shown:
             alone = limits.count(g.cost_limit) == 1 and len(set(limits)) > 1
@@ -256,6 +251,7 @@ def learning(groups: Sequence[Group]) -> Figure:
                 color = looks[g.name]["color"] if alone else "0.4"
                 cost.axhline(g.cost_limit, color=color, ls="--", lw=1)
         for axes, name in zip(panels, names, strict=True):
+            axes.set_visible(bool(axes.lines))  # not a rate that no run of this task has
             label = RATES.get(name) or name.removeprefix("train/")
             axes.set(title=f"{env}, {label}")
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))

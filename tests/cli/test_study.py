@@ -17,6 +17,7 @@ import pytest
 from jaxsafe.commands import study as command
 from jaxsafe.config import ConfigError
 from jaxsafe.report import plots, studies, study_files
+from jaxsafe.report.group import Group
 from jaxsafe.report.published import Published
 from jaxsafe.report.read import read, read_one
 from jaxsafe.run import files, run_folder
@@ -112,6 +113,19 @@ def test_a_study_from_before_override_rates_were_kept_has_none(toy, tmp_path):
     np.savez(path, **found | {"curves": found["curves"][:, :2]})
     with pytest.raises(ConfigError, match=r"curves\.npz has curves float32"):
         study_files.read(toy.folder)
+
+
+def test_a_rate_that_no_run_of_a_task_has_is_left_out_of_its_row(toy, tmp_path):
+    """As a shield's, where one of two tasks has been trained with one."""
+    groups = []
+    for env, shielded in (("car_goal1", False), ("point_goal1", True)):
+        trained(tmp_path / env, [f"env={env}", "algo=ambs"])
+        (run,) = read_one(tmp_path / env)
+        if not shielded:
+            run.table["train/overruled"] = np.full_like(run.table["train/overruled"], np.nan)
+        groups.append(Group(env, {"algo.name": "ambs", "env.name": env}, [run]))
+    shown = [axes.get_visible() for axes in plots.learning(groups).axes]
+    assert shown == [True, True, True, False, True, True, True, True]
 
 
 def test_a_data_set_is_called_by_its_file(toy, tmp_path):
