@@ -91,7 +91,7 @@ def train(
         names = sorted(jax.eval_shape(program.update, start.ts, program.shared())[1])
         names += COLUMNS if hooks.evaluate else ()
         update = programs.compiled(program, start.ts)
-        memory.check_work_memory(update)
+        memory.check_work_memory(update, program.start[1])
         report.line(f"compiled in {time.perf_counter() - begun:.1f} s")
         stop.nothing_to_save = ""
 

@@ -15,6 +15,7 @@ from jaxsafe.run.programs import Program
 from jaxsafe.run.settings import Settings, TrainConfig
 from jaxsafe.types import Env
 
+WORKING_SIZES = ("batch_size", "model_batch", "plans", "shield_rollouts")
 PROGRAM_SHARE = 0.8  # of the memory that a program may take by `capacity`
 
 
@@ -87,15 +88,16 @@ def check_state_memory(program: Program, train_cfg: TrainConfig) -> None:
         )
 
 
-def check_work_memory(update: Any) -> None:
+def check_work_memory(update: Any, cfg: Any) -> None:
     """Refuse a compiled update whose arrays between its operations cannot fit the device. The system
-    would end the process without a word."""
+    would end the process without a word. `cfg` is of an algorithm, whose sizes the refusal names."""
     limit, what = device_memory()
     need = update.memory_analysis().temp_size_in_bytes
     if need > limit:
+        sizes = ["num_envs", "num_seeds", *(f"algo.{n}" for n in WORKING_SIZES if hasattr(cfg, n))]
         raise TooLarge(
             f"an update works in {need / 2**30:,.1f} GiB a device, {what} has {limit / 2**30:,.1f}; "
-            "use fewer num_envs or num_seeds"
+            f"use a smaller {', '.join(sizes[:-1])} or {sizes[-1]}"
         )
 
 

@@ -144,12 +144,13 @@ def test_an_update_that_does_not_fit_is_one_line(tmp_path, capsys, monkeypatch):
     large, few = (8e9, "this machine"), (1000.0, "this machine")
     monkeypatch.setattr(memory, "device_memory", lambda: large)
 
-    def checked(update):
+    def checked(update, cfg):
         monkeypatch.setattr(memory, "device_memory", lambda: few)
-        check(update)
+        check(update, cfg)
 
     check = memory.check_work_memory
     monkeypatch.setattr(memory, "check_work_memory", checked)
     assert typed("train", *SAC, f"run_dir={tmp_path / 'run'}") == 2
     (line,) = [x for x in capsys.readouterr().err.splitlines() if x.startswith("error: ")]
-    assert "an update works in" in line and "this machine has 0.0; use fewer num_envs" in line
+    assert "an update works in" in line and "this machine has 0.0; use a smaller num_envs, num" in line
+    assert line.endswith("num_seeds or algo.batch_size")
