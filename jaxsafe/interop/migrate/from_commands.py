@@ -131,8 +131,8 @@ def alf(command: str) -> Migrated:
         raise ConfigError(f"--conf {conf or '?'}: expected SEditor's, as in seditor_safety_gym_conf.py")
     if "racing" in conf:
         raise ConfigError(
-            f"--conf {conf} has no counterpart: its agents see pictures; env=car_racing0 and "
-            "env=car_racing1 show the road as numbers"
+            f"--conf {conf} has no counterpart: its agents see pictures, which algo=seditor does not "
+            "take; env=car_racing0 and env=car_racing1 show it the road as numbers"
         )
     found, lines = turned(flags, ALF)
     options = EDITED if "seditor" in conf.rpartition("/")[2] else ALONE
