@@ -192,7 +192,8 @@ def priced_parallel(
 
     On velocity tasks a policy answers a price within some hundred gradient steps, and a price that
     waits longer swings. On navigation tasks the cost of two episodes, which are 2,000 steps, is mostly
-    chance. So there `price` is OmniSafe's, and moves every 20,000 steps: see docs/results/goal_off_policy.
+    chance. So there `price` is OmniSafe's, and moves every 20,000 steps:
+    see docs/results/goal_off_policy.
     """
     critics = "cost_reduce", "cost_floor"  # these stay ours
     slow = {name: value for name, value in price.items() if name not in critics}

@@ -41,6 +41,7 @@ from jaxsafe.run import files, run_folder
 
 SPAN = 20  # iterations over which costs are averaged before their swing is taken
 CHUNK = 8  # settings in one figure of curves
+FEW = 3  # options of a run that are all in its name
 MOST = 24  # settings whose points can be told apart in one figure
 PAGE = """# {title}
 
@@ -309,7 +310,8 @@ def page(study: Study) -> tuple[str, list[Picture]]:
 def in_order(study: Study, runs: Sequence[SettingRun]) -> list[Group]:
     """The groups of each setting and task, in the order of the runs, the order of their worth.
 
-    What a preset says anyway is not in their names. Lengths are, where the study sets them.
+    A name has what tells settings apart, and the options that a run sets where they are few. What a
+    preset says anyway is not in it. Lengths are, where they differ and the study sets them.
     """
     lengths = {"total_steps", "total_updates"}
     long = {name for name in lengths if any(f"{name}=" in run for run in study.runs)}
@@ -317,13 +319,26 @@ def in_order(study: Study, runs: Sequence[SettingRun]) -> list[Group]:
     for name in ("compat", "devices"):
         if name not in by and len({run.config[name] for run in runs}) > 1:
             by.append(name)
-    return [g._replace(by=said(g)) for g in group(runs, by)]
+    of_folder = {study_files.name_of(run): few_options(run) for run in study.runs}
+    told = {run.config["run_dir"]: of_folder.get(Path(run.config["run_dir"]).name, []) for run in runs}
+    same = {name for name in lengths if len({run.config.get(name) for run in runs}) == 1}
+    more = dict.fromkeys(name for names in told.values() for name in names if name not in {*by, *same})
+    groups = group(runs, [*by, *(name for name in more if any(name in run.config for run in runs))])
+    return [g._replace(by=said(g, {*by, *told[g.runs[0].config["run_dir"]]})) for g in groups]
 
 
-def said(g: Group) -> dict[str, Any]:
-    """The fields of a group that belong in its name. A data set goes by its file's name."""
+def few_options(run: str) -> list[str]:
+    """The algorithm's options that `run` sets, none if they are many, and its length."""
+    names = [word.partition("=")[0] for word in run.split()]
+    own = [name for name in names if name.startswith("algo.")]
+    return [*(own if len(own) <= FEW else ()), *(name for name in names if name.startswith("total_"))]
+
+
+def said(g: Group, told: set[str]) -> dict[str, Any]:
+    """The fields of a group that belong in its name, of those in `told`. A data set goes by its file's
+    name."""
     named = {"algo.name", "total_steps", "total_updates", "devices", *unusual(g.runs[0].config)}
-    found = {name: value for name, value in g.by.items() if name in named}
+    found = {name: value for name, value in g.by.items() if name in named & told}
     return found | ({"dataset": Path(g.by["dataset"]).stem} if g.by.get("dataset") else {})
 
 

@@ -159,6 +159,22 @@ def test_evaluated_policies_stand_beside_published_ones_and_training_apart(toy, 
     assert studies.matrices(groups, {}) == studies.matrix(groups, {})
 
 
+def test_a_setting_is_called_by_the_few_options_that_its_run_sets(toy, tmp_path):
+    """Even where another algorithm tells it apart. A length that all have is not named, nor what is
+    set as it is anyway."""
+    more = "- env=car_goal1 algo=cpo algo.gae_lambda=0.95\nwindows"
+    (toy.folder / "study.yaml").write_text(TOY.replace("windows", more))
+    study = studies.read(toy.folder)
+    for run in study.runs:
+        trained(tmp_path / study_files.name_of(run), study.command(run))
+        (found,) = read_one(tmp_path / study_files.name_of(run))
+        studies.add(study, run, found, study_files.Origin())
+    names = [g.name for g in studies.in_order(study, read([study.folder]))]
+    assert names == ["cpo", "ppo_lag, algo.dual_lr=0.2", "cpo"]
+    assert studies.few_options("algo=cpo num_envs=8 algo.a=1 algo.b=2 algo.c=3 algo.d=4") == []
+    assert studies.few_options("algo.a=1 total_steps=1e6") == ["algo.a", "total_steps"]
+
+
 def test_a_window_has_means_and_the_swing_of_the_cost_by_hand(toy, tmp_path):
     trained(tmp_path / "run", toy.command(toy.runs[0]))
     (run,) = read_one(tmp_path / "run")
