@@ -1,6 +1,6 @@
 """Constrained optimisation of a policy's visits, by their ratio to those of the data."""
 
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ from jaxsafe.algos import bc
 from jaxsafe.config import Bounds, Rate, Real, Weight, config
 from jaxsafe.learn.acting import Learned
 from jaxsafe.learn.constraints import each
-from jaxsafe.learn.critics import while_it_lasts
+from jaxsafe.learn.conventions import Convention
 from jaxsafe.learn.learner import GradientStep, Learner
 from jaxsafe.learn.offline import (
     OfflinePriceConfig,
@@ -54,9 +54,28 @@ class COptiDICEConfig(OfflinePriceConfig, OfflineValueConfig):
     Differs from it: lam and tau are no exponentials, the policy is one Gaussian instead of several, and
     nu and chi have no penalty on their slopes.
     Differs from OmniSafe: there each reward of a batch is paired with the values of every other
-    transition, and the multiplier is told E[w c]. The published numbers depend on the former, and no
-    option brings it back.
+    transition, so that e, w and l are of B x B pairs. And the multiplier is told E[w c]. The published
+    numbers depend on the former (`compat=omnisafe`).
     """
+
+    CONVENTIONS: ClassVar = (
+        Convention(
+            {"pairs": "all"},
+            "COptiDICE pairs a reward, a cost and an end with the values of all transitions of a batch",
+            "with the values of its own transition",
+        ),
+        Convention(
+            {"price_on": "mean"},
+            "COptiDICE's multiplier is told the cost of the policy's visits, E[w c]",
+            "it is told a bound of that, E[W w c], as in the paper",
+        ),
+    )
+
+    # Whose values a transition's reward, cost and end go with. own: its own. all: those of every
+    # transition of the batch, as in OmniSafe.
+    pairs: Literal["own", "all"] = "own"
+    # What the price is on. bound: E[W w c], as in the paper. mean: E[w c], as in OmniSafe.
+    price_on: Literal["bound", "mean"] = "bound"
 
     # How much it costs to depart from the data's visits, in units of reward, as in the paper's code.
     alpha: Annotated[float, Bounds(1e-8, 1e6)] = 0.01
@@ -82,8 +101,8 @@ def inverse_slope(x: jax.Array) -> jax.Array:
 
 
 def worst_case(ell: jax.Array, tau: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """W [B], with mean 1, and E[W log W], of l [B] and tau []."""
-    log_weight = jax.nn.log_softmax(ell / tau) + jnp.log(ell.shape[0])
+    """W, with mean 1 over the first axis, and E[W log W], of l [B] or [B, B] and tau []."""
+    log_weight = jax.nn.log_softmax(ell / tau, axis=0) + jnp.log(ell.shape[0])
     weight = jnp.exp(log_weight)
     return weight, (weight * log_weight).mean()
 
@@ -124,10 +143,17 @@ def learner(env: Env) -> Learner:
         cost = constrained(batch, several)
         price = jnp.dot(cost, at.dual.lam, precision=jax.lax.Precision.HIGHEST)
 
+        def paired(x: jax.Array) -> jax.Array:
+            """What goes with values [B]: `x` [B], or [B, 1] where it goes with all of them."""
+            return x[:, None] if cfg.pairs == "all" else x
+
+        def later(value: jax.Array) -> jax.Array:
+            return cfg.discount * jnp.where(paired(batch.terminated), 0.0, value)
+
         def surprise(nu: PyTree) -> jax.Array:
-            """e, float [B]."""
+            """e, float [B] or [B, B]."""
             here, ahead = nu_of(nu, batch.obs, cfg), nu_of(nu, batch.next_obs, cfg)
-            return batch.reward - price + cfg.discount * while_it_lasts(batch, ahead) - here
+            return paired(batch.reward - price) + later(ahead) - here
 
         def nu_loss(net: dict[str, PyTree]) -> tuple[jax.Array, Metrics]:
             e = surprise(net["nu"])
@@ -143,15 +169,20 @@ def learner(env: Env) -> Learner:
                 chi_of(net["chi"], x, cfg) for x in (batch.obs, batch.next_obs, at.first_obs)
             )
 
-            def visits(x: jax.Array) -> jax.Array:
-                return each(lambda x: w * x, several)(x)
+            def ell_of(
+                cost: jax.Array, here: jax.Array, ahead: jax.Array, begin: jax.Array
+            ) -> jax.Array:
+                return (1 - cfg.discount) * begin + w * (paired(cost) + later(ahead) - here)
 
-            ahead = cfg.discount * while_it_lasts(batch, ahead)
-            ell = (1 - cfg.discount) * begin + visits(cost + ahead - here)
+            def mean(x: jax.Array) -> jax.Array:
+                return x.mean(tuple(range(w.ndim)))
+
+            ell = each(ell_of, several)(cost, here, ahead, begin)
             ell_now = jax.lax.stop_gradient(ell)
             weight, divergence = each(worst_case, several)(ell_now, params["tau"])
-            bound = (weight * visits(cost)).mean(0)
-            loss = (weight * ell).mean(0)
+            visited = each(lambda x: w * paired(x), several)(cost)
+            bound = mean(visited if cfg.price_on == "mean" else weight * visited)
+            loss = mean(weight * ell)
             metrics = {
                 "train/chi_loss": loss,
                 "train/cost_divergence": divergence,

@@ -1,7 +1,8 @@
 """Critic-regularised regression, and with a multiplier on cost."""
 
+from collections.abc import Callable
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +10,7 @@ import jax.numpy as jnp
 from jaxsafe.algos import bc
 from jaxsafe.config import Amount, Bounds, Cap, Real, config
 from jaxsafe.learn.acting import Learned
+from jaxsafe.learn.conventions import Convention
 from jaxsafe.learn.critics import (
     Values,
     critic_loss,
@@ -81,9 +83,22 @@ class CCRRConfig(OfflineCostConfig, CRRConfig):
 
     Source: CRR of Wang et al. (2020), arXiv:2006.15134, with the multiplier of OmniSafe's CCRR.
     Differs from OmniSafe: there values have no bounds, the critic of reward also learns the costs, and
-    the critic of cost learns nothing. Its published numbers depend on that, and no option brings it
-    back.
+    the critic of cost learns nothing. Its published numbers depend on that (`compat=omnisafe`). With
+    `cost_critic=idle` Q_c is what it is at first, a second step moves Q towards
+    y_c = c + discount (1 - terminated) min_j Q'_j(s', a'), A_c = Q_c(s, a) - mean_i min_j Q_j(s, a_i),
+    and J_c is as above of mean_i min_j Q_j(s, a_i) in place of Q'_c.
     """
+
+    CONVENTIONS: ClassVar = (
+        Convention(
+            {"cost_critic": "idle"},
+            "in C-CRR the critic of reward learns the costs, too, and the critic of cost nothing",
+            "each critic learns its own",
+        ),
+    )
+
+    # What the critic of cost learns. own: the costs. idle: nothing, as in OmniSafe.
+    cost_critic: Literal["own", "idle"] = "own"
 
 
 def learner(env: Env, treatment: Treatment = no_treatment) -> Learner:
@@ -111,8 +126,11 @@ def learner(env: Env, treatment: Treatment = no_treatment) -> Learner:
         q_r, q_c = with_reduced_cost(params, obs, action, names(cfg), cfg)
         return Values(q_r.min(0), q_c)
 
-    def advantages(params: PyTree, batch: Transitions, key: jax.Array, cfg: Any) -> Values:
-        """By how much the data's actions are better than the policy's, A_r and A_c."""
+    def advantages(
+        params: PyTree, batch: Transitions, key: jax.Array, cfg: Any
+    ) -> tuple[Values, Values]:
+        """By how much the data's actions are better than the policy's, A_r and A_c; and what the
+        policy's are worth."""
         dist = bounded_policy(params["actor"], batch.obs, cfg)
         keys = jax.random.split(key, cfg.actions)
         drawn = jax.vmap(lambda key: bounded_action(dist, key))(keys)  # [actions, B, A]
@@ -121,7 +139,11 @@ def learner(env: Env, treatment: Treatment = no_treatment) -> Learner:
             return lowest(params, batch.obs, action, cfg)
 
         here, there = of_actions(batch.action), jax.vmap(of_actions)(drawn)
-        return jax.tree.map(lambda x, y: x - y.mean(0), here, there)
+        if idle(cfg):
+            q_r = there.reward
+            there = there._replace(cost=jnp.broadcast_to(q_r.T, there.cost.T.shape).T)
+        there = jax.tree.map(lambda x: x.mean(0), there)
+        return jax.tree.map(lambda x, y: x - y, here, there), there
 
     def step(
         nets: Trainable, batch: Transitions, at: GradientStep, cfg: Any, axis_name: str | None
@@ -132,16 +154,29 @@ def learner(env: Env, treatment: Treatment = no_treatment) -> Learner:
         after = next_values(nets.params["targets"], batch, next_key, cfg)
         if at.ranges:
             after = Values(*(jnp.clip(x, *ends) for x, ends in zip(after, at.ranges, strict=True)))
-        y = targets_of(batch, constrained(batch, names(cfg)), after, names(cfg), cfg)
+        charged = constrained(batch, names(cfg))
+        y = targets_of(batch, charged, after, names(cfg), cfg)
+        adam = decaying_adam(cfg.critic_lr, at, cfg)
 
-        def errors(critics: dict[str, PyTree]) -> tuple[jax.Array, Metrics]:
-            return critic_loss(critics, batch, y, names(cfg), cfg)
+        def toward(y: Values) -> Callable[[dict[str, PyTree]], tuple[jax.Array, Metrics]]:
+            return lambda critics: critic_loss(critics, batch, y, names(cfg), cfg)
 
-        adams = dict.fromkeys(critics_among(nets.params), decaying_adam(cfg.critic_lr, at, cfg))
-        nets, metrics = descend_each(errors, nets, adams)
+        if idle(cfg):
+            paid = charged.sum(-1) if names(cfg) else charged
+            later = cfg.discount * while_it_lasts(batch, after.reward)
+            nets, metrics = descend_each(toward(y), nets, {"critic_r": adam})
+            nets, of_cost = descend_each(
+                toward(y._replace(reward=paid + later)), nets, {"critic_r": adam}
+            )
+            metrics["train/critic_loss_c"] = of_cost["train/critic_loss"]
+        else:
+            nets, metrics = descend_each(
+                toward(y), nets, dict.fromkeys(critics_among(nets.params), adam)
+            )
 
         # policy
-        better = treatment.advantage(at.dual, *advantages(nets.params, batch, key, cfg))
+        better, drawn = advantages(nets.params, batch, key, cfg)
+        better = treatment.advantage(at.dual, *better)
         weight = jnp.minimum(jnp.exp(better / cfg.temperature), cfg.weight_max)
 
         def loss(net: dict[str, PyTree]) -> tuple[jax.Array, Metrics]:
@@ -152,11 +187,16 @@ def learner(env: Env, treatment: Treatment = no_treatment) -> Learner:
         nets, found = descend_each(loss, nets, {"actor": decaying_adam(cfg.lr, at, cfg)})
         metrics |= found
         if treatment is not no_treatment:
-            paid = batch.mean(while_it_lasts(batch, after.cost))
-            metrics["train/cost_estimate"] = episode_cost(paid, cfg, env)
+            cost = drawn.cost if idle(cfg) else while_it_lasts(batch, after.cost)
+            metrics["train/cost_estimate"] = episode_cost(batch.mean(cost), cfg, env)
         return follow(nets, cfg.tau), metrics
 
     return Learner(init=init, act=act, step=step)
+
+
+def idle(cfg: Any) -> bool:
+    """Whether the critic of cost learns nothing; CRR has none."""
+    return getattr(cfg, "cost_critic", "own") == "idle"
 
 
 def minus_price(dual: Any, adv_r: jax.Array, adv_c: jax.Array) -> jax.Array:

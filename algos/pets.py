@@ -1,13 +1,14 @@
 """PETS, which plans with an ensemble, and its constrained kin: CCE, RCE and CAP."""
 
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
 
 from jaxsafe.config import Amount, Bounds, Iterations, Weight, config
 from jaxsafe.learn.bill import PriceClockConfig
+from jaxsafe.learn.conventions import Convention
 from jaxsafe.learn.model_based import ModelBasedConfig, model_based
 from jaxsafe.learn.planning import (
     Planner,
@@ -36,7 +37,7 @@ class PETSConfig(ModelBasedConfig, ReplayConfig):
     has it, too. Planning sees no end of an episode.
 
     With `true_model` it plans in the simulator instead, whose random numbers it foresees: the most that
-    planning can do. Nothing is learned then, so set `learning_starts` to 0 (`preset=true_model`).
+    planning can do. Nothing is learned then, and no action is random.
 
     Source: Chua et al. (2018), "Deep Reinforcement Learning in a Handful of Trials using Probabilistic
     Dynamics Models", arXiv:1805.12114; the settings are OmniSafe's.
@@ -108,8 +109,8 @@ class CAPConfig(PriceClockConfig, PETSConfig):
     Source: Ma et al. (2022), "Conservative and Adaptive Penalty for Model-Based Safe Reinforcement
     Learning", arXiv:2112.07701.
     Differs from OmniSafe: there a plan gets the uncertainty of other plans, because an array is
-    reshaped in the wrong order. J_c is over 50 episodes there. kappa moves 100 times as fast there, and
-    may be 20 times as large.
+    reshaped in the wrong order (`compat=omnisafe`). J_c is over 50 episodes there. kappa moves 100
+    times as fast there, and may be 20 times as large.
 
     A plan without cost is feasible as long as T kappa |sigma| <= cost_limit, with |sigma| the mean of
     the penalty over its steps. With 30 outputs |sigma| begins at 0.04 or more, because no variance is
@@ -118,6 +119,14 @@ class CAPConfig(PriceClockConfig, PETSConfig):
     the plans of the smallest C, whatever they earn. OmniSafe's kappa is 1 after one move from J_c = 50
     (`preset=published`), and falls by at most 0.1 a move.
     """
+
+    CONVENTIONS: ClassVar = (
+        Convention(
+            {"uncertainty": "mixed"},
+            "CAP adds the uncertainty of other plans to the cost of a plan",
+            "it adds that of the plan itself",
+        ),
+    )
 
     # Environment steps between two moves of kappa. OmniSafe has 20,000 raw steps.
     dual_every: Annotated[int, Bounds(1, 2**30)] = 4_000
@@ -128,6 +137,9 @@ class CAPConfig(PriceClockConfig, PETSConfig):
     # The largest kappa. null: 0.4 cost_limit / T. On PointGoal1 plans without cost are feasible up to
     # cost_limit / (T |sigma|) = 0.5 cost_limit / T. OmniSafe has 1, with a limit of 1.
     kappa_max: Weight | None = None
+    # Whose uncertainty is added to the cost of a plan. own: as in the paper. mixed: that of other plans
+    # at the same step, as in OmniSafe.
+    uncertainty: Literal["own", "mixed"] = "own"
 
 
 def caution(steps: int) -> Treatment:

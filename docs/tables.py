@@ -32,12 +32,10 @@ NO_OPTION = {  # what OmniSafe does otherwise, and no option of ours brings back
     "PETS": MODEL,
     "CCEPETS": LAST,
     "RCEPETS": LAST,
-    "CAPPETS": f"{LAST}; a plan gets the uncertainty of other plans",
+    "CAPPETS": LAST,
     "LOOP": f"{MODEL}; a plan's value is that of the action before its end",
     "SafeLOOP": f"{LAST}; a plan's value is that of the action before its end",
     "VAEBC": "there evaluation draws latents",
-    "CCRR": "there the critic of cost learns nothing",
-    "COptiDICE": "there a reward is paired with the values of other transitions",
     "CRABS": "there it begins with a checkpoint to download, and models have gates",
 }
 

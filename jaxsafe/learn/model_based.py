@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxsafe.config import config
+from jaxsafe.learn.acting import Learned
 from jaxsafe.learn.learner import GradientStep, Learner
 from jaxsafe.learn.models import ModelConfig, init_model, model_of, record_by, refit, with_model
 from jaxsafe.learn.off_policy import off_policy
@@ -67,7 +68,16 @@ def model_based(
         new, metrics = other.step(rest, batch, at, cfg, axis_name)
         return with_model(new, model_of(nets)), metrics
 
+    def random_start(learned: Learned) -> jax.Array:
+        """Who plans in the simulator has nothing to wait for."""
+        return jnp.bool_(beside is not None or not learned.config.true_model)
+
     learner = Learner(
-        init=init, step=step, policy=planning_policy(env, planner), refit=refit, record=record_by
+        init=init,
+        step=step,
+        random_start=random_start,
+        policy=planning_policy(env, planner),
+        refit=refit,
+        record=record_by,
     )
     return off_policy(env, learner, treatment, axis_name)

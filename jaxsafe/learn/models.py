@@ -95,7 +95,7 @@ class ModelConfig(EnsembleConfig):
     # then needs the simulator wherever it acts.
     true_model: bool = False
     # Whether the model learns the cost. If not, the environment computes it from the observation, as
-    # those of Goal do with env.observation=coordinates. OmniSafe learns it in velocity tasks.
+    # those of Goal 0 and 1 do with env.observation=coordinates. OmniSafe learns it in velocity tasks.
     learn_cost: bool = True
     # What the model's hidden layers are computed in. bfloat16, which has 8 bits, halves what a GPU has
     # to move. On an H100 or H200 with Warp networks and draw are one kernel then, with other random
@@ -192,8 +192,8 @@ def observed_cost(env: Env) -> Callable[[jax.Array], jax.Array]:
     cost = getattr(env, "observed_cost", None)
     if cost is None:
         raise ConfigError(
-            "learn_cost=False: observations of this environment do not tell the cost; those of Goal "
-            "do with env.observation=coordinates"
+            "learn_cost=False: observations of this environment do not tell the cost; those of Goal 0 "
+            "and 1 do with env.observation=coordinates, and the vases of Goal 2 cost what none tells"
         )
     return cost
 

@@ -143,6 +143,9 @@ def cautious_cost(imagined: Imagined, learned: Learned) -> jax.Array:
     """As `mean_cost`, float [S], but each step costs c + kappa max_m |sigma_m|. The maximum is over the
     models, at the same plan, step and number of the particle. kappa is `learned.dual`."""
     penalty = imagined.spread.max(1, keepdims=True)  # [H, 1, P, S]
+    if learned.config.uncertainty == "mixed":
+        # each number as often as there are models, one after the other, and read as [M, P, S]
+        penalty = jnp.repeat(penalty, imagined.spread.shape[1]).reshape(imagined.spread.shape)
     return (imagined.cost + learned.dual * penalty).mean((1, 2)).sum(0)
 
 

@@ -75,6 +75,22 @@ def test_an_update_keeps_the_structure(name, true_model):
     assert algo.policy.privileged(learned) == true_model
 
 
+def test_who_plans_in_the_simulator_does_so_from_the_first_step():
+    """However long `learning_starts` is. Who learns a model acts at random first."""
+
+    def taken(true_model, starts):
+        settings = {"true_model": true_model, "learning_starts": starts}
+        algo, cfg = ALGOS["cce_pets"].make(Corridor()), settings_of("cce_pets", **settings)
+
+        def first(key):
+            return algo.update(algo.init(key, cfg, START), START)[0].replay.action
+
+        return jax.jit(first, compiler_options=FAST)(jax.random.key(0))
+
+    assert (taken(True, 0) == taken(True, 10_000)).all()
+    assert (taken(True, 0) != taken(False, 10_000)).any()
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_published_settings_build(name):
     class Seen(Corridor):

@@ -15,9 +15,18 @@ from toys import Corridor, Lever, momentum
 from jaxsafe.algos import ALGOS, bc, bcq, coptidice, crr
 from jaxsafe.config import ConfigError
 from jaxsafe.learn.acting import Learned
-from jaxsafe.learn.learner import GradientStep
-from jaxsafe.learn.offline import batch_at, constrained, data_set, first_obs_at, value_ranges
-from jaxsafe.learn.treatments import Multiplier, lagrangian
+from jaxsafe.learn.learner import GradientStep, Learner
+from jaxsafe.learn.offline import (
+    batch_at,
+    constrained,
+    data_set,
+    episode_cost,
+    first_obs_at,
+    offline,
+    value_ranges,
+)
+from jaxsafe.learn.steps import Trainable
+from jaxsafe.learn.treatments import Multiplier, lagrangian, no_treatment
 from jaxsafe.run import evaluate
 from jaxsafe.types import Shared, State
 
@@ -98,23 +107,24 @@ def noise(key, shape):
     return np.asarray(jax.random.normal(key, shape), np.float64)
 
 
-def elbo(vae, obs, action, eps, weight):
+def elbo(vae, obs, action, eps, weight, squash=np.tanh):
     mean, log_std = np.split(linear(vae["encoder"], np.concatenate([obs, action], -1)), 2, -1)
     z = mean + np.exp(log_std) * eps
-    error = (np.tanh(linear(vae["decoder"], np.concatenate([obs, z], -1))) - action) ** 2
+    error = (squash(linear(vae["decoder"], np.concatenate([obs, z], -1))) - action) ** 2
     divergence = -0.5 * (1 + 2 * log_std - mean**2 - np.exp(2 * log_std))
     return error.mean() + weight * divergence.mean()
 
 
-def test_a_gradient_of_vae_bc():
-    cfg = bc.VAEBCConfig(**LINEAR, vae_hidden=(), kl_weight=0.3)
+@pytest.mark.parametrize("decoder, squash", [("tanh", np.tanh), ("linear", lambda x: x)])
+def test_a_gradient_of_vae_bc(decoder, squash):
+    cfg = bc.VAEBCConfig(**LINEAR, vae_hidden=(), kl_weight=0.3, decoder=decoder)
     learner = bc.autoencoder(Corridor())
     nets, batch, at, b = prepared(learner, cfg)
     after, metrics = stepped(learner, nets, batch, at, cfg)
     eps = noise(at.key, (5, 4))
 
     def loss(vae):
-        return elbo(vae, b["obs"], b["action"], eps, 0.3)
+        return elbo(vae, b["obs"], b["action"], eps, 0.3, squash)
 
     assert_gradient(after, "vae", loss, nets.params["vae"])
     whole = metrics["train/vae_error"] + 0.3 * metrics["train/vae_kl"]
@@ -179,13 +189,18 @@ def test_gradients_of_bcq_lag(target):
             np.testing.assert_allclose(x, z, atol=1e-6)
 
 
-def test_without_a_price_bcq_takes_the_best_of_the_candidates():
-    cfg = bcq.BCQConfig(**LINEAR, vae_hidden=(), act_candidates=20)
-    learner = bcq.learner(Corridor())
+@pytest.mark.parametrize("priced", [False, True])
+def test_bcq_acts_with_the_candidate_that_earns_most_at_the_price_if_it_has_one(priced):
+    """A cost that is like the reward, at a price of 3, turns the choice round."""
+    config, treatment = (bcq.BCQLagConfig, lagrangian) if priced else (bcq.BCQConfig, no_treatment)
+    cfg = config(**LINEAR, vae_hidden=(), act_candidates=20)
+    learner = bcq.learner(Corridor(), treatment)
     nets, batch, _, b = prepared(learner, cfg)
-    params, key = double(nets.params), jax.random.key(2)
-    assert "critic_c" not in params
-    learned = Learned(cfg, nets.params, (), ())
+    assert ("critic_c" in nets.params) == priced
+    alike = {"critic_c": nets.params["critic_r"]} if priced else {}
+    dual = Multiplier(jnp.float32(3), ()) if priced else ()
+    learned = Learned(cfg, nets.params | alike, dual, ())
+    params, key = double(learned.params), jax.random.key(2)
     taken = learner.act(learned, batch.obs, key)
     z = np.clip(noise(key, (5, 20, 4)), -0.5, 0.5)
     for i in range(5):
@@ -193,8 +208,10 @@ def test_without_a_price_bcq_takes_the_best_of_the_candidates():
         likely = np.tanh(linear(params["vae"]["decoder"], np.concatenate([obs, z[i]], -1)))
         out = linear(params["actor"], np.concatenate([obs, likely], -1))
         a = np.clip(likely + 0.05 * np.tanh(out), -1, 1)
-        best = a[q(params["critic_r"], obs, a)[0].argmax()]
-        np.testing.assert_allclose(taken[i], best, atol=1e-5)
+        q_r = q(params["critic_r"], obs, a)
+        gain = q_r[0] - 3 * priced * q_r.mean(0)
+        assert (gain.argmax() != q_r[0].argmax()) == priced
+        np.testing.assert_allclose(taken[i], a[gain.argmax()], atol=1e-5)
     first, again = (learner.act(learned, batch.obs, None) for _ in range(2))
     np.testing.assert_array_equal(first, again)
 
@@ -305,6 +322,113 @@ def test_gradients_of_coptidice():
     assert_gradient(after, "actor", imitate, nets.params["actor"])
 
 
+def test_gradients_of_ccrr_whose_critic_of_cost_is_idle():
+    """OmniSafe's: the critic of reward moves twice, and the policy pays by it."""
+    cfg = crr.CCRRConfig(
+        **LINEAR, actions=3, temperature=0.5, weight_max=10.0, cost_critic="idle", limit_on="value",
+        critic_lr=0.0,
+    )  # fmt: skip
+    learner = crr.learner(Corridor(), crr.unscaled)
+    nets, batch, at, b = prepared(learner, cfg)
+    other = learner.init(jax.random.key(5), 4, 2, cfg).params["targets"]
+    nets = nets._replace(params=nets.params | {"targets": other})
+    after, metrics = stepped(learner, nets, batch, at, cfg)
+    params, old = double(nets.params), double(other)
+    next_key, key = jax.random.split(at.key)
+
+    def sample(actor, obs, key):
+        std = np.exp(np.clip(actor["log_std"], -5, 2))
+        return np.clip(np.tanh(linear(actor["mean"], obs)) + std * noise(key, (5, 2)), -1, 1)
+
+    ahead = sample(old["actor"], b["next_obs"], next_key)
+    later = 0.9 * (1 - b["terminated"]) * q(old["critic_r"], b["next_obs"], ahead).min(0)
+
+    def error(net, aims):
+        return ((q(net, b["obs"], b["action"]) - aims) ** 2).sum(0).mean()
+
+    for name in ("critic_r", "critic_c"):  # neither moves at a rate of 0
+        for x, y in zip(*map(jax.tree.leaves, (after.params[name], nets.params[name])), strict=True):
+            np.testing.assert_array_equal(x, y)
+    first, second = b["reward"] + later, b["cost"] + later
+    loss, loss_c = (error(params["critic_r"], aims) for aims in (first, second))
+    np.testing.assert_allclose(metrics["train/critic_loss"], loss, rtol=1e-4)
+    np.testing.assert_allclose(metrics["train/critic_loss_c"], loss_c, rtol=1e-4)
+    slopes = [
+        differences(lambda net, aims=aims: error(net, aims), params["critic_r"])
+        for aims in (first, second)
+    ]
+    twice = jax.tree.map(lambda x, y: 0.1 * (0.9 * x + y), *slopes)  # Adam's moment after two steps
+    for x, y in zip(*map(jax.tree.leaves, (momentum(after, "critic_r"), twice)), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-3, atol=1e-6)
+    assert all(not x.any() for x in jax.tree.leaves(momentum(after, "critic_c")))
+
+    own = [sample(params["actor"], b["obs"], k) for k in jax.random.split(key, 3)]
+    drawn = np.mean([q(params["critic_r"], b["obs"], a).min(0) for a in own], 0)
+    np.testing.assert_allclose(metrics["train/cost_estimate"], drawn.mean(), rtol=1e-4)
+    adv_r = q(params["critic_r"], b["obs"], b["action"]).min(0) - drawn
+    adv_c = q(params["critic_c"], b["obs"], b["action"]).mean(0) - drawn
+    weight = np.minimum(np.exp((adv_r - LAM * adv_c) / 0.5), 10.0)
+
+    def imitate(actor):
+        return -(weight * density(actor, b["obs"], b["action"])).mean()
+
+    assert_gradient(after, "actor", imitate, nets.params["actor"])
+
+
+def test_gradients_of_coptidice_where_all_are_paired():
+    """OmniSafe's: number i of the batch gives reward, cost and end, and number j the values."""
+    cfg = coptidice.COptiDICEConfig(
+        **LINEAR, alpha=0.5, cost_divergence=0.02, tau_init=0.6, batch_size=5, pairs="all",
+        price_on="mean",
+    )  # fmt: skip
+    learner = coptidice.learner(Corridor())
+    nets, batch, at, b = prepared(learner, cfg)
+    after, metrics = stepped(learner, nets, batch, at, cfg)
+    params, first = double(nets.params), double(at.first_obs)
+    pairs = [(i, j) for i in range(5) for j in range(5)]
+
+    def value(net, obs):
+        return linear(net, obs)[:, 0]
+
+    def surprise(nu):
+        here, ahead = value(nu, b["obs"]), value(nu, b["next_obs"])
+        return np.array([
+            b["reward"][i] - LAM * b["cost"][i] + 0.9 * (1 - b["terminated"][i]) * ahead[j] - here[j]
+            for i, j in pairs
+        ])  # fmt: skip
+
+    def ratio(e):
+        x = e / 0.5
+        return np.where(x < 0, np.exp(np.minimum(x, 0)), x + 1)
+
+    def nu_loss(nu):
+        e = surprise(nu)
+        w = ratio(e)
+        f = np.where(w < 1, w * (np.log(w) - 1) + 1, 0.5 * (w - 1) ** 2)
+        return 0.1 * value(nu, first).mean() + (w * e - 0.5 * f).mean()
+
+    assert_gradient(after, "nu", nu_loss, nets.params["nu"])
+    w = ratio(surprise(params["nu"]))
+    cost, begins = np.array([b["cost"][i] for i, _ in pairs]), np.array([j for _, j in pairs])
+
+    def ell(chi):
+        here, ahead, begin = (value(chi, x) for x in (b["obs"], b["next_obs"], first))
+        inside = [b["cost"][i] + 0.9 * (1 - b["terminated"][i]) * ahead[j] - here[j] for i, j in pairs]
+        return 0.1 * begin[begins] + w * np.array(inside)
+
+    weight = np.exp(ell(params["chi"]) / 0.6).reshape(5, 5)
+    weight = (weight / weight.mean(0)).reshape(-1)  # over the rewards, for the values of each j
+    assert_gradient(after, "chi", lambda chi: (weight * ell(chi)).mean(), nets.params["chi"])
+    divergence = (weight * np.log(weight)).mean()
+    assert_gradient(after, "tau", lambda tau: tau * (0.02 - divergence), nets.params["tau"])
+    np.testing.assert_allclose(metrics["train/cost_estimate"], 20 * (w * cost).mean(), rtol=1e-5)
+
+    def imitate(actor):
+        return -(w * density(actor, b["obs"], b["action"])[begins]).mean()
+
+    assert_gradient(after, "actor", imitate, nets.params["actor"])
+
+
 STILL: dict[str, Any] = {"critic_lr": 0.0}
 LINEAR_VAE: dict[str, Any] = {"vae_hidden": ()}
 # COptiDICE's W is a softmax over the batch. With a tau as large as this it is 1.
@@ -394,6 +518,39 @@ def test_limits_of_named_costs_are_held_apart():
     )
 
 
+def test_first_observations_are_those_at_which_episodes_begin():
+    """Episodes of 3 steps, the last of 1, whose observations are the numbers of their rows."""
+    obs = np.arange(7.0)[:, None]
+    zero, late = np.zeros(7), np.arange(7) % 3 == 2
+    data = data_set(obs, obs, zero, zero, obs + 1, late & False, late)
+    cfg = coptidice.COptiDICEConfig(batch_size=200)
+    first = first_obs_at(data, jax.random.key(0), cfg, ())
+    assert first.shape == (200, 1) and np.unique(first).tolist() == [0, 3, 6]
+
+
+@pytest.mark.parametrize("limit_on, cost", [("episode", 0.2 * 20 * 5), ("value", 5.0)])
+def test_the_limit_is_on_the_cost_of_an_episode_or_on_its_value(limit_on, cost):
+    cfg = crr.CCRRConfig(cost_discount=0.8, limit_on=limit_on)
+    np.testing.assert_allclose(episode_cost(jnp.float32(5), cfg, Corridor()), cost, rtol=1e-6)
+
+
+@pytest.mark.parametrize("starts, moves", [(0, 5), (3, 2), (5, 0), (7, 0)])
+def test_the_price_moves_from_a_gradient_step_on(starts, moves):
+    """By 0.1 at each step, as the cost is above the limit. An iteration has 5 steps, and the next one
+    counts on."""
+
+    def step(nets, batch, at, cfg, axis_name):
+        return nets, {"train/cost_estimate": jnp.float32(99)}
+
+    learner = Learner(init=lambda *_: Trainable({}, {}), step=step, act=lambda *_: jnp.zeros(2))
+    algo, shared = offline(Corridor(), learner, lagrangian), Shared(np.int32(0), data=random_data())
+    cfg = crr.CCRRConfig(updates=5, batch_size=2, lam_init=0.0, dual_lr=0.1, dual_starts=starts)
+    ts, _ = algo.update(algo.init(jax.random.key(0), cfg, shared), shared)
+    np.testing.assert_allclose(ts.dual.lam, 0.1 * moves, rtol=1e-4)
+    ts, _ = algo.update(ts, shared._replace(iteration=np.int32(1)))
+    np.testing.assert_allclose(ts.dual.lam, 0.1 * (10 - starts), rtol=1e-4)
+
+
 @pytest.mark.parametrize(
     "name, cfg", [("bc_safe", bc.BCSafeConfig), ("coptidice", coptidice.COptiDICEConfig)]
 )
@@ -477,12 +634,12 @@ def test_coptidice_finds_the_visits_of_the_linear_program():
 LIMIT, BEST = 2.5, 14.375  # of Lever: cost of an episode, and the best return within it
 
 
-def lever_data(name, n=20_000):
-    """Both levers anywhere, evenly. COptiDICE weighs the luck of a step as if it were an action's
-    merit, so it is shown mean rewards."""
+def lever_data(name, n=20_000, reach: Any = 1.0):
+    """Both levers anywhere up to `reach`, evenly. COptiDICE weighs the luck of a step as if it were an
+    action's merit, so it is shown mean rewards."""
     rng = np.random.default_rng(0)
     signs = rng.choice([-1.0, 1.0], (n + 1, 2))
-    u = rng.random((n, 2))
+    u = reach * rng.random((n, 2))
     luck = 0.5 * rng.choice([-1.0, 1.0], n) * (name != "coptidice")
     reward = u[:, 0] * (2 - u[:, 0]) + u[:, 1] + luck
     late = np.arange(n) % 10 == 9
@@ -605,3 +762,15 @@ def test_the_linear_programs_best_of_the_actions_in_the_data_is_found(name, limi
     np.testing.assert_allclose(whole.ret, ret, rtol=0.15)
     np.testing.assert_allclose(whole.cost, cost, rtol=0.25)
     assert (whole.costs[..., 1] < 0.01).all()
+
+
+@pytest.mark.slow
+def test_coptidice_finds_the_best_of_the_actions_in_the_data():
+    """Not on Slope: there it takes the luck of a next state for the merit of an action. On Lever, whose
+    bold episodes go up to EDGE and timid ones half as far, the second lever is best at EDGE. Where
+    all actions are allowed it is best at 1, and earns BEST."""
+    reach = np.random.default_rng(1).choice([EDGE / 2, EDGE], (2000, 1))
+    data = lever_data("coptidice", reach=np.repeat(reach, 10, 0))
+    whole = trained("coptidice", Lever(), data, LIMIT, alpha=0.01)
+    np.testing.assert_allclose(whole.ret, BEST - 10 * (1 - EDGE), rtol=0.15)
+    np.testing.assert_allclose(whole.cost, LIMIT, rtol=0.25)

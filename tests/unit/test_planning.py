@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compiling import FAST
+from scipy.special import softmax
 
 from jaxsafe.algos import ALGOS, loop, pets
 from jaxsafe.learn.acting import Learned
@@ -166,6 +167,21 @@ def test_a_particle_keeps_its_model_its_plan_and_its_penalty():
     np.testing.assert_allclose(weights, np.where(shuffled < 3, 1 / 3, 0), rtol=1e-6)
 
 
+def test_mixed_uncertainty_is_that_of_other_plans():
+    """OmniSafe's: numbers of three plans, each twice for two models, are read plan by plan."""
+    spread = jnp.array(
+        [[[[1.0, 2.0, 4.0]], [[0.5, 0.5, 0.5]]], [[[0.0, 0.0, 0.0]], [[8.0, 0.0, 16.0]]]]
+    )
+    zero, end = jnp.zeros_like(spread), jnp.zeros((2, 1, 3))
+    imagined = Imagined(zero, zero, spread, end, end)  # [H, M, P, S], two steps
+    learned = learned_by(pets.CAPConfig(uncertainty="mixed"), dual=jnp.float32(0.5))
+    # p0 p0 p1 for the first model, p1 p2 p2 for the second
+    of_steps = [[(1 + 2) / 2, (1 + 4) / 2, (2 + 4) / 2], [(8 + 0) / 2, (8 + 16) / 2, (0 + 16) / 2]]
+    np.testing.assert_allclose(cautious_cost(imagined, learned), 0.5 * np.sum(of_steps, 0), rtol=1e-6)
+    own = learned_by(pets.CAPConfig(), dual=jnp.float32(0.5))
+    np.testing.assert_allclose(cautious_cost(imagined, own), [4.5, 1.0, 10.0], rtol=1e-6)
+
+
 def test_the_mean_and_the_worst_cost_by_hand():
     of_steps = [[[1.0, 0.0], [0.0, 3.0]], [[2.0, 0.0], [0.0, 0.0]]]  # [H, M, P]
     cost = jnp.array(of_steps)[..., None]
@@ -182,18 +198,22 @@ RET = jnp.array([5.0, 4.0, 3.0, 2.0, 1.0])
 
 def test_a_cost_at_the_limit_is_feasible_and_one_above_it_is_not():
     cfg = pets.CCEConfig(elites=2, cost_limit=1.0)
-    at = elites(RET, jnp.array([1.0, 2.0, 2.0, 1.0, 2.0]), cfg)
-    np.testing.assert_allclose(at, [0.5, 0, 0, 0.5, 0])
-    above = elites(RET, jnp.array([1 + 1e-6, 2.0, 0.5, 1.0, 2.0]), cfg)
-    np.testing.assert_allclose(above, [0, 0, 0.5, 0.5, 0])
+    at = elites(RET, jnp.array([1.0, 1.0, 0.5, 2.0, 2.0]), cfg)
+    np.testing.assert_allclose(at, [0.5, 0.5, 0, 0, 0])  # by cost alone 2 is among them
+    above = elites(RET, jnp.array([1 + 1e-6, 1.0, 0.5, 0.0, 2.0]), cfg)
+    np.testing.assert_allclose(above, [0, 0.5, 0.5, 0, 0])  # by cost alone 3 is among them
 
 
-def test_one_feasible_plan_less_than_there_are_elites_changes_the_rule():
-    cfg = pets.CCEConfig(elites=3, cost_limit=1.0)
-    enough = elites(RET, jnp.array([3.0, 1.0, 1.0, 0.5, 2.0]), cfg)
-    np.testing.assert_allclose(enough, [0, 1 / 3, 1 / 3, 1 / 3, 0])
-    few = elites(RET, jnp.array([3.0, 2.5, 1.0, 0.5, 2.0]), cfg)  # by cost alone
-    np.testing.assert_allclose(few, [0, 0, 1 / 3, 1 / 3, 1 / 3])
+def test_as_many_feasible_plans_as_elites_are_enough_and_one_less_changes_the_rule():
+    """The hard rule takes the same plans by either rule if all that are feasible are elites. The soft
+    one has weights by return or by cost."""
+    cfg = loop.SafeLOOPConfig(elites=3, temperature=1.0, cost_temperature=1.0, cost_limit=1.0)
+    enough = by_return_within_limit(RET, jnp.array([3.0, 1.0, 1.0, 0.5, 2.0]), cfg)
+    np.testing.assert_allclose(enough, softmax([-np.inf, 4, 3, 2, -np.inf]), rtol=1e-5)
+    cost = jnp.array([3.0, 2.5, 1.0, 0.5, 2.0])
+    few = by_return_within_limit(RET, cost, cfg)
+    np.testing.assert_allclose(few, softmax(-cost), rtol=1e-5)
+    np.testing.assert_allclose(elites(RET, cost, cfg), [0, 0, 1 / 3, 1 / 3, 1 / 3])  # by cost alone
 
 
 def test_a_plan_that_is_not_finite_is_never_among_the_best():
@@ -267,3 +287,20 @@ def test_a_narrow_plan_is_not_improved_any_further():
 
     plan = cem(score, by_return, mean, (), jax.random.key(0), cfg)
     np.testing.assert_array_equal(plan, mean)
+
+
+def test_mean_and_variance_keep_their_shares_of_what_they_were():
+    """One plan, all 1/2, has all the weight, so the new variance is 0. Halved twice, the first variance
+    of 1 is below `var_stop`, and of the first mean, 1, no more is given up."""
+    momenta: dict[str, Any] = {"mean_momentum": 0.3, "var_momentum": 0.5}
+    cfg = pets.PETSConfig(plans=4, plan_var=1.0, var_stop=0.3, **momenta)
+
+    def last(plans, key):
+        return jnp.arange(5.0), jnp.zeros(5)
+
+    def best_alone(ret, cost, cfg):
+        return (ret == 4).astype(jnp.float32)
+
+    proposals = (jnp.full((1, 2, 1), 0.5),)
+    plan = cem(last, best_alone, jnp.ones((2, 1)), proposals, jax.random.key(0), cfg)
+    np.testing.assert_allclose(plan, 0.5 + 0.3**2 * 0.5, rtol=1e-6)
