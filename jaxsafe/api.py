@@ -224,7 +224,8 @@ class SweepResult(NamedTuple):
 
     folder: with summary.md, summary.csv and summary.png, and a run folder for each program.
     rows: one a setting: `row.name`, `row.cost_limit`, `row.ret` and `row.cost` (mean, low, high over
-        seeds of the last 10 % of training), `row.returns` and `row.costs`, float [S], and `row.held`,
+        seeds of the last 10 % of training, or of the final evaluation where training plays no
+        episodes), `row.returns` and `row.costs`, float [S], and `row.held`,
         whether every limit is: 'yes', 'no', 'unclear' within the interval, or '-' if not known.
     runs: the run folders.
     """
@@ -364,7 +365,8 @@ def collect(
 
     Raises:
         ConfigError: no run folder, no checkpoint yet, runs of different tasks, shares that do not sum
-            to 1, or another kind of file.
+            to 1, another kind of file, or a place where none can be written.
+        jaxsafe.run.checkpoint.NotSaved: the disk failed.
 
     Source: Liu et al. (2023), "Datasets and Benchmarks for Offline Safe Reinforcement Learning",
         arXiv:2306.09303, for the file's arrays.

@@ -29,7 +29,7 @@ If a run has an environment, algorithm or robot of your own, name it: {", ".join
 
 
 def main() -> int:
-    """Exit status: 2 for bad input, 130 if stopped."""
+    """Exit status: 2 for bad input, 1 for a failed disk, 130 if stopped."""
     return guarded(command)
 
 

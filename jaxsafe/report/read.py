@@ -43,15 +43,21 @@ class SettingRun(NamedTuple):
     seeds: np.ndarray  # [S]
     values: dict[str, np.ndarray]  # [S] by name; NaN for a seed without complete episodes
     estimated: bool = False  # no episode has ended yet, so return and cost are estimates from all steps
+    evaluated: bool = False  # training has no episodes, so return and costs are the final evaluation's
 
     @property
     def setting(self) -> dict[str, Any]:
         return {k: v for k, v in self.config.items() if k not in NOT_A_SETTING}
 
     @property
+    def clock(self) -> str:
+        """What `steps` counts: 'steps' of the environment or, where training takes none, 'updates'."""
+        return run_folder.step_column(self.table)
+
+    @property
     def steps(self) -> int:
         """Environment steps, or gradient steps where training takes none."""
-        return int(self.table[run_folder.step_column(self.table)].max())
+        return int(self.table[self.clock].max())
 
     @property
     def progress(self) -> tuple[int, int, str]:
@@ -146,6 +152,17 @@ def read_one(folder: Path, extras: Extras = NO_EXTRAS) -> list[SettingRun]:
     return runs
 
 
+def or_evaluated(run: SettingRun) -> SettingRun:
+    """The run; where training has no episodes, with the final evaluation's return and costs."""
+    known = "final return" in run.values and not np.isfinite(run.values["return"]).any()
+    if run.clock == "steps" or not known:
+        return run
+    shown = {"return", "cost", *map(cost_title, run.limits)}
+    found = {name: run.values[f"final {name}"] for name in shown if f"final {name}" in run.values}
+    values = run.values | found
+    return run._replace(values=values | normalised(run.env, values, run.limits), evaluated=True)
+
+
 def not_ended(table: Mapping[str, np.ndarray]) -> bool:
     """Whether no episode has ended, so that return and cost are only estimated."""
     known = {"train/return_estimate", "train/cost_estimate"} <= table.keys()
@@ -209,7 +226,11 @@ def measured(
     columns = dict(table)
     if not_ended(table):
         columns |= {name: table[run_folder.estimate_of(name)] for name in STAND_IN}
-    over = [table[f"train/cost_{k}" if k else "train/cost"] - limit for k, limit in limits.items()]
+    unknown = np.full(len(table["seed"]), np.nan)  # learning from a data set has no named costs
+    over = [
+        table.get(f"train/cost_{k}" if k else "train/cost", unknown) - limit
+        for k, limit in limits.items()
+    ]
     worst = np.max(over, axis=0)
     columns["over"] = np.where(np.isnan(worst), np.nan, worst > 0)
     late = functools.partial(run_folder.last_tenth, columns)

@@ -8,17 +8,20 @@ from pathlib import Path
 from jaxsafe.learn.constraints import cost_title, limits_in_words
 from jaxsafe.report import plots, tables
 from jaxsafe.report.group import Group, group
-from jaxsafe.report.read import read_one
+from jaxsafe.report.read import or_evaluated, read_one
 from jaxsafe.report.tables import Table
 from jaxsafe.run import files
 from jaxsafe.run.settings import NO_EXTRAS, Extras
 from jaxsafe.run.sweep_folder import read_folder
 
+LATE, EVALUATED = "last 10 % of training", "final evaluation"  # what figures are of
+
 
 def rows_of(folder: Path, extras: Extras = NO_EXTRAS) -> list[Group]:
-    """A row for each setting that has begun."""
+    """A row for each setting that has begun: of the last 10 % of training or, where training has no
+    episodes, of the final evaluation."""
     swept = read_folder(folder).swept
-    runs = [run for path in files.runs_in(folder) for run in read_one(path, extras)]
+    runs = [or_evaluated(run) for path in files.runs_in(folder) for run in read_one(path, extras)]
     return group(runs, swept) if runs else []
 
 
@@ -28,10 +31,26 @@ def summarise(folder: Path, extras: Extras = NO_EXTRAS) -> str:
     text = markdown(rows)
     files.write(folder / "summary.md", text)
     files.write(folder / "summary.csv", as_csv(rows))
-    title = "last 10 % of training, mean and 95 % interval"
+    title = f"{period(rows)}, mean and 95 % interval"
     title += f"; {plots.ESTIMATED}" * any(row.estimated for row in rows)
     plots.save(plots.trade_off(rows, title), folder / "summary", ["png"])
     return text
+
+
+def evaluated(row: Group) -> bool:
+    """Whether return and costs of every run are of its final evaluation."""
+    return all(run.evaluated for run in row.runs)
+
+
+def period(rows: list[Group]) -> str:
+    """What the figures are of."""
+    known = {evaluated(row) for row in rows} or {False}
+    return " or ".join(EVALUATED if found else LATE for found in sorted(known))
+
+
+def clock(rows: list[Group]) -> str:
+    """What the rows count, 'steps' or 'updates'."""
+    return " or ".join(sorted({run.clock for row in rows for run in row.runs})) or "steps"
 
 
 def columns(rows: list[Group]) -> list[str]:
@@ -48,7 +67,7 @@ def markdown(rows: list[Group]) -> str:
     header = [
         *columns(rows),
         "seeds",
-        "steps",
+        clock(rows),
         "return",
         *map(cost_title, costs),
         "limit",
@@ -64,8 +83,14 @@ def markdown(rows: list[Group]) -> str:
         for r in rows
     ]  # fmt: skip
     begun = [r.name for r in rows if r.estimated]
-    note = f"\nNo episode ended yet: return and cost of {'; '.join(begun)} are estimates.\n"
-    return tables.markdown(Table("", header, lines)) + note * bool(begun)
+    final = [r.name for r in rows if evaluated(r)]
+    notes = ""
+    if begun:
+        notes += f"\nNo episode ended yet: return and cost of {'; '.join(begun)} are estimates.\n"
+    if final:
+        of = "; ".join(final)
+        notes += f"\nTraining has no episodes: return and cost of {of} are of the {EVALUATED}.\n"
+    return tables.markdown(Table("", header, lines)) + notes
 
 
 def as_csv(rows: list[Group]) -> str:
@@ -75,7 +100,7 @@ def as_csv(rows: list[Group]) -> str:
     measured = ["return", *map(cost_title, costs)]
     bounds = [f"{m.replace(' ', '_')}{end}" for m in measured for end in ("", "_low", "_high")]
     limits = [f"cost_limit_{name}" if name else "cost_limit" for name in costs]
-    writer.writerow([*columns(rows), "seeds", "steps", *bounds, *limits, "held"])
+    writer.writerow([*columns(rows), "seeds", clock(rows), *bounds, *limits, "held"])
     for r in rows:
         head = [*r.by.values(), len(r.costs), r.steps]
         found = [x for m in measured for x in r.estimate(m)]

@@ -2,6 +2,8 @@
 
 import json
 import math
+import os
+import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -11,11 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxsafe
-from jaxsafe.config import Bounds, ConfigError, flat
+from jaxsafe.config import Bounds, ConfigError, flat, one_line
 from jaxsafe.learn.acting import Player, Playing
 from jaxsafe.learn.observations import observation_like, vector_of, with_vector
 from jaxsafe.learn.offline import DataSet, data_set
-from jaxsafe.run import dataset, run_folder
+from jaxsafe.run import checkpoint, dataset, files, run_folder
 from jaxsafe.run.policies import RunPolicies
 from jaxsafe.types import PyTree, State
 
@@ -79,11 +81,22 @@ def data_file(path: str | Path) -> Path:
     """The path, of a file that can be written.
 
     Raises:
-        ConfigError: another kind of file.
+        ConfigError: another kind of file, a folder, or a place where nothing can be written.
     """
     out = Path(path).expanduser()
     if out.suffix not in (".hdf5", ".npz"):
         raise ConfigError(f"out={out}: expected a name that ends in .hdf5 or .npz")
+    if out.is_dir():
+        raise ConfigError(
+            f"out={out} is a folder; expected a file, such as {out / f'data{out.suffix}'}"
+        )
+    above = next(folder for folder in out.absolute().parents if os.path.lexists(folder))
+    if not above.is_dir():
+        raise ConfigError(f"out={out}: {above} is {files.kind_of(above)}; expected a folder")
+    try:
+        tempfile.TemporaryFile(dir=above).close()
+    except OSError as error:
+        raise ConfigError(f"out={out}: cannot write to {above}: {error.strerror}") from error
     return out
 
 
@@ -92,7 +105,8 @@ def check_same_task(runs: Sequence[RunPolicies]) -> None:
     first = flat(runs[0].settings.plain()["env"])
     for run in runs[1:]:
         other = flat(run.settings.plain()["env"])
-        for name in sorted({*first, *other} - {"engine"}):
+        names = sorted({*first, *other} - {"engine", "name"})
+        for name in ("name", *names):  # another name is why other fields differ
             if first.get(name) != other.get(name):
                 raise ConfigError(
                     f"env.{name} is {first.get(name)} in {runs[0].folder}, {other.get(name)} in "
@@ -214,13 +228,21 @@ def collect(
 def write(
     out: Path, ingredients: Sequence[Ingredient], size: int, seed: int = 0, sampled: bool = True
 ) -> Collected:
-    """As `collect`, and the file `out` of it, with what it was made of."""
+    """As `collect`, and the file `out` of it, with what it was made of.
+
+    Raises:
+        checkpoint.NotSaved: the file could not be written, as on a full disk.
+    """
     made = collect(ingredients, size, seed, sampled)
     env = ingredients[0].run.settings.plain()["env"]
     more = {"run": made.run, "policy": made.policy, "episode": made.data.episodes.number}
-    out.parent.mkdir(parents=True, exist_ok=True)
     data = jax.tree.map(np.asarray, made.data)
-    dataset.write_dataset(out, data, more, attributes(made, env, sampled))
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        dataset.write_dataset(out, data, more, attributes(made, env, sampled))
+    except OSError as error:
+        reason = error.strerror or one_line(error)
+        raise checkpoint.NotSaved(f"cannot write {out}: {reason}; no data set is written") from error
     return made
 
 

@@ -15,6 +15,7 @@ What is written, as .npz or .hdf5:
     timeouts                          bool [n]; that end
     cost_NAME                         float [n], for each cost with a name
     vision, next_vision               uint8 [n, height, width, channels], where there are pictures
+    about                             what the file says of itself, as JSON; in .hdf5 its attributes
 
 Transitions are in the order of their episodes. Without `timeouts` any order will do, and the episodes
 are not known. Other arrays in a file are left alone.
@@ -24,6 +25,8 @@ Source: Liu et al. (2023), "Datasets and Benchmarks for Offline Safe Reinforceme
 """
 
 import contextlib
+import io
+import json
 import math
 import zipfile
 import zlib
@@ -50,6 +53,7 @@ ARRAYS = {
 }
 PICTURES = {"obs": "vision", "next_obs": "next_vision"}  # field -> name in the file
 NAMED = "cost_"  # begins the names of costs that have names
+ABOUT = "about"  # the text of an .npz that has what attributes say in .hdf5
 OMNISAFE = {  # OmniSafe's name -> ours
     "obs": "observations",
     "action": "actions",
@@ -68,11 +72,13 @@ FILTERS = ("gzip", "lzf", None)  # ways to pack that h5py brings itself
 
 
 class Source(NamedTuple):
-    """What a file holds: the names of its arrays, `read(name)`, and the names of its groups."""
+    """What a file holds: the names of its arrays, `read(name)`, the names of its groups, and `about()`,
+    what it says of itself."""
 
     names: tuple[str, ...]
     read: Callable[[str], np.ndarray]
     groups: tuple[str, ...] = ()
+    about: Callable[[], dict[str, Any]] = dict
 
 
 def read_dataset(path: str, episode_length: int | None = None) -> DataSet:
@@ -92,6 +98,37 @@ def read_dataset(path: str, episode_length: int | None = None) -> DataSet:
         if set(OMNISAFE) <= set(source.names):
             return from_omnisafe(path, source, episode_length)
         return from_flat(path, source)
+
+
+def read_about(path: str) -> dict[str, Any]:
+    """What a data set says of itself, text and numbers by name; empty if it says nothing.
+
+    `jaxsafe collect` says 'recipe' and 'env', both JSON, 'actions', 'jaxsafe' and 'commit'.
+
+    Raises:
+        ConfigError: no such file, or one that is none.
+    """
+    with opened(path, found(path)) as source:
+        said = source.about()
+    return {name: x for name, x in said.items() if isinstance(x, str | int | float)}
+
+
+def task_of(path: str) -> str | None:
+    """The environment that a data set was collected on; None if the file does not say it."""
+    try:
+        name = json.loads(read_about(path)["env"])["name"]
+    except (ConfigError, *BROKEN):  # the data may be sound all the same
+        return None
+    return name if isinstance(name, str) else None
+
+
+def other_task(path: str, env: str) -> str:
+    """A warning where the file of a data set says that it is of another environment; else ''."""
+    theirs = task_of(path)
+    if theirs in (None, env):
+        return ""
+    shown = "".join(x if x.isprintable() else "?" for x in theirs[:100])  # a stranger may have set it
+    return f"warning: dataset={path} is of {shown}, and env={env}; expected data of the same task"
 
 
 def from_flat(path: str, source: Source) -> DataSet:
@@ -218,7 +255,7 @@ def opened(path: str, file: Path) -> Iterator[Source]:
                 size = sum(x.file_size for x in archive.infolist())
             check_size(path, size, file.stat().st_size)
             with np.load(file, allow_pickle=False) as arrays:
-                yield Source(tuple(arrays), arrays.__getitem__)
+                yield Source(tuple(arrays), arrays.__getitem__, about=lambda: in_text(arrays))
     except ConfigError:
         raise
     except BROKEN as error:
@@ -228,6 +265,20 @@ def opened(path: str, file: Path) -> Iterator[Source]:
             ) from error
         kind = ".hdf5" if hdf5 else ".npz"
         raise ConfigError(f"dataset={path} cannot be read as {kind}: {one_line(error)}") from error
+
+
+def in_text(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """What the text of an .npz says; nothing if it is not ours."""
+    text = arrays[ABOUT] if ABOUT in arrays else np.zeros(0)
+    said = json.loads(str(text.item())) if text.dtype.kind == "U" and text.shape == () else {}
+    return said if isinstance(said, dict) else {}
+
+
+def in_attributes(file: h5py.File) -> dict[str, Any]:
+    """Those that are one text or one number."""
+    lone = (name for name in file.attrs if file.attrs.get_id(name).shape == ())
+    said = {name: file.attrs[name] for name in lone}
+    return {name: x.item() if isinstance(x, np.generic) else x for name, x in said.items()}
 
 
 def in_hdf5(path: str, file: h5py.File, size: int) -> Source:
@@ -259,7 +310,7 @@ def in_hdf5(path: str, file: h5py.File, size: int) -> Source:
         return np.asarray(x[()])
 
     walk(file, "", 0)
-    return Source(tuple(arrays), read, tuple(groups))
+    return Source(tuple(arrays), read, tuple(groups), lambda: in_attributes(file))
 
 
 def check_size(path: str, unpacked: int, size: int) -> None:
@@ -278,9 +329,10 @@ def write_dataset(
 
     Args:
         more: arrays [n] beside it, by name.
-        about: attributes of the file, in .hdf5 alone.
+        about: what the file says of itself, for `read_about`.
     Raises:
         ConfigError: the name ends otherwise.
+        OSError: the disk failed.
     """
     path = Path(path)
     arrays = {name: np.asarray(vector_of(getattr(data, field))) for name, (field, _) in ARRAYS.items()}
@@ -294,14 +346,16 @@ def write_dataset(
         raise ConfigError(f"{path}: expected a name that ends in .hdf5 or .npz")
     with files.replacing(path) as part:
         if path.suffix == ".npz":
-            named: Any = arrays
+            named: Any = arrays | ({ABOUT: np.array(json.dumps(dict(about)))} if about else {})
             np.savez_compressed(part, **named)
             return
-        with h5py.File(part, "w") as file:
+        memory = io.BytesIO()  # HDF5 may crash the process where a disk fails
+        with h5py.File(memory, "w") as file:
             for name, x in arrays.items():
                 bytewise = x.dtype.itemsize == 1  # pictures and truth values; floats hardly shrink
                 file.create_dataset(name, data=x, compression="lzf" if bytewise else None)
             file.attrs.update(dict(about or {}))
+        part.write_bytes(memory.getbuffer())
 
 
 def sha256(path: str) -> str:

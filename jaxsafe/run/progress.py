@@ -86,6 +86,7 @@ class Reporter:
         """Begin to show progress from `done` to `total`, which count in `unit`."""
         self.total, self.unit = total, unit
         self.last = {"ret": math.nan, "cost": math.nan, "lam": math.nan}  # finite values seen last
+        self.guessed = ""  # what stands before a cost that the learner estimates
         self.printed = -math.inf
         ends = sorted({min(cost_limits), max(cost_limits)}) if cost_limits else []
         self.limits = "/" * bool(ends) + "-".join(map(short, ends))
@@ -103,7 +104,13 @@ class Reporter:
             self.live.start()
 
     def update(self, done: int, num_members: int, ret: float, cost: float, lam: float) -> None:
-        """Show the state where each member has `done` so many; NaN keeps the last value."""
+        """Show the state where each member has `done` so many; NaN keeps the last value.
+
+        Without environment steps only an evaluation knows a return. A cost that comes without a return
+        is the learner's own estimate.
+        """
+        if self.unit == "updates" and math.isfinite(cost) and not math.isfinite(ret):
+            self.guessed = "estimated "
         now = time.perf_counter()
         self.last.update(
             {k: v for k, v in (("ret", ret), ("cost", cost), ("lam", lam)) if math.isfinite(v)}
@@ -114,7 +121,7 @@ class Reporter:
             f"{count_text(done)}/{count_text(self.total)} {self.unit}  "
             f"{count_text(rate * num_members)} {self.unit}/s  "
             f"return {short(self.last['ret'])}  "
-            f"cost {short(self.last['cost'])}{self.limits}  "
+            f"{self.guessed}cost {short(self.last['cost'])}{self.limits}  "
             f"{f'lam {short(lam)}  ' if math.isfinite(lam) else ''}"
             f"left {duration_text((self.total - done) / max(rate, 1e-9))}"
         )

@@ -2,6 +2,8 @@
 
 import json
 import os
+import resource
+from types import SimpleNamespace
 from typing import Any
 
 import h5py
@@ -13,7 +15,7 @@ from toys import Corridor
 import jaxsafe
 from jaxsafe.config import ConfigError
 from jaxsafe.run import collect, dataset
-from jaxsafe.run.dataset import read_dataset, write_dataset
+from jaxsafe.run.dataset import other_task, read_about, read_dataset, write_dataset
 
 
 @pytest.fixture(scope="module")
@@ -113,6 +115,58 @@ def test_what_cannot_be_collected_is_one_line(run, tmp_path, capsys, args, messa
     assert message in said.err and len((said.out + said.err).strip().splitlines()) == 1
 
 
+def test_a_place_that_cannot_be_written_is_refused_before_anything_is_played(tmp_path, capsys):
+    """The run is not even looked for."""
+    folder, file = tmp_path / "folder.hdf5", tmp_path / "file.hdf5"
+    folder.mkdir()
+    file.touch()
+    for out, message in (
+        (folder, f"out={folder} is a folder; expected a file, such as {folder}/data.hdf5"),
+        (file / "x.hdf5", f"out={file}/x.hdf5: {file} is a file; expected a folder"),
+        (file / "a" / "x.npz", f"out={file}/a/x.npz: {file} is a file; expected a folder"),
+        ("/proc/d.hdf5", "out=/proc/d.hdf5: cannot write to /proc: "),
+    ):
+        assert typed("collect", "nowhere", f"out={out}") == 2
+        err = capsys.readouterr().err
+        assert err.startswith(f"error: {message}") and err.count("\n") == 1
+    assert collect.data_file(tmp_path / "new" / "x.npz") == tmp_path / "new" / "x.npz"
+    assert {*tmp_path.iterdir()} == {folder, file}  # to look leaves nothing
+
+
+@pytest.mark.parametrize("suffix", [".hdf5", ".npz"])
+def test_a_disk_that_fails_at_the_end_is_one_line_and_status_1(run, tmp_path, capsys, suffix):
+    out, (soft, hard) = tmp_path / f"data{suffix}", resource.getrlimit(resource.RLIMIT_FSIZE)
+    write = dataset.write_dataset
+
+    def on_a_full_disk(*args):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (4000, hard))
+        try:
+            write(*args)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(dataset, "write_dataset", on_a_full_disk)
+        assert typed("collect", str(run), TOY, "size=400", f"out={out}") == 1
+    assert capsys.readouterr().err.splitlines()[-2:] == [
+        "playing episodes with 400 steps ...",
+        f"error: cannot write {out}: File too large; no data set is written",
+    ]
+    assert not [*tmp_path.iterdir()]
+
+
+def test_two_tasks_are_told_by_their_names():
+    def of(env: str, **fields: int) -> Any:
+        plain = {"env": {"name": env, **fields}}
+        return SimpleNamespace(folder=env[-1], settings=SimpleNamespace(plain=lambda: plain))
+
+    with pytest.raises(ConfigError) as error:
+        collect.check_same_task([of("task_a", bounds=2), of("task_b", bounds=0)])
+    assert str(error.value) == "env.name is task_a in a, task_b in b; expected runs of the same task"
+    with pytest.raises(ConfigError, match=r"env\.bounds is 2 in a, 0 in a; expected runs of the same"):
+        collect.check_same_task([of("task_a", bounds=2), of("task_a", bounds=0)])
+
+
 def test_a_run_that_terminates_gives_shorter_episodes():
     alive = np.array([True, True, False])
     terminated = np.array([False, True, True])
@@ -156,6 +210,47 @@ def test_our_files_come_back_bit_for_bit(tmp_path, suffix):
     data, _ = made("..t..T...T")
     write_dataset(tmp_path / f"data{suffix}", data)
     assert_equal(read_dataset(str(tmp_path / f"data{suffix}")), data)
+
+
+@pytest.mark.parametrize("suffix", [".hdf5", ".npz"])
+def test_a_file_says_what_it_was_made_of(tmp_path, suffix):
+    path, about = tmp_path / f"data{suffix}", {"recipe": '{"runs": []}', "commit": "ä", "count": 3}
+    data, _ = made("..t..T...T")
+    write_dataset(path, data, about=about)
+    assert read_about(str(path)) == about
+    assert_equal(read_dataset(str(path)), data)
+    write_dataset(path, data)
+    assert read_about(str(path)) == {}
+
+
+def test_both_kinds_of_file_say_the_same(run, tmp_path):
+    files = [tmp_path / f"data{suffix}" for suffix in (".hdf5", ".npz")]
+    for out in files:
+        assert typed("collect", str(run), TOY, "size=40", "seed=3", f"out={out}") == 0
+    one, other = (read_about(str(path)) for path in files)
+    assert one == other and {*one} == {"recipe", "env", "actions", "jaxsafe", "commit"}
+    recipe = json.loads(one["recipe"])
+    assert recipe["seed"] == 3 and recipe["runs"][0]["seeds"] == 2
+    assert json.loads(one["env"])["name"] == "toys:Corridor"
+
+
+@pytest.mark.parametrize("suffix", [".hdf5", ".npz"])
+def test_data_of_another_task_is_told_by_both_names(tmp_path, suffix):
+    path = str(tmp_path / f"data{suffix}")
+    write_dataset(path, made()[0], about={"env": '{"name": "point_circle1\\u001b"}'})
+    assert other_task(path, "point_circle2") == (
+        f"warning: dataset={path} is of point_circle1?, and env=point_circle2; expected data of the "
+        "same task"
+    )
+    for unknown in ('{"name": "point_circle2"}', "{}", "[]", "text", '{"name": 3}', 3, "[" * 9999):
+        write_dataset(path, made()[0], about={"env": unknown})
+        assert other_task(path, "point_circle2") == ""
+
+
+def test_a_strangers_npz_says_nothing(tmp_path):
+    for about in (np.zeros(3), np.array("text"), np.array("[1]"), np.array([{}], object)):
+        np.savez(tmp_path / "data.npz", about=about)
+        assert other_task(str(tmp_path / "data.npz"), "point_circle2") == ""
 
 
 def test_a_file_with_dsrls_keys_written_by_h5py_alone_loads(tmp_path):

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import math
 import shutil
 from typing import Any
 
@@ -14,7 +15,7 @@ import jaxsafe
 from jaxsafe.config import ConfigError, flat
 from jaxsafe.learn.offline import DataSet, data_set
 from jaxsafe.report import read
-from jaxsafe.run import checkpoint, dataset, run_folder, session
+from jaxsafe.run import checkpoint, dataset, progress, run_folder, session
 from jaxsafe.run.arguments import compose
 from jaxsafe.run.dataset import read_dataset, write_dataset
 from jaxsafe.run.policies import open_run
@@ -110,7 +111,34 @@ def test_a_comparison_holds_runs_without_training_episodes(whole):
     (run,) = read.read([whole])
     assert run.steps == 400 and run.ended
     assert np.isnan(run.values["return"]).all() and np.isfinite(run.values["final return"]).all()
+    assert run.clock == "updates" and not run.evaluated
     assert typed("plot", str(whole), "--out", str(whole.parent / "comparison")) == 0
+
+
+def test_the_progress_line_says_that_a_cost_is_the_learners_estimate(capsys):
+    def line(ret: float, cost: float) -> str:
+        report.update(5, 1, ret, cost, math.nan)
+        return capsys.readouterr().out
+
+    report = progress.Reporter()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(progress, "PLAIN_EVERY", 0.0)
+        report.start(10, 0, [25.0], "updates")
+        assert "return 3  cost 9/25  left" in line(3.0, 9.0)  # an evaluation
+        assert "return 3  estimated cost -0.549/25  left" in line(math.nan, -0.549)
+        assert "return 4  estimated cost -0.5/25  left" in line(4.0, -0.5)  # its return is evaluated
+        report.start(10, 0, [25.0])
+        assert "return -  cost 9/25  left" in line(math.nan, 9.0)  # of the steps of an iteration
+
+
+def test_a_sweep_falls_back_on_the_evaluation_of_a_named_cost_too(whole):
+    (run,) = read.read([whole])
+    run = run._replace(limits={"wall": 2.0}, values=run.values | {"final cost wall": np.ones(2)})
+    assert np.isnan(read.measured("toys", run.table, run.limits)["return"]).all()
+    found = read.or_evaluated(run)
+    assert found.evaluated and found.values["cost wall"].tolist() == [1, 1]
+    for name in ("return", "cost"):
+        np.testing.assert_array_equal(found.values[name], run.values[f"final {name}"])
 
 
 def test_evaluation_during_training_stands_in_for_its_episodes(data, tmp_path):
@@ -172,6 +200,18 @@ def test_what_cannot_work_is_one_line(tmp_path, data, capsys, options, message):
     assert typed("train", TOY, f"run_dir={tmp_path / 'run'}", *options) == 2
     said = capsys.readouterr()
     assert message in said.err and len((said.out + said.err).strip().splitlines()) == 1
+
+
+def test_data_of_another_task_is_one_line_that_names_both(tmp_path, capsys):
+    for name, lines in (("point_circle1", 1), ("toys:Corridor", 0)):
+        path = tmp_path / "data.npz"
+        write_dataset(path, make_data(), about={"env": json.dumps({"name": name})})
+        run = tmp_path / f"run{lines}"
+        args = (*BC, f"dataset={path}", "total_updates=10", "eval_episodes=0", f"run_dir={run}")
+        assert typed("train", *args) == 0
+        said = f"dataset={path} is of point_circle1, and env=toys:Corridor; expected data of the same"
+        out = capsys.readouterr().out
+        assert out.count("warning: ") == out.count(f"warning: {said}") == lines
 
 
 def test_a_lone_seed_without_environments_does_not_split_over_devices(data, monkeypatch):

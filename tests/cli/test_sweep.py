@@ -18,9 +18,10 @@ from jaxsafe.learn.offline import OfflineConfig, data_set_like
 from jaxsafe.report import plots
 from jaxsafe.report.evaluation import evaluate
 from jaxsafe.report.finish import finish
-from jaxsafe.report.sweep_summary import rows_of, summarise
+from jaxsafe.report.sweep_summary import EVALUATED, LATE, rows_of, summarise
 from jaxsafe.run import arguments, checkpoint, loop, memory, programs, run_folder, session, sweep
 from jaxsafe.run.arguments import compose
+from jaxsafe.run.dataset import write_dataset
 from jaxsafe.run.evaluate import run_episodes
 from jaxsafe.run.policies import open_run
 from jaxsafe.run.programs import build, members
@@ -343,6 +344,51 @@ def test_the_summary_is_the_last_tenth_of_training_over_the_seeds_of_each_settin
     found = [float(rows[1][k]) for k in ("cost", "cost_low", "cost_high", "cost_limit")]
     np.testing.assert_allclose(found, [5, 0, 5 + 25.4124095, 4])
     assert (tmp_path / "summary.png").stat().st_size > 10_000
+
+
+def test_the_summary_of_learning_from_data_is_of_the_final_evaluation(tmp_path, monkeypatch):
+    titles = []
+    monkeypatch.setattr(plots, "trade_off", lambda rows, title: titles.append(title))
+    monkeypatch.setattr(plots, "save", lambda *_: None)
+    write_dataset(tmp_path / "data.npz", data_set_like(Corridor()))
+    offline = [
+        "env=toys:Corridor", "algo=bc", f"dataset={tmp_path / 'data.npz'}", "algo.hidden=[4]",
+        "algo.updates=5", "total_updates=10", "algo.cost_limit=10,40", f"run_dir={tmp_path / 'sweep'}",
+    ]  # fmt: skip
+    asked = planned(*offline)
+    sweep.write_folder(asked, {})
+    ((name, settings),) = asked.groups.items()
+    folder = tmp_path / "sweep" / name
+    folder.mkdir()
+    run_folder.write_config(folder, settings.plain() | {"num_seeds": 2})
+    log = run_folder.Metrics(folder, ["algo.cost_limit", "train/cost_estimate"], 0)
+    for iteration in (1, 2):
+        limits, guesses = np.repeat([10.0, 40.0], 2), np.full(4, -0.5)
+        at = checkpoint.Progress(iteration, 0, 5 * iteration)
+        values = {"algo.cost_limit": limits, "train/cost_estimate": guesses}
+        log.append(at, [0, 1, 0, 1], 0.0, values)
+    log.close()
+    header = (
+        "| algo.cost_limit | seeds | updates | return | cost | limit | limit held |\n"
+        "| --- | ---: | ---: | ---: | ---: | ---: | ---: |\n"
+    )
+    assert summarise(tmp_path / "sweep") == (
+        f"{header}| 10 | 2 | 10 | - | - | 10 | - |\n| 40 | 2 | 10 | - | - | 40 | - |\n"
+    )
+    found = {
+        f"algo.cost_limit={limit}": {"seeds": {"return": [ret, ret], "cost": [20.0, 20.0]}}
+        for limit, ret in ((10, 1.0), (40, 2.0))
+    }
+    (folder / "evaluation.json").write_text(json.dumps(found))
+    assert summarise(tmp_path / "sweep") == (
+        f"{header}| 10 | 2 | 10 | 1 | 20 | 10 | no |\n| 40 | 2 | 10 | 2 | 20 | 40 | yes |\n\n"
+        "Training has no episodes: return and cost of algo.cost_limit=10; algo.cost_limit=40 are of "
+        "the final evaluation.\n"
+    )
+    with (tmp_path / "sweep" / "summary.csv").open() as file:
+        row = next(csv.DictReader(file))
+    assert (row["updates"], row["return"], row["cost"], row["held"]) == ("10", "1.0", "20.0", "no")
+    assert titles == [f"{period}, mean and 95 % interval" for period in (LATE, EVALUATED)]
 
 
 def test_curves_of_settings_side_by_side_have_their_own_limits(tmp_path, monkeypatch):
