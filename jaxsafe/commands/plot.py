@@ -10,6 +10,7 @@
     OUT/profiles.png, .svg  the share of seeds beyond each normalised return and cost
 
 The figures of a seed are those of the last 10 % of its training. Its cost rate is of all its training.
+Where training plays no episodes, as from a data set, they are those of its final evaluation.
 Tasks stand apart. Only normalised scores, and comparisons within a task, are averaged over tasks.
 """
 
@@ -22,7 +23,7 @@ from jaxsafe.config import ConfigError
 from jaxsafe.report.comparison import write
 from jaxsafe.report.group import group, ordered, telling
 from jaxsafe.report.published import read_published
-from jaxsafe.report.read import read
+from jaxsafe.report.read import or_evaluated, read
 from jaxsafe.run.flags import fail
 
 
@@ -58,7 +59,7 @@ def command() -> int:
     )
     args = parser.parse_args()
     published = read_published(args.published) if args.published else {}
-    runs = read(args.runs)
+    runs = [or_evaluated(run) for run in read(args.runs)]
     by = [name for name in args.by if name != "env.name"] or telling(runs)
     groups = ordered(group(runs, by))
     try:

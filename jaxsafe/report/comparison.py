@@ -15,7 +15,7 @@ from jaxsafe.report.comparison_tables import (
     notes,
     results,
 )
-from jaxsafe.report.group import Group, suite
+from jaxsafe.report.group import Group, period, suite
 from jaxsafe.report.published import Published, beside
 from jaxsafe.run import files
 
@@ -42,7 +42,7 @@ def write(
     files.write(out / "results.csv", as_csv(groups, both, found, pairs))
     plots.save(plots.learning(groups), out / "curves")
     known = {(g.env, g.name): beside(g, published) for g in groups}
-    plots.save(plots.trade_off(groups, "last 10 % of training", known), out / "trade_off")
+    plots.save(plots.trade_off(groups, period(groups), known), out / "trade_off")
     for name in ("scores", "profiles"):
         for suffix in plots.FORMATS:
             (out / f"{name}.{suffix}").unlink(missing_ok=True)

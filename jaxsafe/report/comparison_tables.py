@@ -1,7 +1,8 @@
 """The tables of a comparison.
 
 Figures of a seed are those of the last 10 % of its training, but for the cost rate, which is of all of
-it. Tasks stand apart; across them only normalised scores, and comparisons within a task, are averaged.
+it. Where training plays no episodes, they are of its final evaluation. Tasks stand apart; across them
+only normalised scores, and comparisons within a task, are averaged.
 """
 
 import csv
@@ -12,7 +13,7 @@ import numpy as np
 
 from jaxsafe.learn.constraints import limits_in_words
 from jaxsafe.report import scores, stats, tables
-from jaxsafe.report.group import Group, Suite, differing, suite, tasks_of
+from jaxsafe.report.group import Group, Suite, clock, differing, period, suite, tasks_of
 from jaxsafe.report.published import Published, beside
 from jaxsafe.report.stats import Estimate
 from jaxsafe.report.tables import Table
@@ -55,7 +56,7 @@ def results(
         if source:
             rows.append([source, *theirs])
     what = "Return" if metric == "return" else "Cost"
-    caption = f"{what} of an episode, last 10% of training: mean and 95% interval over seeds."
+    caption = f"{what} of an episode, {period(groups)}: mean and 95% interval over seeds."
     if len(limits) == 1 and (words := next(iter(limits))) != "-":
         caption += f" Cost limit {words}."
     if metric == "return" and safe:
@@ -69,7 +70,8 @@ def details(groups: Sequence[Group]) -> list[Table]:
     """What else is known of each setting on each task."""
     groups = sorted(groups, key=lambda g: g.env)
     known = [m for m in ("violation rate", "cost rate") if any(known_of(g, m) for g in groups)]
-    header = ["task", "setting", "seeds", "steps", "return, IQM", "cost, IQM", "limit", "held", *known]
+    header = ["task", "setting", "seeds", clock(groups), "return, IQM", "cost, IQM", "limit", "held"]
+    header += known
     rows = [
         [
             f"`{g.env}`", f"`{g.name}`", str(len(g.costs)), f"{g.steps:,}",
@@ -100,7 +102,7 @@ def details(groups: Sequence[Group]) -> list[Table]:
         rows = [
             [f"`{g.env}`", f"`{g.name}`", *(tables.cell(g.estimate(m)) for m in costs)] for g in groups
         ]
-        caption = "Each cost of an episode, last 10% of training."
+        caption = f"Each cost of an episode, {period(groups)}."
         out.append(Table(caption, ["task", "setting", *(m.split(" ", 1)[1] for m in costs)], rows, 2))
     evaluated = [g for g in groups if known_of(g, "final return")]
     if evaluated:

@@ -13,6 +13,8 @@ from jaxsafe.report.read import SettingRun
 from jaxsafe.report.stats import Estimate
 from jaxsafe.run import run_folder
 
+LATE, EVALUATED = "last 10% of training", "final evaluation"  # what figures are of
+
 
 class Group(NamedTuple):
     """The runs of one task that agree in some fields, `by`."""
@@ -82,6 +84,11 @@ class Group(NamedTuple):
         return all(run.estimated for run in self.runs)
 
     @property
+    def evaluated(self) -> bool:
+        """Whether return and costs of every run are of its final evaluation, as training has none."""
+        return all(run.evaluated for run in self.runs)
+
+    @property
     def held(self) -> str:
         """Whether each limit is: 'unclear' where the mean is above it and its interval is not."""
 
@@ -99,6 +106,17 @@ class Group(NamedTuple):
 @functools.cache
 def over_seeds(name: str, values: tuple[float, ...], statistic: Callable[..., np.ndarray]) -> Estimate:
     return stats.of_measure(name, np.array(values), statistic=statistic)
+
+
+def clock(groups: Iterable[Group]) -> str:
+    """What the steps of settings count, 'steps' or 'updates'."""
+    return " or ".join(sorted({run.clock for g in groups for run in g.runs})) or "steps"
+
+
+def period(groups: Iterable[Group]) -> str:
+    """What the figures of settings are of."""
+    known = {g.evaluated for g in groups} or {False}
+    return " or ".join(EVALUATED if found else LATE for found in sorted(known))
 
 
 def group(runs: Sequence[SettingRun], by: Sequence[str]) -> list[Group]:

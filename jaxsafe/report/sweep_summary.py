@@ -7,14 +7,12 @@ from pathlib import Path
 
 from jaxsafe.learn.constraints import cost_title, limits_in_words
 from jaxsafe.report import plots, tables
-from jaxsafe.report.group import Group, group
+from jaxsafe.report.group import Group, clock, group, period
 from jaxsafe.report.read import or_evaluated, read_one
 from jaxsafe.report.tables import Table
 from jaxsafe.run import files
 from jaxsafe.run.settings import NO_EXTRAS, Extras
 from jaxsafe.run.sweep_folder import read_folder
-
-LATE, EVALUATED = "last 10 % of training", "final evaluation"  # what figures are of
 
 
 def rows_of(folder: Path, extras: Extras = NO_EXTRAS) -> list[Group]:
@@ -35,22 +33,6 @@ def summarise(folder: Path, extras: Extras = NO_EXTRAS) -> str:
     title += f"; {plots.ESTIMATED}" * any(row.estimated for row in rows)
     plots.save(plots.trade_off(rows, title), folder / "summary", ["png"])
     return text
-
-
-def evaluated(row: Group) -> bool:
-    """Whether return and costs of every run are of its final evaluation."""
-    return all(run.evaluated for run in row.runs)
-
-
-def period(rows: list[Group]) -> str:
-    """What the figures are of."""
-    known = {evaluated(row) for row in rows} or {False}
-    return " or ".join(EVALUATED if found else LATE for found in sorted(known))
-
-
-def clock(rows: list[Group]) -> str:
-    """What the rows count, 'steps' or 'updates'."""
-    return " or ".join(sorted({run.clock for row in rows for run in row.runs})) or "steps"
 
 
 def columns(rows: list[Group]) -> list[str]:
@@ -83,13 +65,13 @@ def markdown(rows: list[Group]) -> str:
         for r in rows
     ]  # fmt: skip
     begun = [r.name for r in rows if r.estimated]
-    final = [r.name for r in rows if evaluated(r)]
+    final = [r.name for r in rows if r.evaluated]
     notes = ""
     if begun:
         notes += f"\nNo episode ended yet: return and cost of {'; '.join(begun)} are estimates.\n"
     if final:
         of = "; ".join(final)
-        notes += f"\nTraining has no episodes: return and cost of {of} are of the {EVALUATED}.\n"
+        notes += f"\nTraining has no episodes: return and cost of {of} are of the final evaluation.\n"
     return tables.markdown(Table("", header, lines)) + notes
 
 

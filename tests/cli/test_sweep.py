@@ -18,7 +18,8 @@ from jaxsafe.learn.offline import OfflineConfig, data_set_like
 from jaxsafe.report import plots
 from jaxsafe.report.evaluation import evaluate
 from jaxsafe.report.finish import finish
-from jaxsafe.report.sweep_summary import EVALUATED, LATE, rows_of, summarise
+from jaxsafe.report.group import EVALUATED, LATE
+from jaxsafe.report.sweep_summary import rows_of, summarise
 from jaxsafe.run import arguments, checkpoint, loop, memory, programs, run_folder, session, sweep
 from jaxsafe.run.arguments import compose
 from jaxsafe.run.dataset import write_dataset
@@ -389,6 +390,11 @@ def test_the_summary_of_learning_from_data_is_of_the_final_evaluation(tmp_path, 
         row = next(csv.DictReader(file))
     assert (row["updates"], row["return"], row["cost"], row["held"]) == ("10", "1.0", "20.0", "no")
     assert titles == [f"{period}, mean and 95 % interval" for period in (LATE, EVALUATED)]
+    monkeypatch.undo()
+    assert shell.typed("plot", str(folder), "--out", str(tmp_path / "plot")) == 0
+    text = (tmp_path / "plot" / "results.md").read_text()
+    assert "Return of an episode, final evaluation: mean" in text and "| updates |" in text
+    assert "| `bc, algo.cost_limit=10` | 1.00 |" in text and "limit=40` | 2.00 |" in text
 
 
 def test_curves_of_settings_side_by_side_have_their_own_limits(tmp_path, monkeypatch):
