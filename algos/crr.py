@@ -138,12 +138,11 @@ def learner(env: Env, treatment: Treatment = no_treatment) -> Learner:
         def of_actions(action: jax.Array) -> Values:
             return lowest(params, batch.obs, action, cfg)
 
-        here, there = of_actions(batch.action), jax.vmap(of_actions)(drawn)
-        if idle(cfg):
-            q_r = there.reward
-            there = there._replace(cost=jnp.broadcast_to(q_r.T, there.cost.T.shape).T)
-        there = jax.tree.map(lambda x: x.mean(0), there)
-        return jax.tree.map(lambda x, y: x - y, here, there), there
+        here = of_actions(batch.action)
+        there = jax.tree.map(lambda x: x.mean(0), jax.vmap(of_actions)(drawn))
+        if idle(cfg):  # Q_r in place of each Q_c
+            there = there._replace(cost=jnp.broadcast_to(there.reward, here.cost.T.shape).T)
+        return jax.tree.map(jnp.subtract, here, there), there
 
     def step(
         nets: Trainable, batch: Transitions, at: GradientStep, cfg: Any, axis_name: str | None

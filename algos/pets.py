@@ -178,7 +178,7 @@ VELOCITY: dict[str, Any] = ALONE | {
     "refit_every": 1200, "learning_starts": 10_000, "replay_size": 1_000_000, "plan_steps": 16,
     "plan_var": 0.1,
 }  # fmt: skip
-TRUE: dict[str, Any] = {"true_model": True, "learning_starts": 0}
+TRUE: dict[str, Any] = {"true_model": True}
 LIMIT: dict[str, Any] = {"cost_limit": 1.0}
 # for a problem of two levers, whose next signs nobody can foresee
 LEVER: dict[str, Any] = {

@@ -180,7 +180,7 @@ soft_lagrangian = Treatment(
 
 class Edited(NamedTuple):
     """Proposals and what the editor makes of them, float [..., A]; the log probabilities of the
-    proposals and of the changes, float [...]. Without an editor nothing is changed, for sure."""
+    proposals and of the changes, float [...]. Without an editor actions are the proposals."""
 
     proposal: jax.Array
     action: jax.Array

@@ -193,7 +193,7 @@ def observed_cost(env: Env) -> Callable[[jax.Array], jax.Array]:
     if cost is None:
         raise ConfigError(
             "learn_cost=False: observations of this environment do not tell the cost; those of Goal 0 "
-            "and 1 do with env.observation=coordinates, and the vases of Goal 2 cost what none tells"
+            "and 1 do with env.observation=coordinates; in Goal 2 vases cost, too"
         )
     return cost
 

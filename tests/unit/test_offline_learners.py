@@ -222,6 +222,12 @@ def density(actor, obs, action):
     return (-0.5 * z**2 - log_std - 0.5 * np.log(2 * np.pi)).sum(-1)
 
 
+def sample(actor, obs, key):
+    """Actions [5, 2] of a bounded policy."""
+    std = np.exp(np.clip(actor["log_std"], -5, 2))
+    return np.clip(np.tanh(linear(actor["mean"], obs)) + std * noise(key, (5, 2)), -1, 1)
+
+
 @pytest.mark.parametrize("ranges", [(), ((-0.1, 0.2), (0.0, 0.1))], ids=["free", "kept in range"])
 def test_gradients_of_ccrr(ranges):
     cfg = crr.CCRRConfig(**LINEAR, actions=3, cost_discount=0.8, temperature=0.5, weight_max=1.1)
@@ -233,10 +239,6 @@ def test_gradients_of_ccrr(ranges):
     after, metrics = stepped(learner, nets, batch, at, cfg)
     new, old = double(after.params), double(other)
     next_key, key = jax.random.split(at.key)
-
-    def sample(actor, obs, key):
-        std = np.exp(np.clip(actor["log_std"], -5, 2))
-        return np.clip(np.tanh(linear(actor["mean"], obs)) + std * noise(key, (5, 2)), -1, 1)
 
     ahead, go = sample(old["actor"], b["next_obs"], next_key), 1 - b["terminated"]
     next_r = q(old["critic_r"], b["next_obs"], ahead).min(0)
@@ -335,10 +337,6 @@ def test_gradients_of_ccrr_whose_critic_of_cost_is_idle():
     after, metrics = stepped(learner, nets, batch, at, cfg)
     params, old = double(nets.params), double(other)
     next_key, key = jax.random.split(at.key)
-
-    def sample(actor, obs, key):
-        std = np.exp(np.clip(actor["log_std"], -5, 2))
-        return np.clip(np.tanh(linear(actor["mean"], obs)) + std * noise(key, (5, 2)), -1, 1)
 
     ahead = sample(old["actor"], b["next_obs"], next_key)
     later = 0.9 * (1 - b["terminated"]) * q(old["critic_r"], b["next_obs"], ahead).min(0)
