@@ -161,9 +161,10 @@ NAVIGATION: dict[str, Any] = pets.NAVIGATION | NETS | {
     "horizon": 50, "learn_every": 50, "hidden": (64, 64), "lr": 1e-3,
     "critic_lr": 1e-3, "temperature": 10 * 1000 / 7, "max_grad_norm": math.inf,
 }  # fmt: skip
-VELOCITY: dict[str, Any] = pets.VELOCITY | NETS | {
-    "plan_steps": 3, "policy_delay": 2, "temperature": 1000 / 3, "alpha_init": 0.2,
+PLANS: dict[str, Any] = {
+    "plan_steps": 3, "plan_var": 0.1, "policy_delay": 2, "temperature": 1000 / 3,
 }  # fmt: skip
+VELOCITY: dict[str, Any] = pets.VELOCITY | NETS | PLANS | {"alpha_init": 0.2}
 SAFE: dict[str, Any] = {"cost_limit": 1.0}
 # the actor-critic's settings for a problem of two levers, and the planner's
 LEVER: dict[str, Any] = sac.LEVER | pets.LEVER | {
@@ -176,7 +177,7 @@ ROWS = {
         LOOPConfig,
         make,
         "planning with an ensemble of models and a critic, no constraint",
-        {"omnisafe_navigation": NAVIGATION, "omnisafe_velocity": VELOCITY},
+        {"omnisafe_navigation": NAVIGATION, "omnisafe_velocity": VELOCITY, "velocity": PLANS},
         total_steps=1_000_000,
         omnisafe="LOOP",
         holds="nothing",
@@ -186,7 +187,11 @@ ROWS = {
         SafeLOOPConfig,
         partial(make, cost=worst_cost, weigh=by_return_within_limit),
         "LOOP among plans of a low cost in the worst case",
-        {"omnisafe_navigation": NAVIGATION | SAFE, "omnisafe_velocity": VELOCITY | SAFE},
+        {
+            "omnisafe_navigation": NAVIGATION | SAFE,
+            "omnisafe_velocity": VELOCITY | SAFE,
+            "velocity": PLANS,
+        },
         total_steps=1_000_000,
         omnisafe="SafeLOOP",
         lever=LEVER,

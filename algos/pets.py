@@ -174,9 +174,9 @@ ALONE: dict[str, Any] = {
     "epoch_steps": 0,
 }  # fmt: skip
 NAVIGATION: dict[str, Any] = ALONE | {"refit_every": 240, "learn_cost": False}
-VELOCITY: dict[str, Any] = ALONE | {
-    "refit_every": 1200, "learning_starts": 10_000, "replay_size": 1_000_000, "plan_steps": 16,
-    "plan_var": 0.1,
+PLANS: dict[str, Any] = {"plan_steps": 16, "plan_var": 0.1}  # of velocity tasks
+VELOCITY: dict[str, Any] = ALONE | PLANS | {
+    "refit_every": 1200, "learning_starts": 10_000, "replay_size": 1_000_000,
 }  # fmt: skip
 TRUE: dict[str, Any] = {"true_model": True}
 LIMIT: dict[str, Any] = {"cost_limit": 1.0}
@@ -192,6 +192,7 @@ def published(limit: dict[str, Any], **velocity: Any) -> dict[str, dict[str, Any
     return {
         "omnisafe_navigation": NAVIGATION | limit,
         "omnisafe_velocity": VELOCITY | limit | velocity,
+        "velocity": PLANS,
         "true_model": TRUE,
     }
 

@@ -101,6 +101,7 @@ PRESETS = {  # all but `fast`, which has no settings of its own
     "parallel": "OmniSafe's replay ratio, on a GPU",
     "parallel_navigation": "the same with OmniSafe's slower policy and price of Goal",
     "navigation": "OmniSafe's temperature of Goal",
+    "velocity": "OmniSafe's plans of velocity tasks, else the defaults",
     "true_model": "plans in the simulator, not in learned models",
     "cpu": "for two cores and half an hour",
     "proprio": "DreamerV3's settings of vectors",
