@@ -315,6 +315,21 @@ class Fit(NamedTuple):
     skipped: jax.Array
 
 
+def finite_models(nets: Trainable) -> jax.Array:
+    """Which models have nothing but finite weights and moments, bool [M]."""
+    return jax.vmap(all_finite)([x for x in jax.tree.leaves(nets) if jnp.ndim(x)])
+
+
+def select_models(mask: jax.Array, new: Trainable, old: Trainable) -> Trainable:
+    """`new` of models where `mask` [M] holds, else `old`. Adam's count, which they share, is new if any
+    model is."""
+
+    def choose(a: jax.Array, b: jax.Array) -> jax.Array:
+        return select_rows(mask, a, b) if jnp.ndim(b) else select(mask.any(), a, b)
+
+    return jax.tree.map(choose, new, old)
+
+
 def fit(
     model: Trainable,
     ring: ModelRecord,
@@ -326,7 +341,8 @@ def fit(
     """`model`, as of `init_model`, after training on all that the ring holds, from where it is.
 
     Epoch by epoch, until for `patience` epochs no model's hold-out error has fallen below 99% of its
-    least. Each model is then put back to where its error was least.
+    least. Each model is then put back to where its error was least. An epoch does not move a model that
+    is not finite at its end.
     """
     split_key, key = jax.random.split(device_key(key, axis_name))
     usable = learnable(ring, span)
@@ -367,8 +383,8 @@ def fit(
         start = Trainable(now.ensemble, now.opt_state)
         moved = jax.lax.fori_loop(0, steps, step, start)
         # A gradient that is not finite stays in Adam's moments. To look for it once spares kernels.
-        finite = all_finite(moved)
-        ensemble, opt_state = select(finite, moved, start)
+        finite = finite_models(moved)
+        ensemble, opt_state = select_models(finite, moved, start)
         error = errors(ensemble)
         better = error < BETTER * now.error
         return Fit(
@@ -378,7 +394,7 @@ def fit(
             error=jnp.where(better, error, now.error),
             stale=jnp.where(better.any(), 0, now.stale + 1),
             epochs=now.epochs + 1,
-            skipped=now.skipped + jnp.where(finite, 0, steps),
+            skipped=now.skipped + jnp.where(finite.all(), 0, steps),
         )
 
     none, old = jnp.int32(0), model.params.ensemble

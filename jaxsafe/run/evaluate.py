@@ -131,7 +131,7 @@ def measures(
     """
     costs = {name: episodes.costs[..., k] for k, name in enumerate(cost_names)}
     over = {name: above(costs[name] if name else episodes.cost, most) for name, most in limits.items()}
-    shown = costs if len(costs) > 1 else {}
+    shown = {name: x for name, x in costs.items() if len(costs) > 1 or name in limits}
     goals = {} if np.isnan(episodes.goals).all() else {"goals": episodes.goals}
     return {
         "return": episodes.ret,

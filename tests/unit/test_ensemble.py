@@ -26,6 +26,7 @@ from jaxsafe.learn.models import (
 from jaxsafe.learn.next_step_rollout import collect_records, started
 from jaxsafe.learn.replay import Span
 from jaxsafe.learn.rollout import init_rollout
+from jaxsafe.learn.steps import Trainable
 from jaxsafe.nn.ensemble import ensemble_loss, init_ensemble, outputs_of, unscaled
 
 ROWS, ENVS = 640, 8
@@ -234,6 +235,28 @@ def test_an_epoch_with_a_gradient_that_is_not_finite_moves_nothing():
     end = after.params.ensemble, after.opt_state
     for a, b in zip(jax.tree.leaves(start), jax.tree.leaves(end), strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+def test_a_model_that_is_not_finite_leaves_the_others_to_learn():
+    cfg = dataclasses.replace(Config(), max_epochs=1, epoch_steps=20)
+    x, y = draw(jax.random.key(0), (64, ENVS))
+    whole = init_model(jax.random.key(1), LINE, cfg)
+    broken = jax.tree.map(
+        lambda w: w.at[1].set(jnp.nan) if w.ndim and w.shape[0] == cfg.models else w, whole.params
+    )
+
+    def train(params):
+        ring, span = ring_of(x, y), Span(jnp.int32(0), jnp.int32(64))
+        return fit(Trainable(params, whole.opt_state), ring, span, jax.random.key(2), cfg)
+
+    run = jax.jit(train, compiler_options=FAST)
+    (good, _), clean = run(whole.params)
+    (kept, state), metrics = run(broken)
+    assert clean["train/nonfinite"] == 0 and metrics["train/nonfinite"] == 20
+    for a, b in zip(jax.tree.leaves(good.ensemble), jax.tree.leaves(kept.ensemble), strict=True):
+        np.testing.assert_array_equal(a[::2], b[::2])
+        assert jnp.isnan(b[1]).all()
+    assert all(jnp.isfinite(x).all() for x in jax.tree.leaves(state))
 
 
 def test_a_fit_in_bfloat16_moves_float32_weights_by_nearly_the_same():

@@ -123,6 +123,13 @@ def test_discounted_sums_and_named_costs_of_an_episode_by_hand():
     assert found["violation rate"].item() and not {"cost wall", "goals"} & found.keys()
 
 
+def test_the_only_cost_has_a_row_of_its_own_where_it_has_a_limit_of_its_own():
+    one = evaluate.Episodes(*[np.ones((1, 1))] * len(evaluate.Episodes._fields))
+    one = one._replace(costs=np.full((1, 1, 1), 7.0))
+    assert evaluate.measures(one, ("a",), {"a": 9.0})["cost a"].item() == 7
+    assert "cost a" not in evaluate.measures(one, ("a",), {"": 9.0})
+
+
 def test_goals_of_an_episode_are_counted_until_its_end():
     class Scoring(Ticker):
         def reset(self, key):
