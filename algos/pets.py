@@ -34,7 +34,8 @@ class PETSConfig(ModelBasedConfig, ReplayConfig):
         minimise_m  mean[(mu_m(s, a) - y)^2 / sigma_m(s, a)^2 + log sigma_m(s, a)^2],   y = (r, s' - s)
 
     for each model m of the ensemble, at each refit on all of the replay. Where the cost is learned, y
-    has it, too. Planning sees no end of an episode.
+    has it, too. A plan earns nothing after the end of an episode, where the observation tells it
+    (`foresee_end`).
 
     With `true_model` it plans in the simulator instead, whose random numbers it foresees: the most that
     planning can do. Nothing is learned then, and no action is random.
@@ -42,9 +43,9 @@ class PETSConfig(ModelBasedConfig, ReplayConfig):
     Source: Chua et al. (2018), "Deep Reinforcement Learning in a Handful of Trials using Probabilistic
     Dynamics Models", arXiv:1805.12114; the settings are OmniSafe's.
     Differs from OmniSafe: the bounds of the variances are learned, weights begin with a truncated
-    normal, and each model is put back to its best, as in the papers. The plan begins anew with each
-    episode, and evaluation has plans of its own. Batches are drawn with replacement. The defaults are
-    for a GPU: many environments, and a fixed number of large steps at each refit.
+    normal, and each model is put back to its best, as in the papers. Plans see the end of an episode.
+    They begin anew with each, and evaluation has plans of its own. Batches are drawn with replacement.
+    The defaults are for a GPU: many environments, and a fixed number of large steps at each refit.
     """
 
     # Environments side by side, of all devices together. OmniSafe has 1.
@@ -176,7 +177,7 @@ ALONE: dict[str, Any] = {
 NAVIGATION: dict[str, Any] = ALONE | {"refit_every": 240, "learn_cost": False}
 PLANS: dict[str, Any] = {"plan_steps": 16, "plan_var": 0.1}  # of velocity tasks
 VELOCITY: dict[str, Any] = ALONE | PLANS | {
-    "refit_every": 1200, "learning_starts": 10_000, "replay_size": 1_000_000,
+    "refit_every": 1200, "learning_starts": 10_000, "replay_size": 1_000_000, "foresee_end": False,
 }  # fmt: skip
 TRUE: dict[str, Any] = {"true_model": True}
 LIMIT: dict[str, Any] = {"cost_limit": 1.0}

@@ -48,6 +48,11 @@ class Wrapper:
         return getattr(self.env, "observed_cost", None)
 
     @property
+    def observed_end(self) -> Callable[[jax.Array], jax.Array] | None:
+        """See Velocity."""
+        return getattr(self.env, "observed_end", None)
+
+    @property
     def barrier(self) -> Callable[[jax.Array], jax.Array] | None:
         """At most 1 where an observation is safe, if the environment says: see Pendulum."""
         return getattr(self.env, "barrier", None)
@@ -148,6 +153,10 @@ class FrameStack(Wrapper):
     @property
     def observed_cost(self) -> Callable[[jax.Array], jax.Array] | None:
         return self.of_newest(super().observed_cost)
+
+    @property
+    def observed_end(self) -> Callable[[jax.Array], jax.Array] | None:
+        return self.of_newest(super().observed_end)
 
     @property
     def barrier(self) -> Callable[[jax.Array], jax.Array] | None:

@@ -16,6 +16,7 @@ others' are, there in [-0.4, 0.4]. A physics error ends the episode in its last 
 """
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 
 import flax.struct
@@ -108,6 +109,22 @@ class Velocity:
         speed = self.config.forward_reward_weight * self.threshold
         return self.config.num_steps * (speed + self.config.healthy_reward)
 
+    @property
+    def observed_end(self) -> Callable[[jax.Array], jax.Array] | None:
+        """obs [..., obs_size] -> whether the step after which it is observed ends the episode, bool
+        [...]. None where no step does. Speeds are observed up to a bound only."""
+        ranges = (getattr(self.config, f"healthy_{name}_range") for name in ("z", "angle", "state"))
+        if not self.config.terminate_when_unhealthy or not any(ranges):
+            return None
+        (seen,), (speeds,) = self.observation_spec["qpos"], self.observation_spec["qvel"]
+
+        def end(obs: jax.Array) -> jax.Array:
+            unseen = jnp.zeros((*obs.shape[:-1], self.robot.unseen))
+            qpos = jnp.concatenate([unseen, obs[..., :seen]], -1)
+            return ~self.healthy(qpos, obs[..., seen : seen + speeds])
+
+        return end
+
     # Episode ---------------------------------------------------------------------------------------
 
     def reset(self, key: jax.Array) -> State:
@@ -142,7 +159,7 @@ class Velocity:
         place = self.place(physics, readings)
         velocity = (place - world.place) / self.step_seconds  # [2], m/s
         cost = self.cost(velocity)
-        healthy = self.healthy(physics)
+        healthy = self.healthy(physics.qpos, physics.qvel)
         paid = healthy | cfg.terminate_when_unhealthy
         reward = cfg.forward_reward_weight * velocity[0] + cfg.healthy_reward * paid
         reward -= cfg.ctrl_cost_weight * jnp.square(ctrl).sum()
@@ -189,16 +206,17 @@ class Velocity:
     def cost(self, velocity: jax.Array) -> jax.Array:
         return (self.speed(velocity) > self.threshold).astype(jnp.float32)
 
-    def healthy(self, physics: Physics) -> jax.Array:
-        cfg, qpos = self.config, physics.qpos
-        ok = jnp.bool_(True)
+    def healthy(self, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
+        """Of positions [..., nq] and speeds [..., nv], bool [...]."""
+        cfg, height, pitch = self.config, self.robot.height or 0, self.robot.pitch or 0
+        ok = jnp.ones(qpos.shape[:-1], bool)
         for bounds, value in (
-            (cfg.healthy_z_range, qpos[self.robot.height or 0]),
-            (cfg.healthy_angle_range, qpos[self.robot.pitch or 0]),
-            (cfg.healthy_state_range, jnp.concatenate([qpos[2:], physics.qvel])),
+            (cfg.healthy_z_range, qpos[..., height : height + 1]),
+            (cfg.healthy_angle_range, qpos[..., pitch : pitch + 1]),
+            (cfg.healthy_state_range, jnp.concatenate([qpos[..., 2:], qvel], -1)),
         ):
             if bounds is not None:
-                ok &= ((bounds[0] < value) & (value < bounds[1])).all()
+                ok &= ((bounds[0] < value) & (value < bounds[1])).all(-1)
         return ok
 
     def observe(self, physics: Physics, readings: Readings) -> jax.Array:

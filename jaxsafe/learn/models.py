@@ -97,6 +97,9 @@ class ModelConfig(EnsembleConfig):
     # Whether the model learns the cost. If not, the environment computes it from the observation, as
     # those of Goal 0 and 1 do with env.observation=coordinates. OmniSafe learns it in velocity tasks.
     learn_cost: bool = True
+    # Whether a plan sees that an episode ends, where the environment tells that from the observation,
+    # as velocity tasks do. OmniSafe's plans do not.
+    foresee_end: bool = True
     # What the model's hidden layers are computed in. bfloat16, which has 8 bits, halves what a GPU has
     # to move. On an H100 or H200 with Warp networks and draw are one kernel then, with other random
     # numbers.
@@ -169,7 +172,8 @@ class Fitted:
 
 
 def learned_model(env: Env) -> Model:
-    """The ensemble as a model. The latent is an observation. It foresees no end of an episode."""
+    """The ensemble as a model. The latent is an observation, which may tell the end of an episode."""
+    ends = getattr(env, "observed_end", None)
 
     def predict(
         fitted: Fitted, latent: jax.Array, action: jax.Array, key: jax.Array, cfg: Any
@@ -178,7 +182,8 @@ def learned_model(env: Env) -> Model:
         out, spread = draw(fitted.ensemble, fitted.scale, inputs, key, cfg.model_dtype)
         obs = jnp.clip(latent + out[..., -env.obs_size :], -FARTHEST, FARTHEST)
         cost = out[..., 1] if cfg.learn_cost else observed_cost(env)(obs)
-        return Prediction(obs, out[..., 0], cost, spread, jnp.zeros(cost.shape, bool))
+        end = ends(obs) if ends and cfg.foresee_end else jnp.zeros(cost.shape, bool)
+        return Prediction(obs, out[..., 0], cost, spread, end)
 
     return Model(lambda cfg: (cfg.models, cfg.particles), predict, lambda latent: latent)
 

@@ -20,6 +20,7 @@ from jaxsafe import envs
 from jaxsafe.config import ConfigError
 from jaxsafe.envs.velocity.suite import NAMES
 from jaxsafe.envs.velocity.task import Velocity, World
+from jaxsafe.envs.wrap import ActionRepeat, FrameStack
 from jaxsafe.types import State
 
 DATA = Path(__file__).parent.parent / "data"
@@ -342,7 +343,29 @@ def test_a_height_is_healthy_within_its_range():
         physics = jax.tree.map(lambda x: x[0], begin(m, 1).physics.physics)
         for z, healthy in ((low - 1e-3, 0), (low + 1e-3, 1), (high - 1e-3, 1), (high + 1e-3, 0)):
             qpos = physics.qpos.at[m.env.robot.height].set(z)
-            assert m.env.healthy(physics.replace(qpos=qpos)) == healthy
+            assert m.env.healthy(qpos, physics.qvel) == healthy
+
+
+@pytest.mark.parametrize("robot", ["ant", "hopper", "walker2d", "humanoid"])
+def test_the_observation_tells_whether_the_episode_has_ended(robot):
+    m = made(robot)
+    end: Any = m.env.observed_end
+    state, falls = begin(m, 32), 0
+    for t in range(60):
+        action = jax.random.uniform(jax.random.key(t), (32, m.env.action_size), minval=-1.0)
+        state = m.step(state, action)
+        np.testing.assert_array_equal(end(state.obs), state.terminated)
+        falls += state.terminated.sum()
+    assert falls > 0
+    frames: Any = FrameStack(ActionRepeat(m.env, 2), 2)
+    stacked = jnp.concatenate([state.obs, jnp.zeros_like(state.obs)], -1)  # the newest first
+    np.testing.assert_array_equal(frames.observed_end(stacked), state.terminated)
+
+
+def test_a_task_without_an_end_tells_none():
+    assert made("halfcheetah").env.observed_end is None
+    assert made("ant", terminate_when_unhealthy=False).env.observed_end is None
+    assert FrameStack(envs.make("point_goal1"), 2).observed_end is None
 
 
 @pytest.mark.parametrize("change", [{"pitch": 0.25}, {"speed": 101.0}, {}])

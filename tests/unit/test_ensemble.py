@@ -8,10 +8,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from compiling import FAST
 from toys import Ticker
 
 from jaxsafe.config import config
+from jaxsafe.learn.acting import Learned
 from jaxsafe.learn.models import (
     Fitted,
     ModelConfig,
@@ -19,11 +21,13 @@ from jaxsafe.learn.models import (
     fit,
     init_model,
     learnable,
+    learned_model,
     record_by,
     scale_of,
     transitions_at,
 )
 from jaxsafe.learn.next_step_rollout import collect_records, started
+from jaxsafe.learn.planning import PlanConfig, imagine
 from jaxsafe.learn.replay import Span
 from jaxsafe.learn.rollout import init_rollout
 from jaxsafe.learn.steps import Trainable
@@ -33,7 +37,7 @@ ROWS, ENVS = 640, 8
 
 
 @config
-class Config(ModelConfig):
+class Config(PlanConfig, ModelConfig):
     models: int = 3
     model_hidden: tuple[int, ...] = (32, 32)
     learn_cost: bool = False
@@ -271,3 +275,31 @@ def test_a_fit_in_bfloat16_moves_float32_weights_by_nearly_the_same():
     for a, b in zip(jax.tree.leaves(grads), jax.tree.leaves(near_grads), strict=True):
         assert b.dtype == jnp.float32
         np.testing.assert_allclose(b, a, atol=0.02 * np.abs(a).max())
+
+
+@pytest.mark.parametrize("foresees", [True, False])
+def test_a_plan_earns_nothing_after_an_end_that_the_observation_tells(foresees):
+    """The ensemble is sure that a step goes 1 ahead and pays 2. Beyond 1.5 the episode ends."""
+
+    @dataclass(frozen=True)
+    class Ending(Line):
+        episode_length: int = 5
+
+        def observed_end(self, obs):
+            return obs[..., 0] > 1.5
+
+    env: Any = Ending()
+    cfg = dataclasses.replace(Config(), foresee_end=foresees, particles=2)
+    model = init_model(jax.random.key(0), env, cfg).params
+    *layers, last = jax.tree.map(jnp.zeros_like, model.ensemble.layers)
+    means = jnp.zeros_like(last.bias).at[:, 0].set(2.0).at[:, 1].set(1.0)
+    sure = jnp.full_like(model.ensemble.low, -30.0)
+    ensemble = model.ensemble.replace(
+        layers=(*layers, last.replace(bias=means)), low=sure, high=sure + 1e-3
+    )
+    learned = Learned(cfg, {"model": model.replace(ensemble=ensemble)}, (), ())
+    plans = jnp.zeros((1, 4, 1))
+    imagined = imagine(learned_model(env), learned, jnp.zeros(1), plans, jax.random.key(1))
+    paid = [2, 2, 0, 0] if foresees else [2, 2, 2, 2]
+    np.testing.assert_allclose(imagined.reward.mean((1, 2, 3)), paid, atol=1e-4)
+    assert (imagined.alive == (not foresees)).all()
