@@ -183,7 +183,7 @@ SAC_PARALLEL: dict[str, Any] = PARALLEL | {"policy_delay": 2}
 NAVIGATION_RATE: dict[str, Any] = {"lr": 16 * 5e-6, "lr_decay": False}
 # and its temperature there: a goal is worth 1, and a step some hundredths
 COLD: dict[str, Any] = {"alpha_init": 1e-5, "alpha_lr": 0.0}
-# Ours. With targets of one step, as OmniSafe has, much of the return is lost while a price rises.
+# Ours, for navigation. With one step, as OmniSafe has, much of the return is lost while a price rises.
 FAR: dict[str, Any] = {"n_step": 3}
 
 
@@ -195,7 +195,7 @@ def priced_parallel(
     On velocity tasks a policy answers a price within some hundred gradient steps, and a price that
     waits longer swings. On navigation tasks the cost of two episodes, which are 2,000 steps, is mostly
     chance. So there `price` is OmniSafe's, and moves every 20,000 steps. Targets of three steps keep
-    the return while it rises: see docs/results/goal_off_policy.
+    more of the return while it rises: see docs/results/goal_off_policy.
     """
     critics = "cost_reduce", "cost_floor"  # these stay ours
     slow = {name: value for name, value in price.items() if name not in critics}
