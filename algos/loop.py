@@ -161,7 +161,7 @@ NAVIGATION: dict[str, Any] = pets.NAVIGATION | NETS | {
     "horizon": 50, "learn_every": 50, "hidden": (64, 64), "lr": 1e-3,
     "critic_lr": 1e-3, "temperature": 10 * 1000 / 7, "max_grad_norm": math.inf,
 }  # fmt: skip
-PLANS: dict[str, Any] = {
+PLANS: dict[str, Any] = {  # of velocity tasks, and the delay of the actor
     "plan_steps": 3, "plan_var": 0.1, "policy_delay": 2, "temperature": 1000 / 3,
 }  # fmt: skip
 VELOCITY: dict[str, Any] = pets.VELOCITY | NETS | PLANS | {"alpha_init": 0.2}

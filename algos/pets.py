@@ -75,7 +75,8 @@ class CCEConfig(PETSConfig):
         elites: the largest R among plans with C <= cost_limit;
                 if there are fewer of these than elites, the smallest C of all plans
 
-    The rest is as in PETS.
+    The rest is as in PETS. A plan that ends the episode costs nothing after that. So where too few
+    plans are within the limit, one that falls soon may be the cheapest.
 
     Source: Wen and Topcu (2018), "Constrained Cross-Entropy Method for Safe Reinforcement Learning".
     Differs from OmniSafe: there C is the cost of 1000 steps of the planner, whatever an episode has.
@@ -172,12 +173,12 @@ def make_cautious(env: Env, axis_name: str | None = None) -> Algorithm:
 # env.observation=coordinates, where 5 raw steps are one step here. An update of 40 steps is ours.
 ALONE: dict[str, Any] = {
     "num_envs": 1, "horizon": 40, "stagger": False, "model_batch": 256, "max_epochs": 1000,
-    "epoch_steps": 0,
+    "epoch_steps": 0, "foresee_end": False,
 }  # fmt: skip
 NAVIGATION: dict[str, Any] = ALONE | {"refit_every": 240, "learn_cost": False}
 PLANS: dict[str, Any] = {"plan_steps": 16, "plan_var": 0.1}  # of velocity tasks
 VELOCITY: dict[str, Any] = ALONE | PLANS | {
-    "refit_every": 1200, "learning_starts": 10_000, "replay_size": 1_000_000, "foresee_end": False,
+    "refit_every": 1200, "learning_starts": 10_000, "replay_size": 1_000_000,
 }  # fmt: skip
 TRUE: dict[str, Any] = {"true_model": True}
 LIMIT: dict[str, Any] = {"cost_limit": 1.0}

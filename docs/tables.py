@@ -101,7 +101,7 @@ PRESETS = {  # all but `fast`, which has no settings of its own
     "parallel": "OmniSafe's replay ratio, on a GPU",
     "parallel_navigation": "the same for Goal: a slower policy and price, and targets of three steps",
     "navigation": "for Goal and Button: OmniSafe's temperature of Goal, and targets of three steps",
-    "velocity": "OmniSafe's plans of velocity tasks, else the defaults",
+    "velocity": "plans as long as OmniSafe's of velocity tasks, else nearly the defaults",
     "true_model": "plans in the simulator, not in learned models",
     "cpu": "for two cores and half an hour",
     "proprio": "DreamerV3's settings of vectors",

@@ -10,6 +10,7 @@ from jaxsafe.types import Env, State
 
 SIZES = ("obs_size", "action_size", "episode_length")
 MEMBERS = (*SIZES, "cost_names", "reset", "step")
+TOLD = {"observed_cost": jnp.float32, "observed_end": jnp.bool_}  # of an observation, if it tells them
 
 
 def check_env(env: Any, name: str) -> Env:
@@ -43,7 +44,23 @@ def check_env(env: Any, name: str) -> Env:
         if (was := form(old.get(path))) != (now := form(new.get(path))):
             where = jax.tree_util.keystr(path)
             raise ConfigError(f"{name}: state{where} is {was} after reset but {now} after step")
+    for member, dtype in TOLD.items():
+        check_told(env, member, dtype, name)
     return env
+
+
+def check_told(env: Env, member: str, dtype: Any, name: str) -> None:
+    """What an observation tells, if the environment says how: one number for each of many."""
+    if (told := getattr(env, member, None)) is None:
+        return
+    expected = form(jax.ShapeDtypeStruct((2, 3), dtype))
+    obs = jax.ShapeDtypeStruct((2, 3, env.obs_size), jnp.float32)
+    try:
+        found = form(jax.eval_shape(told, obs))
+    except (TypeError, ValueError, IndexError) as error:
+        found = f"no function of it ({error})"
+    if found != expected:
+        raise ConfigError(f"{name}: {member} of {form(obs)} is {found}, expected {expected}")
 
 
 def check_state(state: Any, env: Env, where: str) -> None:

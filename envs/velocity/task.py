@@ -112,7 +112,8 @@ class Velocity:
     @property
     def observed_end(self) -> Callable[[jax.Array], jax.Array] | None:
         """obs [..., obs_size] -> whether the step after which it is observed ends the episode, bool
-        [...]. None where no step does. Speeds are observed up to a bound only."""
+        [...]. None where no step does. It does not tell an end by a physics error, nor one by a speed
+        beyond what is observed."""
         ranges = (getattr(self.config, f"healthy_{name}_range") for name in ("z", "angle", "state"))
         if not self.config.terminate_when_unhealthy or not any(ranges):
             return None

@@ -26,7 +26,6 @@ from jaxsafe.learn.batch import (
     device_key,
     pmean,
     psum,
-    select,
     select_rows,
 )
 from jaxsafe.learn.next_step_rollout import Stepping, arrival_record
@@ -98,7 +97,7 @@ class ModelConfig(EnsembleConfig):
     # those of Goal 0 and 1 do with env.observation=coordinates. OmniSafe learns it in velocity tasks.
     learn_cost: bool = True
     # Whether a plan sees that an episode ends, where the environment tells that from the observation,
-    # as velocity tasks do. OmniSafe's plans do not.
+    # as velocity tasks do. OmniSafe's plans do not. The simulator always sees it.
     foresee_end: bool = True
     # What the model's hidden layers are computed in. bfloat16, which has 8 bits, halves what a GPU has
     # to move. On an H100 or H200 with Warp networks and draw are one kernel then, with other random
@@ -220,7 +219,13 @@ def init_fitted(key: jax.Array, env: Env, cfg: Any) -> Trainable:
 
 
 def optimiser_of(cfg: Any) -> optax.GradientTransformation:
-    return optax.adam(cfg.model_lr)
+    """Adam of each model for itself: its state has an axis [M] on every leaf."""
+    adam = optax.adam(cfg.model_lr)
+
+    def update(grads: PyTree, state: PyTree, params: PyTree = None) -> tuple[PyTree, PyTree]:
+        return jax.vmap(adam.update)(grads, state)
+
+    return optax.GradientTransformation(jax.vmap(adam.init), update)  # type: ignore[arg-type]
 
 
 def model_of(nets: Trainable) -> Trainable:
@@ -320,21 +325,6 @@ class Fit(NamedTuple):
     skipped: jax.Array
 
 
-def finite_models(nets: Trainable) -> jax.Array:
-    """Which models have nothing but finite weights and moments, bool [M]."""
-    return jax.vmap(all_finite)([x for x in jax.tree.leaves(nets) if jnp.ndim(x)])
-
-
-def select_models(mask: jax.Array, new: Trainable, old: Trainable) -> Trainable:
-    """`new` of models where `mask` [M] holds, else `old`. Adam's count, which they share, is new if any
-    model is."""
-
-    def choose(a: jax.Array, b: jax.Array) -> jax.Array:
-        return select_rows(mask, a, b) if jnp.ndim(b) else select(mask.any(), a, b)
-
-    return jax.tree.map(choose, new, old)
-
-
 def fit(
     model: Trainable,
     ring: ModelRecord,
@@ -388,8 +378,8 @@ def fit(
         start = Trainable(now.ensemble, now.opt_state)
         moved = jax.lax.fori_loop(0, steps, step, start)
         # A gradient that is not finite stays in Adam's moments. To look for it once spares kernels.
-        finite = finite_models(moved)
-        ensemble, opt_state = select_models(finite, moved, start)
+        finite = jax.vmap(all_finite)(moved)  # [M]
+        ensemble, opt_state = select_rows(finite, moved, start)
         error = errors(ensemble)
         better = error < BETTER * now.error
         return Fit(

@@ -52,8 +52,8 @@ class PlanConfig:
 class Imagined(NamedTuple):
     """What a model thinks of S plans over H steps, for P particles of each of M models.
 
-    reward, cost, spread: float [H, M, P, S], see `models.Prediction`; rewards and costs are 0 after the
-    end of an episode. obs: what is seen after the last step, [M, P, S, O]. alive: bool [M, P, S],
+    reward, cost, spread: float [H, M, P, S], see `models.Prediction`; all are 0 after the end of an
+    episode. obs: what is seen after the last step, [M, P, S, O]. alive: bool [M, P, S],
     whether the episode still goes on then.
     """
 
@@ -107,8 +107,8 @@ def imagine(model: Model, learned: Learned, seen: PyTree, plans: jax.Array, key:
         (latent, alive), (action, key) = now, x
         action = jnp.broadcast_to(action, (*shape, action.shape[-1]))
         after = model.predict(fitted, latent, action, key, cfg)
-        reward, cost = (jnp.where(alive, x, 0.0) for x in (after.reward, after.cost))
-        return (after.latent, alive & ~after.end), (reward, cost, after.spread)
+        told = (after.reward, after.cost, after.spread)
+        return (after.latent, alive & ~after.end), tuple(jnp.where(alive, x, 0.0) for x in told)
 
     start = particles_of(seen, shape), jnp.ones(shape, bool)
     keys = jax.random.split(key, plans.shape[1])

@@ -130,6 +130,25 @@ def test_a_member_that_is_missing_or_odd_is_one_line():
     assert check_env(Ticker(), "clock") == Ticker()
 
 
+@pytest.mark.parametrize(
+    "end, found",
+    [
+        (lambda obs: obs[..., 0], "float32[2, 3]"),
+        (lambda obs: obs[..., :1] > 2, "bool[2, 3, 1]"),
+        (lambda obs: obs[0] > 2, "bool[3, 4]"),
+        (lambda obs: obs @ jnp.ones((5, 1)) > 2, "no function of it"),
+    ],
+)
+def test_what_an_observation_tells_is_checked_too(end, found):
+    class Telling(Corridor):
+        observed_end = staticmethod(end)
+
+    with pytest.raises(ConfigError) as refused:
+        check_env(Telling(), "odd")
+    assert f"odd: observed_end of float32[2, 3, 4] is {found}" in str(refused.value)
+    assert "expected bool[2, 3]" in str(refused.value)
+
+
 # On the command line -------------------------------------------------------------------------
 
 MINE = """

@@ -346,9 +346,18 @@ def test_a_height_is_healthy_within_its_range():
             assert m.env.healthy(qpos, physics.qvel) == healthy
 
 
-@pytest.mark.parametrize("robot", ["ant", "hopper", "walker2d", "humanoid"])
-def test_the_observation_tells_whether_the_episode_has_ended(robot):
-    m = made(robot)
+@pytest.mark.parametrize(
+    "robot, options",
+    [
+        ("ant", {}),
+        ("hopper", {}),
+        ("walker2d", {}),
+        ("humanoid", {}),
+        ("hopper", {"healthy_state_range": (-3.0, 3.0)}),  # its speeds are observed up to 10
+    ],
+)
+def test_the_observation_tells_whether_the_episode_has_ended(robot, options):
+    m = made(robot, **options)
     end: Any = m.env.observed_end
     state, falls = begin(m, 32), 0
     for t in range(60):
@@ -357,9 +366,18 @@ def test_the_observation_tells_whether_the_episode_has_ended(robot):
         np.testing.assert_array_equal(end(state.obs), state.terminated)
         falls += state.terminated.sum()
     assert falls > 0
-    frames: Any = FrameStack(ActionRepeat(m.env, 2), 2)
-    stacked = jnp.concatenate([state.obs, jnp.zeros_like(state.obs)], -1)  # the newest first
-    np.testing.assert_array_equal(frames.observed_end(stacked), state.terminated)
+
+
+def test_wrappers_tell_the_end_of_the_newest_step():
+    env: Any = FrameStack(ActionRepeat(made("hopper").env, 3), 2)
+    step = jax.jit(jax.vmap(env.step), compiler_options=FAST)
+    state, falls = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 32)), 0
+    for t in range(12):
+        action = jax.random.uniform(jax.random.key(t), (32, env.action_size), minval=-1.0)
+        state = step(state, action)
+        np.testing.assert_array_equal(env.observed_end(state.obs), state.terminated)
+        falls += state.terminated.sum()
+    assert falls > 0
 
 
 def test_a_task_without_an_end_tells_none():

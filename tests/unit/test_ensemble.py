@@ -241,25 +241,35 @@ def test_an_epoch_with_a_gradient_that_is_not_finite_moves_nothing():
         np.testing.assert_array_equal(a, b)
 
 
-def test_a_model_that_is_not_finite_leaves_the_others_to_learn():
+@pytest.mark.parametrize("kind", ["huge weights", "a huge gradient"])
+def test_a_model_that_does_not_stay_finite_leaves_the_others_to_learn(kind):
+    """A gradient of 1e20 moves no weight, but its square is infinite in Adam's moments."""
     cfg = dataclasses.replace(Config(), max_epochs=1, epoch_steps=20)
     x, y = draw(jax.random.key(0), (64, ENVS))
     whole = init_model(jax.random.key(1), LINE, cfg)
-    broken = jax.tree.map(
-        lambda w: w.at[1].set(jnp.nan) if w.ndim and w.shape[0] == cfg.models else w, whole.params
-    )
+    ensemble = whole.params.ensemble
+    if kind == "huge weights":
+        layers = jax.tree.map(lambda w: w.at[1].multiply(1e18), ensemble.layers)
+        broken = ensemble.replace(layers=layers)
+    else:
+        low, high = (bound.at[1].set(-46.0) for bound in (ensemble.low, ensemble.high))
+        broken = ensemble.replace(low=low, high=high)
 
-    def train(params):
+    def train(ensemble):
         ring, span = ring_of(x, y), Span(jnp.int32(0), jnp.int32(64))
+        params = whole.params.replace(ensemble=ensemble)
         return fit(Trainable(params, whole.opt_state), ring, span, jax.random.key(2), cfg)
 
     run = jax.jit(train, compiler_options=FAST)
-    (good, _), clean = run(whole.params)
+    (good, _), clean = run(ensemble)
     (kept, state), metrics = run(broken)
     assert clean["train/nonfinite"] == 0 and metrics["train/nonfinite"] == 20
-    for a, b in zip(jax.tree.leaves(good.ensemble), jax.tree.leaves(kept.ensemble), strict=True):
-        np.testing.assert_array_equal(a[::2], b[::2])
-        assert jnp.isnan(b[1]).all()
+    leaves = [jax.tree.leaves(tree) for tree in (good.ensemble, broken, kept.ensemble)]
+    for learned, start, end in zip(*leaves, strict=True):
+        np.testing.assert_array_equal(learned[::2], end[::2])
+        np.testing.assert_array_equal(start[1], end[1])
+    assert (good.ensemble.layers[0].weight != ensemble.layers[0].weight).any()
+    assert state[0].count.tolist() == [20, 0, 20]
     assert all(jnp.isfinite(x).all() for x in jax.tree.leaves(state))
 
 
@@ -302,4 +312,5 @@ def test_a_plan_earns_nothing_after_an_end_that_the_observation_tells(foresees):
     imagined = imagine(learned_model(env), learned, jnp.zeros(1), plans, jax.random.key(1))
     paid = [2, 2, 0, 0] if foresees else [2, 2, 2, 2]
     np.testing.assert_allclose(imagined.reward.mean((1, 2, 3)), paid, atol=1e-4)
+    assert ((imagined.spread > 0).all((1, 2, 3)) == (jnp.array(paid) > 0)).all()
     assert (imagined.alive == (not foresees)).all()

@@ -167,7 +167,7 @@ MODEL_BASED: dict[str, Rule] = ON_POLICY | {
     "dynamics_cfgs.reward_size": always(1, note="there is one"),
     "dynamics_cfgs.cost_size": always(1, note="there is one"),
     "dynamics_cfgs.use_cost": ignored(DECIDES),
-    "dynamics_cfgs.use_terminal": always(False, note="the model foresees no end"),
+    "dynamics_cfgs.use_terminal": Rule("algo.foresee_end"),
     "dynamics_cfgs.use_var": ignored(DECIDES),
     "dynamics_cfgs.use_reward_critic": ignored(DECIDES),
     "dynamics_cfgs.use_cost_critic": always(False, note="there is none in a plan"),
