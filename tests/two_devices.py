@@ -44,7 +44,7 @@ def on_two_devices(claim: Callable[..., None], *names: str) -> list[str]:
     return out.stdout.splitlines()
 
 
-def split(fn: Callable, devices: int = 2) -> Callable:
+def split(fn: Callable, devices: int = 2, options: dict[str, Any] = FAST) -> Callable:
     """`fn`, each device with its own entry [devices, ...] of every array; also of what it returns."""
 
     def one(*args: Any) -> Any:
@@ -54,7 +54,7 @@ def split(fn: Callable, devices: int = 2) -> Callable:
     mesh = jax.make_mesh((devices,), ("devices",), **parts)
     spec = PartitionSpec("devices")
     sharded = jax.shard_map(one, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
-    return jax.jit(sharded, compiler_options=FAST)
+    return jax.jit(sharded, compiler_options=options)
 
 
 def agree(tree: Any) -> None:

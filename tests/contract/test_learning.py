@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import FAST
+from compiling import BUSY
 from learners import on_policy_names, options_of
 from toys import START, Lever
 
@@ -39,7 +39,7 @@ def train(name, iterations=100, options=None, **swept):
         return jax.lax.scan(lambda ts, i: algo.update(ts, Shared(i)), ts, jnp.arange(iterations))
 
     keys = jax.random.split(jax.random.key(0), max(map(len, swept.values()), default=2))
-    return algo, *jax.jit(jax.vmap(run), compiler_options=FAST)(keys, swept)
+    return algo, *jax.jit(jax.vmap(run), compiler_options=BUSY)(keys, swept)
 
 
 def late(metrics, window=30):

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import FAST
+from compiling import BUSY, FAST
 from learners import at, copy, member
 from toys import START, Arriving, Corridor, Lever, Ticker
 from two_devices import agree, on_two_devices, split
@@ -396,7 +396,7 @@ def trained(name: str, updates: int, **settings: Any) -> dict[str, jax.Array]:
         ts = algo.init(key, cfg, START)
         return jax.lax.scan(lambda ts, i: algo.update(ts, Shared(i)), ts, jnp.arange(updates))[1]
 
-    return jax.jit(jax.vmap(train), compiler_options=FAST)(jax.random.split(jax.random.key(0), 2))
+    return jax.jit(jax.vmap(train), compiler_options=BUSY)(jax.random.split(jax.random.key(0), 2))
 
 
 @pytest.mark.slow
@@ -470,16 +470,18 @@ def on_levers(name, axis_name, num_envs):
 
 def seeds_and_devices(name):
     same = jnp.stack([jax.random.key(0)] * 2)
-    ts, metrics = split(on_levers(name, "devices", 16))(same)  # one seed, 2 x 16 environments
+    ts, metrics = split(on_levers(name, "devices", 16), options=BUSY)(
+        same
+    )  # one seed, 2 x 16 environments
     agree((ts.params, ts.opt_state, ts.normaliser, ts.lost_time, metrics))
     rings = np.asarray(ts.replay.obs)
     assert rings.shape[1] == 16 and (rings[0] != rings[1]).any()  # each with a ring of its own
-    alone = split(on_levers(name, None, 32), devices=1)
+    alone = split(on_levers(name, None, 32), devices=1, options=BUSY)
     late = [np.asarray(m["train/return"])[..., -10:].mean() for m in (metrics, alone(same[:1])[1])]
     assert min(late) > 17 and abs(late[0] - late[1]) < 1, late
     print(name, "one seed ok")
     keys = jax.random.split(jax.random.key(1))  # two seeds, one a device
-    both = split(on_levers(name, None, 32))
+    both = split(on_levers(name, None, 32), options=BUSY)
     here, there = both(keys), both(keys[::-1])
     for i in range(2):  # neither the neighbour nor the device matters, bit for bit
         for x, y in zip(*(jax.tree.leaves(run[0].params) for run in (here, there)), strict=True):

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from compiling import FAST
+from compiling import BUSY, FAST
 from learners import TINY
 from toys import START, Corridor, Patch
 
@@ -118,7 +118,7 @@ def test_ppo_learns_where_the_patch_is():
     options = {"hidden": (32,), "trunk": "shared", "lr": 2e-3, "epochs": 4, "cost_limit": 5.0}
     cfg = ALGOS["ppo_lag"].config(num_envs=64, horizon=10, minibatches=4, encoder="cnn", **options)
     ts = jax.jit(lambda: algo.init(jax.random.key(0), cfg, START))()
-    update = jax.jit(algo.update)
+    update = jax.jit(algo.update, compiler_options=BUSY)
     for _ in range(32):
         ts, metrics = update(ts, START)
     assert metrics["train/return"] > 3 and metrics["train/nonfinite"] == 0

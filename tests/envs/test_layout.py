@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import FAST
+from compiling import BUSY, FAST
 from scipy.stats import chisquare, ks_2samp, kstest
 from tasks import ROBOT_AT_ORIGIN, change, put, task, with_qpos
 
@@ -19,6 +19,7 @@ from jaxsafe.envs import registry
 from jaxsafe.envs.safety_gym import layout as layouts
 from jaxsafe.envs.safety_gym.arena import World
 from jaxsafe.envs.safety_gym.config import config_from_plain, defaults
+from jaxsafe.envs.safety_gym.task import in_parts
 
 DATA = Path(__file__).parent.parent / "data"
 RECORDED = ("point_goal2", "car_push2", "doggo_button2")
@@ -33,7 +34,8 @@ def recorded(name: str) -> dict[str, np.ndarray]:
 
 @functools.cache
 def begun(name: str) -> World:
-    return task(name).reset(jax.random.split(jax.random.key(11), COUNT)).physics
+    reset, _ = in_parts(task(name).env, compiler_options=BUSY)
+    return reset(jax.random.split(jax.random.key(11), COUNT)).physics
 
 
 @functools.cache

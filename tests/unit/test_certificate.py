@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import FAST
+from compiling import BUSY
 
 from jaxsafe import envs
 from jaxsafe.config import ConfigError
@@ -124,7 +124,7 @@ def test_walks_visit_states_as_often_as_their_density_says(gain):
     def step(search, _):
         return walk(system, core, search, cfg), jnp.abs(search.obs).mean()
 
-    run = jax.jit(lambda start: jax.lax.scan(step, start, None, 1500), compiler_options=FAST)
+    run = jax.jit(lambda start: jax.lax.scan(step, start, None, 1500), compiler_options=BUSY)
     end, seen = run(start)
     assert (jnp.abs(end.obs) < BOUND).all()
     r = gain / 0.15
@@ -161,7 +161,7 @@ def searches():
         state = certificate.decayed_adam(0.0, 0.0).init(net)
         return certify(system, Core(net, k, ()), net, 0.0, state, search, cfg)
 
-    return jax.jit(run, compiler_options=FAST)
+    return jax.jit(run, compiler_options=BUSY)
 
 
 BALANCE, LIMP = jnp.array([6.0, 1.5]), jnp.zeros(2)
@@ -189,7 +189,7 @@ def test_a_certified_region_is_never_left_on_the_true_pendulum():
         return after, (after.cost, system.h(core.barrier, after.obs, cfg), overruled)
 
     begin = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 64))
-    run = jax.jit(lambda keys: jax.lax.scan(step, begin, keys)[1], compiler_options=FAST)
+    run = jax.jit(lambda keys: jax.lax.scan(step, begin, keys)[1], compiler_options=BUSY)
     cost, height, overruled = run(jax.random.split(jax.random.key(1), 300))
     assert (cost == 0).all() and (height < 0).all()
     assert 0.001 < overruled.mean() < 0.9

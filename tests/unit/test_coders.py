@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from compiling import FAST
+from compiling import BUSY, FAST
 
 from jaxsafe.config import ConfigError
 from jaxsafe.nn import coders
@@ -109,7 +109,10 @@ def test_with_bins_it_sees_where_a_hazard_begins(bins, least, most):
         updates, state = rule.update(jax.grad(loss)(params), state)
         return (optax.apply_updates(params, updates), state), None
 
-    run = jax.jit(lambda params: jax.lax.scan(step, (params, rule.init(params)), None, 300)[0][0])
+    @partial(jax.jit, compiler_options=BUSY)
+    def run(params):
+        return jax.lax.scan(step, (params, rule.init(params)), None, 300)[0][0]
+
     said = np.asarray(logits(run(params), fresh))
     area = (said[truth][:, None] > said[~truth]).mean()
     assert least < area < most

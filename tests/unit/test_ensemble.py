@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import FAST
+from compiling import BUSY, FAST
 from toys import Ticker
 
 from jaxsafe.config import config
@@ -92,7 +92,7 @@ def fitted():
         after, metrics = fit(model, ring, span, key, cfg)
         return model.params, *after, metrics
 
-    return jax.jit(train, compiler_options=FAST)(jax.random.key(1))
+    return jax.jit(train, compiler_options=BUSY)(jax.random.key(1))
 
 
 def predicted(model: Fitted, x):
@@ -218,7 +218,7 @@ def test_a_model_is_put_back_to_its_best():
         return *after, metrics
 
     def run(epochs):
-        return jax.jit(train, static_argnums=0, compiler_options=FAST)(epochs)
+        return jax.jit(train, static_argnums=0, compiler_options=BUSY)(epochs)
 
     model, _, metrics = run(1000)
     early, _, before = run(int(metrics["train/model_epochs"]) - 3)
