@@ -1,6 +1,7 @@
 """How the tests compile: little optimised, because a program runs a few times at most."""
 
 import os
+from typing import Any
 
 import jax
 
@@ -22,8 +23,12 @@ def compile_quickly() -> None:
 
     XLA reads its flags once, before it first compiles.
     """
-    flags = [f"--{name}={str(value).lower()}" for name, value in FAST.items()]
-    os.environ["XLA_FLAGS"] = " ".join([*flags, os.environ.get("XLA_FLAGS", "")])
+    os.environ["XLA_FLAGS"] = " ".join([as_flags(FAST), os.environ.get("XLA_FLAGS", "")])
+
+
+def as_flags(options: dict[str, Any]) -> str:
+    """The options as flags for XLA, of which the last of a name counts."""
+    return " ".join(f"--{name}={str(value).lower()}" for name, value in options.items())
 
 
 def keep_programs() -> None:
