@@ -84,9 +84,11 @@ class CCRRConfig(OfflineCostConfig, CRRConfig):
     Source: CRR of Wang et al. (2020), arXiv:2006.15134, with the multiplier of OmniSafe's CCRR.
     Differs from OmniSafe: there values have no bounds, the critic of reward also learns the costs, and
     the critic of cost learns nothing. Its published numbers depend on that (`compat=omnisafe`). With
-    `cost_critic=idle` Q_c is what it is at first, a second step moves Q towards
-    y_c = c + discount (1 - terminated) min_j Q'_j(s', a'), A_c = Q_c(s, a) - mean_i min_j Q_j(s, a_i),
-    and J_c is as above of mean_i min_j Q_j(s, a_i) in place of Q'_c.
+    `cost_critic=idle` Q_c stays what it is at first. A second step moves Q towards y_c. J_c is as
+    above, of V in place of Q'_c:
+
+        y_c = c + discount (1 - terminated) min_j Q'_j(s', a')
+        A_c = Q_c(s, a) - V(s),   V(s) = mean_i min_j Q_j(s, a_i)
     """
 
     CONVENTIONS: ClassVar = (

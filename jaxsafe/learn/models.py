@@ -215,17 +215,13 @@ def init_fitted(key: jax.Array, env: Env, cfg: Any) -> Trainable:
     """An ensemble, `Fitted`, and its optimiser's state."""
     inputs, outputs = env.obs_size + env.action_size, len(cfg.told) + env.obs_size
     ensemble: PyTree = init_ensemble(key, cfg.models, inputs, cfg.model_hidden, outputs)
-    return Trainable(Fitted(ensemble, unscaled(inputs)), optimiser_of(cfg).init(ensemble))
+    opt_state = jax.vmap(optimiser_of(cfg).init)(ensemble)
+    return Trainable(Fitted(ensemble, unscaled(inputs)), opt_state)
 
 
 def optimiser_of(cfg: Any) -> optax.GradientTransformation:
-    """Adam of each model for itself: its state has an axis [M] on every leaf."""
-    adam = optax.adam(cfg.model_lr)
-
-    def update(grads: PyTree, state: PyTree, params: PyTree = None) -> tuple[PyTree, PyTree]:
-        return jax.vmap(adam.update)(grads, state)
-
-    return optax.GradientTransformation(jax.vmap(adam.init), update)  # type: ignore[arg-type]
+    """Of one model. Over the models its functions are mapped, so that each has a count of its own."""
+    return optax.adam(cfg.model_lr)
 
 
 def model_of(nets: Trainable) -> Trainable:
@@ -347,7 +343,7 @@ def fit(
     batch = (cfg.models, cfg.model_batch // device_count(axis_name))
     steps = jnp.maximum(psum(train.count, axis_name) // cfg.model_batch, 1)
     steps = jnp.int32(cfg.epoch_steps) if cfg.epoch_steps else steps
-    optimiser = optimiser_of(cfg)
+    update = jax.vmap(optimiser_of(cfg).update)
 
     def errors(ensemble: Ensemble) -> jax.Array:
         """Of each model on all that is held out: mean squared error, float [M]."""
@@ -372,7 +368,7 @@ def fit(
             )
             x, y = transitions_at(ring, train.flat[drawn], cfg)
             grads = jax.grad(ensemble_loss)(nets.params, scale, x, y, cfg.weight_decay, cfg.fit_dtype)
-            change, state = optimiser.update(pmean(grads, axis_name), nets.opt_state)
+            change, state = update(pmean(grads, axis_name), nets.opt_state)
             return Trainable(optax.apply_updates(nets.params, change), state)
 
         start = Trainable(now.ensemble, now.opt_state)
