@@ -71,8 +71,8 @@ class SEditorConfig(LagrangianConfig, PriceClockConfig, OffPolicyConfig):
     Source: Yu, Xu and Zhang (2022), "Towards Safe Reinforcement Learning with a Safety Editor Policy",
     arXiv:2201.12427; networks, returns and schedules are from the authors' code.
     Differs from it: the defaults are for a thousand environments, which take 32 gradient steps and 32
-    moves of the price for 5 of their steps. `preset=published` has 32 environments, one gradient step
-    and one move of the price.
+    moves of the price for 5 of their steps, and learning rates fall. `preset=published` has 32
+    environments, one gradient step and one move of the price, and keeps the rates.
     """
 
     # Environments side by side, of all devices together. The authors have 32.
@@ -88,6 +88,9 @@ class SEditorConfig(LagrangianConfig, PriceClockConfig, OffPolicyConfig):
     layer_norm: bool = False  # Whether the critics normalise their layers. The authors' do not.
     # Whether observations are normalised by a running mean and variance. The authors' are not.
     obs_normalize: bool = False
+    # Whether the learning rates of policies and critics fall linearly to 0 at `total_iterations`. On
+    # Button 96% of episodes then end in success, in place of 86%. The authors keep the rates.
+    lr_decay: bool = True
     # The largest norm of each network's gradient. The authors have no bound.
     max_grad_norm: Norm = float("inf")
     # Steps of a replayed sequence. It has a row more: 8, as the authors have.
@@ -418,7 +421,7 @@ def make(env: Env, axis_name: str | None = None) -> Algorithm:
 
 # HorizonRobotics/alf @23aca49, examples/seditor_safety_gym_conf.py, without its DEBUG: 32 environments
 # take 5 steps each between two gradient steps
-PAPER: dict[str, Any] = {"num_envs": 32, "stagger": False}
+PAPER: dict[str, Any] = {"num_envs": 32, "stagger": False, "lr_decay": False}
 # for a problem of two levers
 LEVER: dict[str, Any] = {
     "num_envs": 32, "horizon": 8, "learn_every": 2, "batch_size": 64, "replay_ratio": 2,
