@@ -27,6 +27,7 @@ def robots(task: str) -> dict[str, SafetyGym]:
 PRICE = "there the price moves at every gradient step"
 MODEL = "there the last weights of each model stay, not the best"
 LAST = f"{MODEL}; C is of 1000 steps of the planner"
+PERTURBED = "there the next action is perturbed by the present network, not by its target"
 NO_OPTION = {  # what OmniSafe does otherwise, and no option of ours brings back
     **dict.fromkeys(("DDPGLag", "TD3Lag", "SACLag", "DDPGPID", "TD3PID", "SACPID"), PRICE),
     "PETS": MODEL,
@@ -36,6 +37,8 @@ NO_OPTION = {  # what OmniSafe does otherwise, and no option of ours brings back
     "LOOP": f"{MODEL}; a plan's value is that of the action before its end",
     "SafeLOOP": f"{LAST}; a plan's value is that of the action before its end",
     "VAEBC": "there evaluation draws latents",
+    "BCQ": PERTURBED,
+    "BCQLag": f"{PERTURBED}; the price moves by Q_c of the present observation",
     "CRABS": "there it begins with a checkpoint to download, and models have gates",
 }
 

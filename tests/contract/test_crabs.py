@@ -1,6 +1,7 @@
 """CRABS on toys: what it does before its first certificate, and after it."""
 
 import dataclasses
+from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any
 
@@ -8,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import FAST
+from compiling import BUSY, FAST
 from learners import at
 from toys import START, Corridor, Ticker, momentum
 
@@ -18,6 +19,7 @@ from jaxsafe.learn.acting import Player
 from jaxsafe.learn.certificate import interval_barrier
 from jaxsafe.learn.learner import GradientStep
 from jaxsafe.learn.replay import Transitions
+from jaxsafe.types import Shared, State
 
 ROW = ALGOS["crabs"]
 TINY: dict[str, Any] = {
@@ -305,3 +307,57 @@ def test_a_gradient_step_counts_what_the_certificate_allows_and_charges_for_the_
     slope = [(moved(by) - moved(-by)) / 2e-6 for by in 1e-6 * np.eye(4)]
     bias = momentum(after, "actor")["params"]["Dense_0"]["bias"]
     np.testing.assert_allclose(bias, 0.1 * np.array(slope), rtol=1e-4, atol=1e-6)
+
+
+# ---- learning ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Ledge:
+    """The farther to the right, the more it earns. Beyond 1 it falls, which ends the episode.
+
+    Observation [1]: x, 0 at first. Action [1]: a fifth of it is added to x. Standing still earns
+    nothing, and 18 is the most that an episode without a fall earns.
+    """
+
+    obs_size: int = 1
+    action_size: int = 1
+    episode_length: int = 20
+    cost_names: tuple[str, ...] = ("fall",)
+
+    def barrier(self, obs: jax.Array) -> jax.Array:
+        return interval_barrier(obs[..., 0], 1.0)
+
+    def reset(self, key: jax.Array) -> State:
+        return self._state(jnp.zeros(1))
+
+    def step(self, state: State, action: jax.Array) -> State:
+        return self._state(state.physics + 0.2 * jnp.clip(action, -1.0, 1.0))
+
+    def _state(self, x: jax.Array) -> State:
+        fall = jnp.abs(x[0]) > 1
+        cost = fall.astype(jnp.float32)
+        return State(x, x, x[0], cost, cost[None], fall, {})
+
+
+def test_it_falls_until_it_has_a_certificate_and_earns_without_a_fall_after():
+    settings: dict[str, Any] = {
+        "num_envs": 8, "horizon": 20, "batch_size": 64, "replay_ratio": 32, "replay_size": 6400,
+        "learning_starts": 320, "refit_every": 320, "hidden": (16,), "discount": 0.9, "tau": 0.02,
+        "lr": 3e-3, "critic_lr": 3e-3, "models": 2, "model_hidden": (16,), "model_lr": 3e-3,
+        "model_batch": 64, "epoch_steps": 200, "barrier_hidden": (16,), "barrier_lr": 3e-3,
+        "chains": 64, "barrier_steps": 600, "quiet_steps": 20, "check_steps": 60, "candidates": 10,
+    }  # fmt: skip
+    algo, cfg = ROW.make(Ledge()), ROW.config(**settings)
+
+    def train(key):
+        ts = algo.init(key, cfg, START)
+        return jax.lax.scan(lambda ts, i: algo.update(ts, Shared(i)), ts, jnp.arange(30))[1]
+
+    keys = jax.random.split(jax.random.key(0))
+    metrics = jax.tree.map(np.asarray, jax.jit(jax.vmap(train), compiler_options=BUSY)(keys))
+    ret, cost, certified = (metrics[f"train/{k}"] for k in ("return", "cost", "certified"))
+    certified = np.nancumsum(certified, axis=1) > 0
+    assert not certified[:, 0].any() and certified[:, 7].all()
+    assert (cost[:, :7].sum(1) > 0).all() and (cost[:, 8:] == 0).all()
+    assert (ret[:, -10:].mean(1) > 7).all()
