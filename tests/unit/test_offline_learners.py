@@ -577,8 +577,10 @@ def test_bc_safe_draws_from_whole_episodes_within_the_limit_alone():
 # ---- optima -------------------------------------------------------------------------------------
 
 
-def test_coptidice_finds_the_visits_of_the_linear_program():
-    """Two states, two actions: each leads to the state of its number. The data has all four alike."""
+@pytest.mark.parametrize("counts", [(1, 1, 1, 1), (4, 1, 3, 2)])
+def test_coptidice_finds_the_visits_of_the_linear_program(counts):
+    """Two states, two actions: each leads to the state of its number. The data has all four alike, or
+    is mixed of policies that prefer some of them."""
     reward, cost = np.array([0.0, 1.0, 0.6, 0.2]), np.array([0.0, 1.0, 0.2, 0.0])  # of (s, a)
     state, action = np.array([0, 0, 1, 1]), np.array([0, 1, 0, 1])
     discount, limit = 0.9, 0.3  # cost of a step
@@ -590,7 +592,9 @@ def test_coptidice_finds_the_visits_of_the_linear_program():
     assert cost @ free > 1.3 * limit  # the limit binds
     signs = 2.0 * action[:, None] - 1
     no = np.zeros(4, bool)
-    data = data_set(np.eye(2)[state], signs, reward, cost, np.eye(2)[action], no, ~no)
+    rows = np.repeat(np.arange(4), counts)
+    told = (np.eye(2)[state], signs, reward, cost, np.eye(2)[action], no, ~no)
+    data = data_set(*(x[rows] for x in told))
 
     class Small:
         episode_length = 10
@@ -599,11 +603,11 @@ def test_coptidice_finds_the_visits_of_the_linear_program():
     cfg = coptidice.COptiDICEConfig(
         hidden=(), obs_normalize=False, discount=discount, alpha=0.015,
         cost_divergence=0.0, tau_init=1e5, tau_lr=0.0, critic_lr=3e-3,
-        dual_lr=3e-3, cost_limit=10 * limit, batch_size=4,
+        dual_lr=3e-3, cost_limit=10 * limit, batch_size=len(rows),
     )  # fmt: skip
     learner = coptidice.learner(env)
-    batch = batch_at(data, jnp.arange(4), cfg, ())
-    first = jnp.tile(jnp.array([1.0, 0.0]), (4, 1))
+    batch = batch_at(data, jnp.arange(len(rows)), cfg, ())
+    first = jnp.tile(jnp.array([1.0, 0.0]), (len(rows), 1))
 
     def step(now, share):
         nets, dual = now
@@ -620,7 +624,8 @@ def test_coptidice_finds_the_visits_of_the_linear_program():
     nu = linear(double(nets.params["nu"]), np.eye(2))[:, 0]
     e = reward - float(dual.lam) * cost + discount * nu[action] - nu[state]
     w = np.asarray(coptidice.inverse_slope(jnp.array(e / cfg.alpha)))
-    np.testing.assert_allclose(w / 4, best, atol=0.02 * best.max())
+    shares = np.array(counts) / len(rows)
+    np.testing.assert_allclose(shares * w, best, atol=0.02 * best.max())
     np.testing.assert_allclose(metrics["train/cost_estimate"][-1], 10 * limit, rtol=0.02)
     # in each state the policy's mean is the mean action of the program's visits
     visits = best.reshape(2, 2)
