@@ -591,10 +591,10 @@ def test_coptidice_finds_the_visits_of_the_linear_program(counts):
     free = linprog(-reward, A_eq=flow, b_eq=[(1 - discount), 0], bounds=(0, None)).x
     assert cost @ free > 1.3 * limit  # the limit binds
     signs = 2.0 * action[:, None] - 1
-    no = np.zeros(4, bool)
     rows = np.repeat(np.arange(4), counts)
-    told = (np.eye(2)[state], signs, reward, cost, np.eye(2)[action], no, ~no)
-    data = data_set(*(x[rows] for x in told))
+    no = np.zeros(len(rows), bool)
+    now, after = np.eye(2)[state[rows]], np.eye(2)[action[rows]]
+    data = data_set(now, signs[rows], reward[rows], cost[rows], after, no, ~no)
 
     class Small:
         episode_length = 10
