@@ -89,7 +89,8 @@ class SEditorConfig(LagrangianConfig, PriceClockConfig, OffPolicyConfig):
     # Whether observations are normalised by a running mean and variance. The authors' are not.
     obs_normalize: bool = False
     # Whether the learning rates of policies and critics fall linearly to 0 at `total_iterations`. On
-    # Button 96% of episodes then end in success, in place of 86%. The authors keep the rates.
+    # Button 96% of episodes then end in success, in place of 86%, of three seeds. The authors keep the
+    # rates.
     lr_decay: bool = True
     # The largest norm of each network's gradient. The authors have no bound.
     max_grad_norm: Norm = float("inf")
