@@ -1,6 +1,7 @@
 """Runs that learn from a data set: trained, evaluated, stopped, resumed, compared, refused."""
 
 import contextlib
+import dataclasses
 import json
 import math
 import shutil
@@ -12,8 +13,9 @@ import pytest
 from shell import TOY, assert_same_run, start, typed, wait_for
 
 import jaxsafe
+from jaxsafe.algos import ALGOS
 from jaxsafe.config import ConfigError, flat
-from jaxsafe.learn.offline import DataSet, data_set
+from jaxsafe.learn.offline import DataSet, OfflineConfig, data_set
 from jaxsafe.report import read
 from jaxsafe.run import checkpoint, dataset, progress, run_folder, session
 from jaxsafe.run.arguments import compose
@@ -52,6 +54,20 @@ def test_a_data_set_comes_back_from_its_file(data):
     for x, y in zip(*map(jax.tree.leaves, (read_dataset(str(data)), make_data())), strict=True):
         assert x.dtype == y.dtype
         np.testing.assert_array_equal(x, y)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name", [name for name, row in ALGOS.items() if issubclass(row.config, OfflineConfig)]
+)
+def test_each_offline_learner_trains_and_is_evaluated(name, data, tmp_path):
+    known = {field.name for field in dataclasses.fields(ALGOS[name].config)}
+    sizes = ["algo.vae_hidden=[8]"] if "vae_hidden" in known else []
+    args = (*BC, f"algo={name}", *sizes, f"dataset={data}", "total_updates=40", "num_seeds=2")
+    assert typed("train", *args, f"run_dir={tmp_path / 'run'}") == 0
+    scores = json.loads((tmp_path / "run/evaluation.json").read_text())
+    assert np.isfinite([scores["return"]["mean"], scores["cost"]["mean"]]).all()
+    assert (tmp_path / "run/curves.png").exists()
 
 
 def test_a_run_counts_gradient_steps_and_needs_no_data_to_be_evaluated(whole, data, capsys):

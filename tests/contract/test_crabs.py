@@ -1,7 +1,6 @@
 """CRABS on toys: what it does before its first certificate, and after it."""
 
 import dataclasses
-from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any
 
@@ -312,7 +311,7 @@ def test_a_gradient_step_counts_what_the_certificate_allows_and_charges_for_the_
 # ---- learning ----------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Ledge:
     """The farther to the right, the more it earns. Beyond 1 it falls, which ends the episode.
 
