@@ -5,7 +5,8 @@ the coordinator's address, where the others meet before `jax.distributed` starts
 with a stack trace where another one is missing. The connections made there stay open, without
 traffic, as lifelines: when a process ends, its connection closes and so all others end too, even
 while they wait for it in a collective. A byte sent before says that it ended by an error which it
-has reported, with this exit status.
+has reported, with this exit status. Process 0 leaves last: the others' `jax.distributed` ends them
+with a stack trace as soon as its service there is gone.
 """
 
 import atexit
@@ -31,9 +32,11 @@ from jaxsafe.types import PyTree
 
 PATIENCE = 120.0  # s for all processes to start
 KEEPALIVE = {"TCP_KEEPIDLE": 10, "TCP_KEEPINTVL": 10, "TCP_KEEPCNT": 5}  # s, s; a lost host: 60 s
+FAREWELL = 5.0  # s that process 0 waits for the others to end before it does
 OPTIONS = ("coordinator", "num_processes", "process_index")
 
 _lifelines: dict[int, socket.socket] = {}  # to process 0 or, there, to all others; empty when alone
+_leaving = threading.RLock()  # held by the thread that ends this process
 
 
 class Position(NamedTuple):
@@ -214,19 +217,33 @@ def watch_lifelines() -> None:
         status = ready.recv(1)
     except OSError:
         status = b""
-    if status == b"\0" or not _lifelines:
-        return
-    if not status:
-        index = next(i for i, line in lines.items() if line is ready)
-        line = f"error: process {index} has ended, and so this one; the last checkpoint stays\n"
-        os.write(sys.stderr.fileno(), line.encode())  # at once: jax.distributed may notice too
-    exit_all(status[0] if status else 1)
+    with _leaving:  # else this thread waits here for the end
+        if status == b"\0" or not _lifelines:
+            return
+        if not status:
+            index = next(i for i, line in lines.items() if line is ready)
+            line = f"error: process {index} has ended, and so this one; the last checkpoint stays\n"
+            os.write(sys.stderr.fileno(), line.encode())  # at once: jax.distributed may notice too
+        exit_all(status[0] if status else 1)
 
 
 def exit_all(status: int) -> NoReturn:
-    """Leave at once and, where several train together, end the others too."""
-    send_status(status)
-    os._exit(status)
+    """End this process and, where several train together, the others too."""
+    with _leaving:
+        send_status(status)
+        if 0 not in _lifelines:
+            wait_for_their_end(FAREWELL)
+        os._exit(status)
+
+
+def wait_for_their_end(seconds: float) -> None:
+    """Wait until every other process has closed its lifeline, for `seconds` at most."""
+    ends = time.monotonic() + seconds
+    for line in _lifelines.values():
+        with contextlib.suppress(OSError):
+            line.settimeout(max(0.01, ends - time.monotonic()))
+            while line.recv(1):
+                pass
 
 
 def exit_all_if_joined(status: int) -> None:

@@ -4,6 +4,7 @@ import shutil
 import signal
 import socket
 import subprocess
+import threading
 import time
 from pathlib import Path
 
@@ -132,6 +133,21 @@ def test_a_run_that_diverges_ends_both_with_one_line(tmp_path):
     assert [status for status, _, _ in found] == [3, 3]
     (line,) = {line for _, _, err in found for line in err.splitlines()}
     assert "diverged at" in line and "the reward of worlds is not finite" in line
+
+
+def test_process_0_tells_the_others_its_status_and_ends_after_them(monkeypatch):
+    here, there = socket.socketpair()
+    left = []
+    monkeypatch.setattr(distributed, "_lifelines", {1: here})
+    monkeypatch.setattr(distributed.os, "_exit", left.append)
+    leader = threading.Thread(target=distributed.exit_all, args=(3,))
+    leader.start()
+    assert there.recv(1) == bytes([3])
+    leader.join(0.2)
+    assert not left
+    there.close()
+    leader.join(10)
+    assert left == [3]
 
 
 @pytest.mark.parametrize(
