@@ -1,4 +1,4 @@
-"""Environments small enough to know the answers of, and updates and gradient steps without a loop."""
+"""Environments small enough to know the answers of, and updates and gradient steps of algorithms."""
 
 import dataclasses
 from collections.abc import Callable
@@ -14,7 +14,7 @@ from jax.flatten_util import ravel_pytree
 from jaxsafe.learn.acting import Player
 from jaxsafe.learn.certificate import interval_barrier
 from jaxsafe.learn.steps import Context, Trainable
-from jaxsafe.types import Algorithm, Env, Policy, PyTree, Shared, State
+from jaxsafe.types import Algorithm, Env, Metrics, Policy, PyTree, Shared, State
 
 START = Shared(np.int32(0))
 
@@ -22,6 +22,16 @@ START = Shared(np.int32(0))
 def updated(algo: Algorithm) -> Callable:
     """ts -> (ts, metrics), for what does not depend on the iteration."""
     return lambda ts: algo.update(ts, START)
+
+
+def training(algo: Algorithm, cfg: Any, updates: int) -> Callable:
+    """key -> (ts, metrics [updates]) of one member from its start."""
+
+    def train(key: jax.Array) -> tuple[PyTree, Metrics]:
+        start = algo.init(key, cfg, START)
+        return jax.lax.scan(lambda ts, i: algo.update(ts, Shared(i)), start, jnp.arange(updates))
+
+    return train
 
 
 def momentum(nets: Trainable, name: str) -> PyTree:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compiling import FAST
-from toys import START, Lever, Ticker, momentum
+from toys import START, Lever, Ticker, momentum, training
 
 from jaxsafe.algos import ALGOS, ddpg, sac, td3
 from jaxsafe.learn.actor_critic import Actor, actor_critic
@@ -22,7 +22,7 @@ from jaxsafe.learn.replay import Transitions
 from jaxsafe.learn.treatments import Multiplier, lagrangian, no_treatment
 from jaxsafe.nn.critics import q_values
 from jaxsafe.run import compat
-from jaxsafe.types import Env, Shared, State
+from jaxsafe.types import Env, State
 
 ACTORS: dict[str, Callable[[int], Actor]] = {
     "sac": sac.soft_actor,
@@ -398,12 +398,8 @@ def test_the_critics_find_the_values_of_a_chain(name, circle, n_step):
     settings |= quiet if name.startswith("sac") else {"policy_delay": 1}
     row = ALGOS[name]
     cfg, algo = row.config(**settings), row.make(env)
-
-    def train(key):
-        ts = algo.init(key, cfg, START)
-        return jax.lax.scan(lambda ts, i: algo.update(ts, Shared(i)), ts, jnp.arange(150))
-
-    ts, metrics = jax.jit(train, compiler_options=FAST)(jax.random.key(0))
+    train = jax.jit(training(algo, cfg, 150), compiler_options=FAST)
+    ts, metrics = train(jax.random.key(0))
     expected = {"critic_r": value(np.array([1.0, 2, 3]), 0.5, circle)}
     if row.holds == "average":
         expected["critic_c"] = value(np.array([3.0, 2, 1]), 0.75, circle)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from compiling import BUSY, FAST
 from learners import at
-from toys import START, Corridor, Ticker, momentum
+from toys import START, Corridor, Ticker, momentum, training
 
 from jaxsafe.algos import ALGOS, crabs
 from jaxsafe.config import ConfigError
@@ -18,7 +18,7 @@ from jaxsafe.learn.acting import Player
 from jaxsafe.learn.certificate import interval_barrier
 from jaxsafe.learn.learner import GradientStep
 from jaxsafe.learn.replay import Transitions
-from jaxsafe.types import Shared, State
+from jaxsafe.types import State
 
 ROW = ALGOS["crabs"]
 TINY: dict[str, Any] = {
@@ -348,13 +348,9 @@ def test_it_falls_until_it_has_a_certificate_and_earns_without_a_fall_after():
         "chains": 64, "barrier_steps": 600, "quiet_steps": 20, "check_steps": 60, "candidates": 10,
     }  # fmt: skip
     algo, cfg = ROW.make(Ledge()), ROW.config(**settings)
-
-    def train(key):
-        ts = algo.init(key, cfg, START)
-        return jax.lax.scan(lambda ts, i: algo.update(ts, Shared(i)), ts, jnp.arange(30))[1]
-
-    keys = jax.random.split(jax.random.key(0))
-    metrics = jax.tree.map(np.asarray, jax.jit(jax.vmap(train), compiler_options=BUSY)(keys))
+    train = jax.jit(jax.vmap(training(algo, cfg, 30)), compiler_options=BUSY)
+    _, metrics = train(jax.random.split(jax.random.key(0)))
+    metrics = jax.tree.map(np.asarray, metrics)
     ret, cost, certified = (metrics[f"train/{k}"] for k in ("return", "cost", "certified"))
     certified = np.nancumsum(certified, axis=1) > 0
     assert not certified[:, 0].any() and certified[:, 7].all()

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from compiling import FAST
 from learners import at, copy, member, two_members
-from toys import START, Corridor, Ledge, Lever
+from toys import START, Corridor, Ledge, Lever, training
 from two_devices import on_two_devices, same_parameters_own_replays
 
 from jaxsafe.algos import ALGOS, ambs
@@ -18,7 +18,7 @@ from jaxsafe.config import ConfigError
 from jaxsafe.learn.acting import Player
 from jaxsafe.learn.world_model import WorldModelConfig
 from jaxsafe.nn.rssm import SIZES
-from jaxsafe.types import Env, Shared
+from jaxsafe.types import Env
 
 NAMES = [name for name, row in ALGOS.items() if issubclass(row.config, WorldModelConfig)]
 TINY: dict[str, Any] = {
@@ -205,13 +205,8 @@ LIMIT, BEST = 2.5, 14.375  # cost of an episode of Lever, and the best return wi
 def trained(name: str, updates: int, env: Env, **settings: Any) -> tuple[np.ndarray, np.ndarray]:
     """Return and cost of an episode, of two seeds, over the last quarter of the updates."""
     algo, cfg = ALGOS[name].make(env), ALGOS[name].config(**{**ALGOS[name].lever, **settings})
-
-    def train(key):
-        ts = algo.init(key, cfg, START)
-        return jax.lax.scan(lambda ts, i: algo.update(ts, Shared(i)), ts, jnp.arange(updates))[1]
-
-    keys = jax.random.split(jax.random.key(0), 2)
-    metrics = jax.jit(jax.vmap(train), compiler_options=FAST)(keys)
+    train = jax.jit(jax.vmap(training(algo, cfg, updates)), compiler_options=FAST)
+    _, metrics = train(jax.random.split(jax.random.key(0), 2))
     late = -(updates // 4)
     ret, cost = (np.asarray(metrics[f"train/{k}"])[:, late:].mean(1) for k in ("return", "cost"))
     return ret, cost

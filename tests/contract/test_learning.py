@@ -13,11 +13,10 @@ import numpy as np
 import pytest
 from compiling import BUSY
 from learners import on_policy_names, options_of
-from toys import START, Lever
+from toys import Lever, training
 
 from jaxsafe.algos import ALGOS
 from jaxsafe.run import evaluate
-from jaxsafe.types import Shared
 
 QUICK = ("cpo", "p3o", "trpo_saute")
 LIMIT, BEST = 2.5, 14.375  # cost of an episode, and the best return within it
@@ -35,8 +34,7 @@ def train(name, iterations=100, options=None, **swept):
     cfg = ALGOS[name].config(**settings)
 
     def run(key, swept):
-        ts = algo.init(key, dataclasses.replace(cfg, **swept), START)
-        return jax.lax.scan(lambda ts, i: algo.update(ts, Shared(i)), ts, jnp.arange(iterations))
+        return training(algo, dataclasses.replace(cfg, **swept), iterations)(key)
 
     keys = jax.random.split(jax.random.key(0), max(map(len, swept.values()), default=2))
     return algo, *jax.jit(jax.vmap(run), compiler_options=BUSY)(keys, swept)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from compiling import BUSY, FAST
 from learners import at, copy, member, two_members
-from toys import START, Corridor, Lever
+from toys import START, Corridor, Lever, training
 from two_devices import on_two_devices, same_parameters_own_replays
 
 from jaxsafe.algos import ALGOS
@@ -18,7 +18,6 @@ from jaxsafe.config import ConfigError
 from jaxsafe.learn.acting import Player
 from jaxsafe.learn.model_based import ModelBasedConfig
 from jaxsafe.learn.off_policy import OffPolicyConfig
-from jaxsafe.types import Shared
 
 NAMES = [name for name, row in ALGOS.items() if issubclass(row.config, ModelBasedConfig)]
 
@@ -216,13 +215,8 @@ def trained(name: str) -> tuple[np.ndarray, np.ndarray]:
     """Return and cost of an episode of Lever, of two seeds, over the last updates."""
     algo, row, updates = ALGOS[name].make(Lever()), ALGOS[name], 14 if name == "cce_pets" else 30
     cfg = row.config(**row.lever, cost_limit=LIMIT)
-
-    def train(key):
-        ts = algo.init(key, cfg, START)
-        return jax.lax.scan(lambda ts, i: algo.update(ts, Shared(i)), ts, jnp.arange(updates))[1]
-
-    keys = jax.random.split(jax.random.key(0), 2)
-    metrics = jax.jit(jax.vmap(train), compiler_options=BUSY)(keys)
+    train = jax.jit(jax.vmap(training(algo, cfg, updates)), compiler_options=BUSY)
+    _, metrics = train(jax.random.split(jax.random.key(0), 2))
     ret, cost = (np.asarray(metrics[f"train/{k}"])[:, -6:].mean(1) for k in ("return", "cost"))
     return ret, cost
 

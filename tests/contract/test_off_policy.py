@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from compiling import BUSY, FAST
 from learners import at, copy, member
-from toys import START, Arriving, Corridor, Lever, Ticker
+from toys import START, Arriving, Corridor, Lever, Ticker, training
 from two_devices import agree, on_two_devices, split
 
 from jaxsafe.algos import ALGOS
@@ -21,7 +21,7 @@ from jaxsafe.learn.models import EnsembleConfig
 from jaxsafe.learn.next_step_rollout import collect_records
 from jaxsafe.learn.off_policy import OffPolicyConfig
 from jaxsafe.learn.timetable import ReplayConfig, timetable_of
-from jaxsafe.types import Env, Shared, State
+from jaxsafe.types import Env, State
 
 NAMES = [
     name
@@ -389,12 +389,8 @@ def test_without_a_constraint_all_the_reward_is_taken_and_the_cost_paid(name):
 def trained(name: str, updates: int, **settings: Any) -> dict[str, jax.Array]:
     """The metrics of two seeds on Lever."""
     algo, cfg = ALGOS[name].make(Lever()), ALGOS[name].config(**{**ALGOS[name].lever, **settings})
-
-    def train(key):
-        ts = algo.init(key, cfg, START)
-        return jax.lax.scan(lambda ts, i: algo.update(ts, Shared(i)), ts, jnp.arange(updates))[1]
-
-    return jax.jit(jax.vmap(train), compiler_options=BUSY)(jax.random.split(jax.random.key(0), 2))
+    train = jax.jit(jax.vmap(training(algo, cfg, updates)), compiler_options=BUSY)
+    return train(jax.random.split(jax.random.key(0), 2))[1]
 
 
 @pytest.mark.slow
@@ -458,12 +454,7 @@ def on_levers(name, axis_name, num_envs):
     if name != "sac":
         sizes |= {"cost_limit": 1e3, "lam_init": 0.0}  # the price stays 0
     cfg = ALGOS[name].config(**{**ALGOS[name].lever, **sizes})
-
-    def train(key):
-        ts = algo.init(key, cfg, START)
-        return jax.lax.scan(lambda ts, i: algo.update(ts, Shared(i)), ts, jnp.arange(40))
-
-    return train
+    return training(algo, cfg, 40)
 
 
 def seeds_and_devices(name):

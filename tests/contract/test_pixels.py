@@ -11,7 +11,7 @@ import optax
 import pytest
 from compiling import BUSY, FAST
 from learners import TINY
-from toys import START, Corridor, Patch
+from toys import START, Corridor, Patch, training
 
 from jaxsafe.algos import ALGOS, dreamer
 from jaxsafe.config import ConfigError
@@ -204,11 +204,6 @@ def test_a_model_learns_to_paint_what_it_sees():
 def test_dreamer_learns_where_the_patch_is(name):
     """5 at best, and 2 without eyes."""
     algo, cfg = ALGOS[name].make(Patch()), ALGOS[name].config(**ALGOS[name].lever, encoder="cnn")
-
-    def train(key):
-        ts = algo.init(key, cfg, START)
-        return jax.lax.scan(lambda ts, i: algo.update(ts, Shared(i)), ts, jnp.arange(100))[1]
-
-    metrics = jax.jit(train)(jax.random.key(0))
+    _, metrics = jax.jit(training(algo, cfg, 100))(jax.random.key(0))
     assert metrics["train/return"][-20:].mean() > 4
     assert (metrics["train/nonfinite"] == 0).all()

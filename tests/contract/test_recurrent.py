@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compiling import FAST
-from toys import START, Recall, Ticker, updated
+from toys import START, Recall, Ticker, training, updated
 
 from jaxsafe.algos import ALGOS
 from jaxsafe.config import ConfigError
@@ -15,7 +15,6 @@ from jaxsafe.learn.acting import Player, reset_carry
 from jaxsafe.nn.networks import apply_to_rollout, net_of, recurrent_step
 from jaxsafe.nn.recurrent import Sequences, unroll
 from jaxsafe.run import evaluate
-from jaxsafe.types import Shared
 
 SIZES: dict[str, Any] = {"num_envs": 64, "horizon": 12, "minibatches": 2, "hidden": (8, 16)}
 FIRST_ORDER: dict[str, Any] = {"lr": 3e-3, "target_kl": 0.1, "epochs": 5, "discount": 0.9}
@@ -30,13 +29,8 @@ def learner(name="ppo", env: Any = Recall(), **settings):  # noqa: B008
 def trained():
     """PPO and its train states of 2 seeds on Recall, after 60 updates."""
     algo, cfg = learner(**FIRST_ORDER)
-
-    def train(key):
-        ts = algo.init(key, cfg, START)
-        return jax.lax.scan(lambda ts, i: algo.update(ts, Shared(i)), ts, jnp.arange(60))[0]
-
-    keys = jax.random.split(jax.random.key(0), 2)
-    return algo, jax.jit(jax.vmap(train), compiler_options=FAST)(keys)
+    train = jax.jit(jax.vmap(training(algo, cfg, 60)), compiler_options=FAST)
+    return algo, train(jax.random.split(jax.random.key(0), 2))[0]
 
 
 def test_what_was_shown_at_the_first_step_is_remembered_to_the_last(trained):

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from compiling import FAST
-from toys import START, Lever, Ticker
+from toys import Lever, Ticker, training
 
 from jaxsafe.algos import ALGOS
 from jaxsafe.learn.estimates import Batch
@@ -17,7 +17,6 @@ from jaxsafe.learn.steps import with_values
 from jaxsafe.learn.surrogates import clipped
 from jaxsafe.nn.gaussian import log_prob, sample
 from jaxsafe.nn.networks import action_dist, init_params, share_trunk, value, values
-from jaxsafe.types import Shared
 
 CFG = ALGOS["ppo_lag"].config(hidden=(4,), trunk="shared", value_coef=0.3)
 
@@ -112,13 +111,8 @@ def test_each_value_on_a_shared_trunk_learns_its_own_cost():
         num_envs=8, horizon=25, minibatches=2, hidden=(8,), trunk="shared", lr=1e-2, target_kl=1.0,
         cost_limits={"b": 1.0, "a": 20.0}, discount=0.0, cost_discount=0.0,
     )  # fmt: skip
-
-    def train(key):
-        ts = algo.init(key, cfg, START)
-        return jax.lax.scan(lambda ts, i: algo.update(ts, Shared(i)), ts, jnp.arange(20))
-
-    seeds = jax.random.split(jax.random.key(0), 2)
-    ts, metrics = jax.jit(jax.vmap(train), compiler_options=FAST)(seeds)
+    train = jax.jit(jax.vmap(training(algo, cfg, 20)), compiler_options=FAST)
+    ts, metrics = train(jax.random.split(jax.random.key(0), 2))
 
     def learned(ts):
         return values(ts.params, normalise(ts.normaliser, ts.rollout.state.obs), cfg).mean(0)
@@ -135,12 +129,8 @@ def test_a_policy_on_a_shared_trunk_learns_what_the_limit_allows():
         lr=3e-3, target_kl=0.1, epochs=8, barrier=0.1, price_max=4.0,
         reward_normalize=True, cost_normalize=True,
     )  # fmt: skip
-
-    def train(key):
-        ts = algo.init(key, cfg, START)
-        return jax.lax.scan(lambda ts, i: algo.update(ts, Shared(i)), ts, jnp.arange(100))[1]
-
-    metrics = jax.jit(jax.vmap(train), compiler_options=FAST)(jax.random.split(jax.random.key(0), 2))
+    train = jax.jit(jax.vmap(training(algo, cfg, 100)), compiler_options=FAST)
+    _, metrics = train(jax.random.split(jax.random.key(0), 2))
     ret, cost = (np.asarray(metrics[f"train/{k}"])[:, -30:].mean(1) for k in ("return", "cost"))
     assert (cost < 2.5).all()
     assert (ret > 0.9 * 14.375).all()  # the best within the limit

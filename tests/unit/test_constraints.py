@@ -12,7 +12,7 @@ import pytest
 from compiling import BUSY, FAST
 from learners import on_policy_names, options_of
 from scipy.optimize import linprog, minimize
-from toys import START, Corridor, Ticker, updated
+from toys import START, Corridor, Ticker, training, updated
 
 from jaxsafe.algos import ALGOS, cpo, pcpo
 from jaxsafe.algos.ppo import CPPOPIDConfig, PPOLagConfig
@@ -293,11 +293,8 @@ def test_the_best_policy_within_both_limits_is_found(name):
     algo = ALGOS[name].make(Levers())
     sizes = {"num_envs": 32, "horizon": 20, "minibatches": 2, "critic_epochs": 4, "hidden": (16,)}
     cfg = ALGOS[name].config(**sizes, cost_limits=LIMITS, **LEARN[name])
-
-    def train(key):
-        return jax.lax.scan(lambda ts, _: algo.update(ts, START), algo.init(key, cfg, START), None, 300)
-
-    _, metrics = jax.jit(jax.vmap(train), compiler_options=BUSY)(jax.random.split(jax.random.key(0), 2))
+    train = jax.jit(jax.vmap(training(algo, cfg, 300)), compiler_options=BUSY)
+    _, metrics = train(jax.random.split(jax.random.key(0), 2))
     late = {k: np.asarray(x)[:, -200:].mean(1) for k, x in metrics.items()}
     for cost, most in LIMITS.items():
         assert (late[f"train/cost_{cost}"] < 1.05 * most).all()
@@ -370,13 +367,7 @@ def test_each_critic_learns_its_own_cost():
     cfg = ALGOS["ppo_lag"].config(
         **TINY, cost_limits={"b": 1.0, "a": 20.0}, cost_discount=0.0, critic_lr=1e-2
     )
-
-    def train(key):
-        return jax.lax.scan(lambda ts, _: algo.update(ts, START), algo.init(key, cfg, START), None, 20)[
-            0
-        ]
-
-    ts = jax.jit(train, compiler_options=FAST)(jax.random.key(0))
+    ts, _ = jax.jit(training(algo, cfg, 20), compiler_options=FAST)(jax.random.key(0))
     obs = normalise(ts.normaliser, ts.rollout.state.obs)
     values = jax.vmap(lambda critic: value(critic, obs, cfg).mean())(ts.params["critic_c"])
     np.testing.assert_allclose(values, [0.5, 1.5], atol=0.1)
@@ -389,8 +380,7 @@ def test_limits_are_leaves_and_train_side_by_side(name):
 
     def one(paint):
         limits = {"paint": paint, "noise": 4.0}
-        ts = algo.init(jax.random.key(0), dataclasses.replace(cfg, cost_limits=limits), START)
-        return jax.lax.scan(lambda ts, _: algo.update(ts, START), ts, None, 2)
+        return training(algo, dataclasses.replace(cfg, cost_limits=limits), 2)(jax.random.key(0))
 
     values = jnp.array([8.0, 1.0])
     together = jax.jit(jax.vmap(one), compiler_options=FAST)(values)
