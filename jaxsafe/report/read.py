@@ -221,7 +221,8 @@ def measured(
         table: the columns.
         limits: by the name of a cost; '' is the name of `cost`.
 
-    Return and cost are the learner's estimates where no episode has ended.
+    Return and cost are the learner's estimates where no episode has ended. What sampled actions make in
+    the end is known of a run with `eval_every`.
     """
     columns = dict(table)
     if not_ended(table):
@@ -245,6 +246,10 @@ def measured(
         values[cost_title(name)] = late(f"train/cost_{name}")
     if "train/goal_met" in table:
         values["goals"] = late("train/goal_met")
+    for what in ("return", "cost"):
+        column = table.get(f"eval/{what}_sampled", unknown)
+        if np.isfinite(last := column[table["iteration"] == table["iteration"].max()]).all():
+            values[f"final sampled {what}"] = last
     return values | normalised(env, values, limits)
 
 

@@ -454,11 +454,18 @@ def run_table(
 
 
 def final_policy(run: SettingRun, otherwise: str) -> str:
-    """What the mean action made in fresh episodes, mean over seeds and its interval."""
+    """What the mean action made in fresh episodes, and where it is known the sampled one: means over
+    seeds and their intervals."""
+
+    def made(by: str) -> str:
+        ret, cost = (stats.of_measure(k, run.values[f"final {by}{k}"]) for k in ("return", "cost"))
+        return "{:.2f} [{:.2f}, {:.2f}], cost {:.2f} [{:.2f}, {:.2f}]".format(*ret, *cost)
+
     if not {"final return", "final cost"} <= run.values.keys():
         return otherwise
-    ret, cost = (stats.of_measure(k, run.values[f"final {k}"]) for k in ("return", "cost"))
-    return "{:.2f} [{:.2f}, {:.2f}], cost {:.2f} [{:.2f}, {:.2f}]".format(*ret, *cost)
+    if "final sampled return" not in run.values:
+        return made("")
+    return f"{made('')}; sampled: {made('sampled ')}"
 
 
 def published_cell(config: Mapping[str, Any], known: Mapping[tuple[str, str], Published]) -> str:

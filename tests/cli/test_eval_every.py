@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from shell import SMALL, STEPS, call, typed
 
-from jaxsafe.report import plots
+from jaxsafe.report import plots, read, studies
 from jaxsafe.run import checkpoint, run_folder
 from jaxsafe.run.evaluate import COLUMNS, run_episodes
 from jaxsafe.run.policies import open_run
@@ -50,6 +50,22 @@ def test_the_last_row_is_what_fresh_episodes_of_the_policies_make(watched):
         np.testing.assert_allclose(table[f"eval/return{end}"][-2:], found.ret.mean(1), rtol=1e-5)
         np.testing.assert_allclose(table[f"eval/cost{end}"][-2:], found.cost.mean(1), rtol=1e-5)
     assert (table["eval/return"][-2:] != table["eval/return_sampled"][-2:]).all()
+
+
+def test_a_study_shows_what_sampled_actions_make_in_the_end(watched):
+    table, limits = run_folder.read_metrics(watched), {"": 25.0}
+    values = read.measured("", table, limits)
+    for what in ("return", "cost"):
+        np.testing.assert_array_equal(
+            values[f"final sampled {what}"], table[f"eval/{what}_sampled"][-2:]
+        )
+    values |= {"final return": np.array([1.0, 3.0]), "final cost": np.array([5.0, 5.0])}
+    run = read.SettingRun(watched, "", {}, limits, table, np.arange(2.0), values)
+    mean, _, drawn = studies.final_policy(run, "-").partition("; sampled: ")
+    assert mean.startswith("2.00 [") and "cost 5.00" in mean
+    assert drawn.startswith(f"{values['final sampled return'].mean():.2f} [")
+    cut = {name: x[:-4] for name, x in table.items()}  # ends in an iteration without evaluation
+    assert "final sampled return" not in read.measured("", cut, limits)
 
 
 def test_training_is_the_same_without_evaluation_which_may_change_on_resumption(watched, tmp_path):
