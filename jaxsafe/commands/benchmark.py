@@ -3,10 +3,11 @@
 Each row is one program. Compiling is timed apart. The rate is the median of --repeats runs, after
 --warmup steps of each environment: fresh layouts, where nothing touches yet, are faster. With --algo a
 run is an update of the algorithm, else steps with random actions, resets included. An algorithm with a
-replay is measured once it learns. Its settings are options of train, as in
-`--algo sac_lag preset=parallel algo.hidden_dtype=bfloat16`. A physics step is one substep. The forward
-pass at the end of a step is not counted. A task of your own is 'module:name', as in train. Only Safety
-Gym's and the velocity tasks tell their physics steps. A --peer has the sizes of --num-envs and --algo.
+replay is measured once it learns. Settings are options of train, those of the tasks and, with --algo,
+its own, as in `env.wrap.action_repeat=2 --algo sac_lag preset=parallel algo.hidden_dtype=bfloat16`. A
+physics step is one substep. The forward pass at the end of a step is not counted. A task of your own is
+'module:name', as in train. Only Safety Gym's and the velocity tasks tell their physics steps. A --peer
+has the sizes of --num-envs and --algo.
 """
 
 import argparse
@@ -28,10 +29,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsafe import algos, envs
+from jaxsafe import algos
 from jaxsafe.commands.guard import guarded
 from jaxsafe.config import Amount, ConfigError, Devices, Iterations, Period
 from jaxsafe.envs import SafetyGym, Velocity
+from jaxsafe.envs.wrap import innermost, raw_steps
 from jaxsafe.learn.observations import EncoderConfig
 from jaxsafe.learn.offline import OfflineConfig
 from jaxsafe.learn.rollout import collect, init_rollout, memoryless
@@ -42,7 +44,7 @@ from jaxsafe.run.devices import check_devices, device_name, use_compilation_cach
 from jaxsafe.run.flags import fail, number
 from jaxsafe.run.programs import build
 from jaxsafe.run.session import engine_of
-from jaxsafe.run.settings import TrainConfig, find_algo, load
+from jaxsafe.run.settings import Settings, TrainConfig, find_algo, make_env
 from jaxsafe.types import Shared
 
 
@@ -119,12 +121,17 @@ def memory() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
-def options_of(args: argparse.Namespace) -> dict[str, Any]:
-    """What environments are made with."""
-    awake = {} if args.awake is None else {"awake": args.awake}
-    vision = {"observe_vision": True, "vision_size": args.vision} if args.vision else {}
-    engine = {} if args.engine == "auto" else {"engine": args.engine}  # others have no such option
-    return {**engine, **awake, **vision}
+def task_settings(name: str, args: argparse.Namespace) -> Settings:
+    """The settings of a task, as `make_env` takes them.
+
+    Raises:
+        ConfigError: no such task, or an option that it does not have.
+    """
+    awake = [] if args.awake is None else [f"env.awake={args.awake}"]
+    size = "[{},{}]".format(*args.vision) if args.vision else ""
+    vision = ["env.observe_vision=true", f"env.vision_size={size}"] if size else []
+    engine = [] if args.engine == "auto" else [f"env.engine={args.engine}"]  # others have none
+    return compose([f"env={name}", *engine, *awake, *vision, *args.env_options])
 
 
 def config_of(algo: str, options: list[str], **sizes: Any) -> Any:
@@ -145,7 +152,7 @@ def config_of(algo: str, options: list[str], **sizes: Any) -> Any:
 
 def measure(name: str, wanted: int | None, args: argparse.Namespace) -> dict:
     """A row, of so many environments as are `wanted`, or as the algorithm has, or 256."""
-    env, warmup = envs.make(name, **options_of(args)), args.warmup
+    env, warmup = make_env(task_settings(name, args)), args.warmup
     if args.algo:
         if issubclass(algos.ALGOS[args.algo].config, OfflineConfig):
             raise ConfigError(
@@ -161,27 +168,29 @@ def measure(name: str, wanted: int | None, args: argparse.Namespace) -> dict:
     else:
         num_envs, horizon = wanted or 256, args.horizon or 100
         state, fn = stepping(env, num_envs, args.seeds, horizon)
+    inner: Any = innermost(env)
     before = max(1, -(-warmup // horizon))
     timing = timed(fn, state, before=before, repeats=args.repeats)
     runs = timing.runs
     seconds = statistics.median(runs)
     rate = num_envs * horizon * args.seeds / seconds
-    physics = isinstance(env, SafetyGym | Velocity)  # others do not tell it
+    raw = rate * raw_steps(env)
+    physics = isinstance(inner, SafetyGym | Velocity)  # others do not tell it
     return {
         "env": name,
         "engine": engine_of(env),
         "awake": args.awake,
         "vision": args.vision,
         "algo": args.algo,
-        "options": " ".join(args.options),
+        "options": " ".join([*args.env_options, *args.options]),
         "num_envs": num_envs,
         "num_seeds": args.seeds,
         "devices": args.devices if args.algo else 1,
         "horizon": horizon,
         "warmup": before * horizon,
         "env_steps_per_s": rate,
-        "physics_steps_per_s": rate * env.substeps if physics else None,
-        "simulated_s_per_s": rate * env.step_seconds if physics else None,
+        "physics_steps_per_s": raw * inner.substeps if physics else None,
+        "simulated_s_per_s": raw * inner.step_seconds if physics else None,
         "fastest": num_envs * horizon * args.seeds / min(runs),
         "slowest": num_envs * horizon * args.seeds / max(runs),
         "compile_s": timing.compile_s,
@@ -266,7 +275,10 @@ def command() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.error = fail  # type: ignore[method-assign]
     parser.add_argument(
-        "envs", nargs="*", metavar="ENV|key=value", help="tasks to measure, and settings of --algo"
+        "envs",
+        nargs="*",
+        metavar="ENV|key=value",
+        help="tasks to measure; settings of them or of --algo",
     )
     parser.add_argument(
         "--num-envs",
@@ -313,18 +325,18 @@ def command() -> int:
     )
     parser.add_argument("--json", type=Path, help="append the rows to this file, a line each")
     args = parser.parse_intermixed_args()
-    args.options = [text for text in args.envs if "=" in text]
+    args.env_options = [text for text in args.envs if text.startswith("env.") and "=" in text]
+    args.options = [text for text in args.envs if "=" in text and text not in args.env_options]
     args.envs = [text for text in args.envs if "=" not in text]
     if args.algo:
         find_algo(args.algo)
         config_of(args.algo, args.options)
     elif args.options:
-        raise ConfigError(f"{args.options[0]}: settings are of an algorithm; give --algo")
+        raise ConfigError(f"{args.options[0]}: expected env.OPTION=; other settings need --algo")
     for num_envs in args.num_envs if args.peer else ():
         peer_sizes(num_envs, args)
     for name in args.envs:
-        load("env", name)
-        envs.check_options(name, **options_of(args))
+        task_settings(name, args)
     use_compilation_cache()
     about = versions()
     print(f"{' '.join(f'{k} {v}' for k, v in about.items())}")

@@ -35,6 +35,20 @@ def test_a_row_tells_what_was_measured(tmp_path, monkeypatch, capsys):
     assert row["slowest"] <= rate <= row["fastest"]
 
 
+def test_a_task_is_measured_with_the_settings_of_train(tmp_path, monkeypatch, capsys):
+    """A step of two raw steps of hopper has 8 physics steps."""
+    rows = tmp_path / "rows.jsonl"
+    words = "hopper_velocity env.wrap.action_repeat=2 --engine c --num-envs 3 --horizon 2 --warmup 2"
+    monkeypatch.setattr(sys, "argv", ["benchmark", *words.split(), "--json", str(rows)])
+    assert benchmark.main() == 0
+    row = json.loads(rows.read_text())
+    assert row["options"] == "env.wrap.action_repeat=2" and row["engine"] == "c"
+    assert row["physics_steps_per_s"] == pytest.approx(8 * row["env_steps_per_s"])
+    monkeypatch.setattr(sys, "argv", ["benchmark", "hopper_velocity", "env.lidar_num_bins=8"])
+    assert benchmark.main() == 2
+    assert "lidar_num_bins" in capsys.readouterr().err
+
+
 def test_updates_are_timed_one_after_another():
     """So that schedules go on, and learners with a replay begin to learn."""
     seen = []
@@ -72,7 +86,7 @@ def test_other_settings_are_refused(option):
 def test_settings_without_an_algorithm_are_refused(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["benchmark", "point_goal1", "algo.tau=0.5"])
     assert benchmark.main() == 2
-    assert "give --algo" in capsys.readouterr().err
+    assert "algo.tau=0.5: expected env.OPTION=; other settings need --algo" in capsys.readouterr().err
 
 
 def test_a_task_of_the_user_s_own_is_measured_without_physics_steps(tmp_path, monkeypatch, capsys):
