@@ -1,6 +1,7 @@
 """Runs and sweeps compared by any field of their configs, in tables and figures.
 
-    jaxsafe plot RUNS... [--by FIELD ...] [--published CSV] [--out DIR]
+    jaxsafe plot RUNS... [env=MODULE:NAME] [algo=MODULE:NAME] [--by FIELD ...] [--published CSV]
+                 [--out DIR]
 
     OUT/results.md, .tex    return and cost, a row a setting, a column a task; what else is known
     OUT/results.csv         every estimate, a row each
@@ -11,11 +12,13 @@
 
 The figures of a seed are those of the last 10 % of its training. Its cost rate is of all its training.
 Where training plays no episodes, as from a data set, they are those of its final evaluation.
+Runs on your own environment or algorithm are read once that is named, as it is imported.
 Tasks stand apart. Only normalised scores, and comparisons within a task, are averaged over tasks.
 """
 
 import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from jaxsafe.commands.guard import guarded
@@ -25,6 +28,7 @@ from jaxsafe.report.group import group, ordered, telling
 from jaxsafe.report.published import read_published
 from jaxsafe.report.read import or_evaluated, read
 from jaxsafe.run.flags import fail
+from jaxsafe.run.settings import DEFAULT, load
 
 
 def main() -> int:
@@ -40,8 +44,10 @@ def command() -> int:
     )
     parser.error = fail  # type: ignore[method-assign]
     parser.add_argument(
-        "runs", nargs="+", type=Path, metavar="RUNS", help="run folders, sweeps, or folders of them"
-    )
+        "runs", nargs="+", metavar="RUNS",
+        help="run folders, sweeps, or folders of them; and env=MODULE:NAME, algo=MODULE:NAME, your own "
+        "code, if the runs have some",
+    )  # fmt: skip
     parser.add_argument(
         "--by", nargs="+", metavar="FIELD", default=[],
         help="fields that tell settings apart, such as algo.cost_limit; runs with the same values are "
@@ -59,7 +65,7 @@ def command() -> int:
     )
     args = parser.parse_args()
     published = read_published(args.published) if args.published else {}
-    runs = [or_evaluated(run) for run in read(args.runs)]
+    runs = [or_evaluated(run) for run in read(folders_among(args.runs))]
     by = [name for name in args.by if name != "env.name"] or telling(runs)
     groups = ordered(group(runs, by))
     try:
@@ -69,3 +75,21 @@ def command() -> int:
     print(f"{len(runs)} run{'s' * (len(runs) > 1)} by {', '.join(by)}", file=sys.stderr)
     print(write(groups, args.out, published) + f"written: {args.out}")
     return 0
+
+
+def folders_among(words: Sequence[str]) -> list[Path]:
+    """The words that are folders. The others name the user's code, which is imported.
+
+    Raises:
+        ConfigError: no word is a folder, or code cannot be imported.
+    """
+    folders = []
+    for word in words:
+        kind, _, name = word.partition("=")
+        if kind in DEFAULT and ":" in name and not Path(word).exists():
+            load(kind, name)
+        else:
+            folders.append(Path(word))
+    if not folders:
+        raise ConfigError(f"{' '.join(words)}: expected run folders beside it")
+    return folders

@@ -215,6 +215,21 @@ def test_a_run_on_ones_own_code_trains_resumes_and_evaluates_once_that_is_named(
     assert status == 0 and "resuming at 128 steps" in out, err
 
 
+def test_runs_on_ones_own_code_are_plotted_once_that_is_named(call, tmp_path):
+    code = ("env=mine:Corridor", "algo=mine:priced")
+    status, _, err = call("train", *code, *SMALL, "total_steps=128", "video=false", "run_dir=run")
+    assert status == 0, err
+    forget()
+    for given, missing in ((), code[0]), (code[:1], code[1]):
+        status, _, err = call("plot", "run", *given)
+        assert status == 2 and f"if you trust it, add {missing}" in err and err.count("\n") == 1
+    status, out, err = call("plot", "run", *code)
+    assert status == 0 and "`mine:priced`" in out, err
+    assert (tmp_path / "comparison" / "trade_off.png").exists()
+    status, _, err = call("plot", *code)
+    assert status == 2 and "expected run folders" in err
+
+
 BAD = {
     "mine:Coridor": "mine has no 'Coridor'; did you mean 'Corridor'?",
     "mime:Corridor": "no module 'mime' in",
