@@ -13,9 +13,10 @@ from typing import NamedTuple
 import matplotlib.pyplot as plt
 import numpy as np
 
-from jaxsafe.report import plots, scores, stats, studies
+from jaxsafe.report import plots, scores, stats, studies, trade_off
 from jaxsafe.report.comparison_tables import SCORES, aggregates
 from jaxsafe.report.group import Group, group, ordered, suite
+from jaxsafe.report.looks import styles
 from jaxsafe.report.published import Published, beside, read_published
 from jaxsafe.report.read import SettingRun, read
 from jaxsafe.report.study_files import holds_study
@@ -347,10 +348,11 @@ def learning(runs: Sequence[SettingRun], path: Path) -> None:
     chosen = [run for run in runs if run.env == "car_goal1" and run.config["algo.name"] in names]
     groups = group(chosen, ["algo.name"])
     edges = np.linspace(0, max(run.steps for run in chosen), 51)
+    looks = styles(groups)
     for g in sorted(groups, key=lambda g: names.index(g.name)):
         for axes, name in zip(panels, ("train/return", "train/cost"), strict=True):
             values = np.concatenate([plots.stretches(run.table, name, edges) for run in g.runs])
-            plots.band(axes, name, edges[1:] / 1e6, values, g.name)
+            plots.band(axes, name, edges[1:] / 1e6, values, g.name, **looks[g.name])
     panels[1].axhline(25, color="0.4", ls="--", lw=1, label="limit")
     for axes, what in zip(panels, ("return", "cost"), strict=True):
         axes.set(xlabel="million environment steps", ylabel=f"{what} of an episode")
@@ -501,7 +503,7 @@ def main() -> None:
     shown = [run for run in studies.evaluated(runs) if run.config["algo.name"] in SHOWN]
     groups = ordered(group(shown, ["algo.name"]))
     published = {(g.env, g.name): beside(g, PUBLISHED) for g in groups}
-    picture = plots.trade_off(groups, "evaluated policies", published)
+    picture = trade_off.draw(groups, "evaluated policies", published)
     studies.save_small(picture, RESULTS / "images" / "trade_off.png")
     scored = suite([g for g in ordered(group(runs, ["algo.name"])) if g.name not in EXTRA])
     picture = plots.normalised(list(scored.groups), SCORES, aggregates(scored))

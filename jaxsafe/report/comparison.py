@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from jaxsafe.report import plots, tables
+from jaxsafe.report import plots, tables, trade_off
 from jaxsafe.report.comparison_tables import (
     SCORES,
     across,
@@ -42,7 +42,7 @@ def write(
     files.write(out / "results.csv", as_csv(groups, both, found, pairs))
     plots.save(plots.learning(groups), out / "curves")
     known = {(g.env, g.name): beside(g, published) for g in groups}
-    plots.save(plots.trade_off(groups, period(groups), known), out / "trade_off")
+    plots.save(trade_off.draw(groups, period(groups), known), out / "trade_off")
     for name in ("scores", "profiles"):
         for suffix in plots.FORMATS:
             (out / f"{name}.{suffix}").unlink(missing_ok=True)

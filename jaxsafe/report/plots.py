@@ -1,4 +1,4 @@
-"""Pictures: the learning curves of a run; the curves, trade-off, scores and profiles of several."""
+"""Pictures: the learning curves of a run; the curves, scores and profiles of several."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -11,18 +11,19 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
-from matplotlib.ticker import EngFormatter
 
-from jaxsafe.learn.constraints import cost_title
 from jaxsafe.report import stats
 from jaxsafe.report.group import Group, Suite
-from jaxsafe.report.published import Published
+from jaxsafe.report.looks import styles
+from jaxsafe.report.published import CurveEnd
 from jaxsafe.report.stats import Estimate
 from jaxsafe.run import files, run_folder
 
 FORMATS = ("png", "svg")
+WIDE = 10.5  # inches of the widest figure, which a page shrinks little
 LONG = 30  # letters of a name in the legend that leave the panels too little room
-MARKERS = {"-": "o", "--": "s", ":": "^", "-.": "v"}  # by the kind of line that goes with it
+LETTER = 0.06  # inches, of the legend
+FEWEST = 3  # seeds whose interval is drawn
 ESTIMATED = "estimate, no episode ended yet"
 RATES = {"train/cost_rate": "cost rate so far", "train/overruled": "override rate of the shield"}
 PANELS = (("train/return", "return of an episode"), ("train/cost", "cost of an episode"))
@@ -50,7 +51,7 @@ def curves(
     cost_limit: float,
     own_limits: Mapping[str, float] = MappingProxyType({}),
 ) -> None:
-    """Write the PNG: a thin line a seed, and for several seeds their mean and 95 % interval.
+    """Write the PNG: a line a seed, and for `FEWEST` seeds or more their mean and 95 % interval.
 
     Evaluations during training are points on dashed lines, each the mean over seeds.
 
@@ -108,7 +109,7 @@ def evaluated(metrics: Mapping[str, np.ndarray], name: str) -> tuple[np.ndarray,
 def axis_of(metrics: Mapping[str, np.ndarray]) -> str:
     """What the axis of training is called."""
     known = metrics and run_folder.step_column(metrics) == "updates"
-    return "gradient steps" if known else "environment steps"
+    return "gradient updates" if known else "environment steps"
 
 
 def draw_setting(
@@ -121,16 +122,16 @@ def draw_setting(
     estimated: bool = False,
 ) -> None:
     """The curves of one setting, `values` [S, T]. Estimates are dashed."""
-    alone, ls = len(values) == 1, "--" if estimated else "-"
-    look = {"lw": 1.2 if alone else 0.6, "alpha": 1 if alone else 0.4, "color": color, "ls": ls}
+    alone, few, ls = len(values) == 1, len(values) < FEWEST, "--" if estimated else "-"
+    look = {"lw": 1.2 if few else 0.6, "alpha": 1 if few else 0.4, "color": color, "ls": ls}
     lines = axes.plot(steps, values.T, **look)
     label = ", ".join(filter(None, [setting, ESTIMATED * estimated]))
-    if not alone:
+    if few:
+        lines[0].set_label(label or ("" if alone else f"{len(values)} seeds"))
+    else:
         label = label or f"mean of {len(values)} seeds"
         band(axes, measure, steps, values, label, color=color, ls=ls)
         axes.collections[-1].set_label(None if setting else "95 % interval")
-    elif label:
-        lines[0].set_label(label)
 
 
 def band(
@@ -142,91 +143,41 @@ def band(
     axes.fill_between(steps, e.low, e.high, color=line.get_color(), alpha=0.2, lw=0)
 
 
-def trade_off(
-    rows: Sequence[Group],
-    title: str,
-    published: Mapping[tuple[str, str], Published | None] = MappingProxyType({}),
+def traces(
+    axes: Axes, measure: str, steps: np.ndarray, values: np.ndarray, label: str, **style: Any
+) -> None:
+    """A `band`; or a thin line a seed where so few have an interval that says little."""
+    if len(values) >= FEWEST:
+        band(axes, measure, steps, values, label, **style)
+        return
+    first, *_ = axes.plot(steps, values.T, lw=0.9, **style)
+    first.set_label(label)
+
+
+def learning(
+    groups: Sequence[Group],
+    looks: Mapping[str, dict[str, Any]] | None = None,
+    ends: Mapping[tuple[str, str], CurveEnd] = MappingProxyType({}),
 ) -> Figure:
-    """Return against cost of each row of a comparison: a panel an environment or, where named costs
-    have limits of their own, each of these.
-
-    A point is the mean over seeds with its 95 % interval, each limit a dashed line: grey, or in the
-    colour of the one setting it belongs to. The grey steps are the Pareto front of the means. A hollow
-    diamond is the mean that was published, by environment and name. The frame holds all
-    seeds, means and limits. Intervals may reach beyond it.
-    """
-    places = sorted({(row.env, name) for row in rows for name in row.limits or [""]})
-    figure, panels = grid(len(places), size=(4.6, 4))
-    looks = styles(rows)
-    for axes, (env, name) in zip(panels, places, strict=True):
-        shown = [row for row in rows if row.env == env]
-        limits = [row.limits.get(name, np.nan) for row in shown]
-        means, costs, returns = [], [], []  # and those of all that the frame holds
-        for i, row in enumerate(shown):
-            color, marker = looks[row.name]["color"], MARKERS[looks[row.name]["ls"]]
-            axes.plot(row.values(cost_title(name)), row.returns, ".", color=color, ms=4, alpha=0.5)
-            ret, cost = row.ret, row.estimate(cost_title(name))
-            costs += [*row.values(cost_title(name)), cost.mean, limits[i]]
-            returns += [*row.returns, ret.mean]
-            means.append((cost.mean, ret.mean))
-            axes.errorbar(
-                cost.mean,
-                ret.mean,
-                xerr=[[cost.mean - cost.low], [cost.high - cost.mean]],
-                yerr=[[ret.mean - ret.low], [ret.high - ret.mean]],
-                fmt=marker,
-                color=color,
-                label=row.name,
-            )
-            if not name and (known := published.get((env, row.name))) is not None:
-                axes.plot(known.cost[0], known.ret[0], "D", mfc="none", ms=7, color=color)
-                costs, returns = [*costs, known.cost[0]], [*returns, known.ret[0]]
-            if (limit := limits[i]) not in limits[:i]:
-                alone = limits.count(limit) == 1 and len({x for x in limits if not np.isnan(x)}) > 1
-                line = color if alone else "0.5"
-                axes.axvline(limit, color=line, ls="--", lw=1)
-        axes.plot(*front(means), color="0.6", lw=1, zorder=0)
-        axes.set(title=env, xlabel=f"{name or 'cost'} of an episode", ylabel=PANELS[0][1])
-        axes.set(xlim=frame(costs), ylim=frame(returns))
-    legend(figure, panels, looks)
-    figure.suptitle(title + ("; hollow: published" if any(published.values()) else ""))
-    return figure
-
-
-def frame(values: Sequence[float]) -> tuple[float, float] | None:
-    """Ends of an axis that holds all finite values; None leaves them as they are."""
-    finite = np.array([x for x in values if np.isfinite(x)])
-    if not len(finite) or np.ptp(finite) == 0:
-        return None
-    margin = 0.06 * np.ptp(finite)
-    return float(finite.min() - margin), float(finite.max() + margin)
-
-
-def front(points: Sequence[tuple[float, float]]) -> tuple[list[float], list[float]]:
-    """The corners of the steps under which no point costs less and returns more."""
-    xs: list[float] = []
-    ys: list[float] = []
-    for cost, ret in sorted(p for p in points if np.isfinite(p).all()):
-        if not ys or ret > ys[-1]:
-            xs += [cost, cost] if ys else [cost]
-            ys += [ys[-1], ret] if ys else [ret]
-    return xs, ys
-
-
-def learning(groups: Sequence[Group]) -> Figure:
     """Return, cost and, where they are known, cost rate so far and override rate over training: a row a
     task, a line a setting.
 
     A point is the mean over one of at most 50 equal stretches of training; the band is the 95 %
-    interval over seeds. A line ends where the first of its seeds does.
+    interval over seeds. Fewer than `FEWEST` seeds are a thin line each. A line ends where the first of
+    its seeds does. The panel holds all means and nearly all seeds. Intervals may reach beyond it.
+
+    Args:
+        groups: what to draw.
+        looks: the `styles` of the settings; those of `groups` if it is left out.
+        ends: where published curves end, by environment and name: a hollow diamond each.
     """
     envs = sorted({g.env for g in groups})
     names = ["train/return", "train/cost"]
     tables = [run.table for g in groups for run in g.runs]
     names += [name for name in RATES if any(name in table for table in tables)]
-    figure = Figure(figsize=(13 + 4 * (len(names) > 3), 3.4 * len(envs)), layout="constrained")
+    figure = Figure(figsize=(3.4 * len(names), 2.5 * len(envs) + 0.3), layout="constrained")
     FigureCanvasAgg(figure)
-    looks = styles(groups)
+    looks = looks or styles(groups)
     rows = figure.subplots(len(envs), len(names), squeeze=False)
     for env, panels in zip(envs, rows, strict=True):
         cost = panels[1]
@@ -234,6 +185,7 @@ def learning(groups: Sequence[Group]) -> Figure:
         runs = [run for g in shown for run in g.runs]
         count = min(50, *(len(np.unique(run.table["iteration"])) for run in runs))
         edges = np.linspace(0, max(run.steps for run in runs), count + 1)
+        held: dict[str, list[float]] = {name: [] for name in names}  # what the panels must hold
         for g in shown:
             for axes, name in zip(panels, names, strict=True):
                 if all(name in run.table for run in g.runs):
@@ -243,23 +195,56 @@ def learning(groups: Sequence[Group]) -> Figure:
                     label = f"{g.name}, {ESTIMATED}" if guess else g.name
                     style = looks[g.name] | ({"ls": "--"} if guess else {})
                     if np.isfinite(values).any():
-                        band(axes, name, edges[1:], values, label, **style)
+                        traces(axes, name, edges[1:], values, label, **style)
+                        held[name] += extent(values)
         limits = [g.cost_limit for g in shown]
         for g in shown:
             alone = limits.count(g.cost_limit) == 1 and len(set(limits)) > 1
             if alone or g is shown[limits.index(g.cost_limit)]:
                 color = looks[g.name]["color"] if alone else "0.4"
                 cost.axhline(g.cost_limit, color=color, ls="--", lw=1)
+                held["train/cost"].append(g.cost_limit)
+        for g in shown:
+            if end := ends.get((env, g.name)):
+                for axes, y in zip(panels, (end.ret, end.cost), strict=False):
+                    color = looks[g.name]["color"]
+                    axes.plot(end.steps, y, "D", mfc="none", ms=6, color=color, clip_on=False, zorder=4)
+                    held[names[[*panels].index(axes)]].append(y)
         for axes, name in zip(panels, names, strict=True):
             axes.set_visible(bool(axes.lines))  # not a rate that no run of this task has
-            label = RATES.get(name) or name.removeprefix("train/")
-            axes.set(title=f"{env}, {label}")
-            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+            what = RATES.get(name) or f"{name.removeprefix('train/')} of an episode"
+            axes.set(title=env, ylabel=what, xlim=(0, edges[-1]), ylim=frame(held[name]))
+            axes.xaxis.set_major_formatter(steps_in_words)
         clocks = dict.fromkeys(axis_of(run.table) for run in runs)
         for axes in panels:
             axes.set_xlabel(" or ".join(clocks))
+    if any((g.env, g.name) in ends for g in groups):
+        rows[0, 0].plot([], [], "D", mfc="none", ms=6, color="0.45", label="end of the published curve")
     legend(figure, rows.ravel(), looks)
     return figure
+
+
+def steps_in_words(x: float, _: int) -> str:
+    """2500000.0 as '2.5M', on an axis."""
+    for unit, letter in ((1e6, "M"), (1e3, "k")):
+        if abs(x) >= unit:
+            return f"{x / unit:.6g}{letter}"
+    return f"{x:.6g}"
+
+
+def extent(values: np.ndarray) -> list[float]:
+    """Ends of what a panel shows of `values` [S, T]: all means, and all but a few points of seeds."""
+    means = values.mean(0)[np.isfinite(values).all(0)]
+    return [*np.nanquantile(values, (0.02, 0.98)), *(f(means) for f in (min, max) if len(means))]
+
+
+def frame(values: Sequence[float]) -> tuple[float, float] | None:
+    """Ends of an axis that holds all finite values; None leaves them as they are."""
+    finite = np.array([x for x in values if np.isfinite(x)])
+    if not len(finite) or np.ptp(finite) == 0:
+        return None
+    margin = 0.06 * np.ptp(finite)
+    return float(finite.min() - margin), float(finite.max() + margin)
 
 
 def stretches(table: Mapping[str, np.ndarray], name: str, edges: np.ndarray) -> np.ndarray:
@@ -298,7 +283,7 @@ def normalised(
     names: Sequence[str], metrics: Sequence[str], found: Mapping[tuple[str, str, str], Estimate]
 ) -> Figure:
     """Mean and IQM of each score with their intervals, a row a setting."""
-    figure = Figure(figsize=(4 * len(metrics) + 1, 1.2 + 0.4 * len(names)), layout="constrained")
+    figure = Figure(figsize=(3 * len(metrics) + 1, 1.2 + 0.3 * len(names)), layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplots(1, len(metrics), sharey=True, squeeze=False)[0]
     for axes, metric in zip(panels, metrics, strict=True):
@@ -316,7 +301,7 @@ def normalised(
 
 def profiles(suite: Suite) -> Figure:
     """The share of seeds above each normalised return, and above each cost in limits."""
-    figure, panels = grid(2, size=(5, 3.8))
+    figure, panels = grid(2, size=(3.2, 3.4))
     looks = styles([gs[0] for gs in suite.groups.values()])
     labels = ("normalised return", "cost / limit")
     for axes, label in zip(panels, labels, strict=True):
@@ -348,20 +333,12 @@ def profiles(suite: Suite) -> Figure:
 # ---- what the figures share ------------------------------------------------------------------
 
 
-def styles(rows: Iterable[Group]) -> dict[str, dict[str, Any]]:
-    """Colour and line of each name: ten colours, then the next kind of line."""
-    names = dict.fromkeys(row.name for row in rows)
-    lines = list(MARKERS)
-    return {
-        name: {"color": f"C{i % 10}", "ls": lines[i // 10 % len(lines)]} for i, name in enumerate(names)
-    }
-
-
 def grid(count: int, size: tuple[float, float]) -> tuple[Figure, list[Axes]]:
-    """A figure of `count` panels, at most four beside each other, with room for a legend."""
-    columns = min(4, max(1, count))
+    """A figure of `count` panels, two beside each other or, of many, three, with room for a legend."""
+    columns = min(2 if count <= 4 else 3, max(1, count))
     rows = -(-max(1, count) // columns)
-    figure = Figure(figsize=(size[0] * columns + 2, size[1] * rows), layout="constrained")
+    stretch = {1: 1.3, 2: 1.5, 3: 1.0}[columns]
+    figure = Figure(figsize=(stretch * size[0] * columns, size[1] * rows), layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     for axes in panels[count:]:
@@ -370,23 +347,28 @@ def grid(count: int, size: tuple[float, float]) -> tuple[Figure, list[Axes]]:
 
 
 def legend(figure: Figure, panels: Iterable[Axes], names: Iterable[str] = ()) -> None:
-    """One legend for all panels, `names` first. It stands on the right. If a name is long it stands
-    below, and the figure grows to hold it."""
+    """One legend for all panels, `names` first. It stands on the right of a figure that has room there.
+    If the figure is wide, a name is long or there are many, it stands below. The figure grows to hold
+    it."""
     entries: dict[str, Any] = dict.fromkeys(names)
     for axes in panels:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             entries[label] = entries.get(label) or handle
     entries = {label: handle for label, handle in entries.items() if handle}
-    if entries:
-        columns = -(-len(entries) // int(4 * figure.get_figheight()))
-        place = {"loc": "outside right upper", "ncols": columns, "frameon": False}
-        if (longest := max(map(len, entries))) > LONG:
-            figure.set_figwidth(max(figure.get_figwidth(), longest / 10))  # ten letters take an inch
-            fitting = max(1, int(figure.get_figwidth() * 10 / longest))
-            rows = -(-len(entries) // fitting)
-            figure.set_figheight(figure.get_figheight() + 0.3 + 0.22 * rows)  # inches: a margin, rows
-            place |= {"loc": "outside lower center", "ncols": fitting}
-        figure.legend(entries.values(), entries.keys(), **place)
+    if not entries:
+        return
+    longest, width = max(map(len, entries)), figure.get_figwidth()
+    look = {"frameon": False, "fontsize": "small"}
+    if longest <= LONG and width <= 0.8 * WIDE and len(entries) <= 4 * figure.get_figheight():
+        figure.set_figwidth(width + 0.6 + LETTER * longest)
+        figure.legend(entries.values(), entries.keys(), loc="outside right upper", **look)
+        return
+    column = 0.7 + LETTER * longest  # inches, with the handle
+    figure.set_figwidth(max(width, column))
+    fitting = max(1, min(len(entries), int(figure.get_figwidth() / column)))
+    rows = -(-len(entries) // fitting)
+    figure.set_figheight(figure.get_figheight() + 0.3 + 0.19 * rows)  # inches: a margin, rows
+    figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=fitting, **look)
 
 
 def write(figure: Figure, path: Path, **how: Any) -> None:

@@ -24,6 +24,14 @@ class Published(NamedTuple):
         return self.rules in ("", rules)
 
 
+class CurveEnd(NamedTuple):
+    """Where a published curve ends; NaN where it cannot be read."""
+
+    steps: float
+    ret: float
+    cost: float
+
+
 def read_published(path: Path) -> dict[tuple[str, str], Published]:
     """Published figures by task and algorithm, from a CSV with the columns of `PUBLISHED`, and `rules`
     where a task has others in `env.rules=safety_gym` and `safety_gymnasium`."""
@@ -45,6 +53,33 @@ def read_published(path: Path) -> dict[tuple[str, str], Published]:
     except (OSError, ValueError, TypeError) as error:
         raise ConfigError(f"{path} cannot be read: {one_line(error)}") from error
     return found
+
+
+def read_ends(path: Path) -> dict[tuple[str, str], CurveEnd]:
+    """Where published curves end, by task and algorithm, from a CSV with the columns env, algo, steps,
+    return and cost."""
+    try:
+        with path.open(newline="") as file:
+            return {
+                (row["env"], row["algo"]): CurveEnd(
+                    *(float(row[name] or "nan") for name in ("steps", "return", "cost"))
+                )
+                for row in csv.DictReader(file)
+            }
+    except (OSError, ValueError, KeyError) as error:
+        raise ConfigError(f"{path} cannot be read: {one_line(error)}") from error
+
+
+def end_beside(
+    g: Group,
+    published: Mapping[tuple[str, str], Published],
+    ends: Mapping[tuple[str, str], CurveEnd],
+) -> CurveEnd | None:
+    """Where the published curve ends of what `beside` finds, if training was as long."""
+    end = ends.get((g.env, g.algo or ""))
+    if end is None or beside(g, published) is None or abs(g.steps / end.steps - 1) > 0.01:
+        return None
+    return end
 
 
 def beside(g: Group, published: Mapping[tuple[str, str], Published]) -> Published | None:

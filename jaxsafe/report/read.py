@@ -196,7 +196,8 @@ def runs_of(folder: Path, study: study_files.Condensed) -> list[SettingRun]:
         figures = [k for k in study.figures() if k in always or any(row[k] for row in of_run)]
         values = {k: np.array([float(row[k] or "nan") for row in of_run]) for k in figures}
         values |= normalised(env, values, limits)
-        table = study_files.table(of_run, [curves[run, row["seed"]] for row in of_run])
+        clock = "updates" if config.get("dataset") else "steps"  # learning from a data set takes none
+        table = study_files.table(of_run, [curves[run, row["seed"]] for row in of_run], clock)
         seeds = np.array([float(row["seed"]) for row in of_run])
         runs.append(SettingRun(folder, env, config, limits, table, seeds, values))
     return runs

@@ -16,6 +16,7 @@ study.yaml has these keys; the first four are needed:
     runs       a list of further options, a run each: 'env=point_goal1 algo=cpo'
     windows    stretches of training, [[begin, end], ...] in steps, over which final.csv has means too
     published  a CSV of published figures to set beside the runs, relative to the study
+    ends       a CSV of where the published curves of those end, relative to the study
     printed    of runs whose evaluation was kept for all seeds together: the text that the run printed
 """
 
@@ -31,9 +32,10 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from jaxsafe.config import ConfigError
-from jaxsafe.report import plots, scores, stats, study_files, tables
+from jaxsafe.report import plots, scores, stats, study_files, tables, trade_off
 from jaxsafe.report.group import Group, group, tasks_of, telling
-from jaxsafe.report.published import Published, beside, read_published
+from jaxsafe.report.looks import styles
+from jaxsafe.report.published import Published, beside, end_beside, read_ends, read_published
 from jaxsafe.report.read import SettingRun, defaults
 from jaxsafe.report.read import read as read_runs
 from jaxsafe.report.study_files import CURVES, POINTS, Origin
@@ -41,6 +43,7 @@ from jaxsafe.run import files, run_folder
 
 SPAN = 20  # iterations over which costs are averaged before their swing is taken
 CHUNK = 8  # settings in one figure of curves
+HIGH = 4  # tasks in one figure of curves
 FEW = 3  # options of a run that are all in its name
 MOST = 24  # settings whose points can be told apart in one figure
 PAGE = """# {title}
@@ -77,6 +80,7 @@ class Study(NamedTuple):
     runs: list[str]  # 'env=point_goal1 algo=cpo', in order of worth
     windows: list[tuple[float, float]]  # in steps
     published: Path | None
+    ends: Path | None
     printed: dict[str, str]  # by run
 
     def command(self, run: str) -> list[str]:
@@ -92,7 +96,7 @@ def read(folder: Path) -> Study:
     """
     path = folder / "study.yaml"
     found = files.read_yaml(path)
-    needed, more = {"title", "about", "options", "runs"}, {"windows", "published", "printed"}
+    needed, more = {"title", "about", "options", "runs"}, {"windows", "published", "ends", "printed"}
     if not isinstance(found, dict) or not needed <= found.keys() <= needed | more:
         raise ConfigError(
             f"{path}: expected {', '.join(sorted(needed))} and perhaps {', '.join(sorted(more))}"
@@ -104,7 +108,7 @@ def read(folder: Path) -> Study:
     for name in names:
         if names.count(name) > 1:
             raise ConfigError(f"{path}: {name} occurs twice")
-    published = found.get("published")
+    published, ends = found.get("published"), found.get("ends")
     return Study(
         folder,
         str(found["title"]),
@@ -113,6 +117,7 @@ def read(folder: Path) -> Study:
         runs,
         [(float(begin), float(end)) for begin, end in found.get("windows") or []],
         folder / published if published else None,
+        folder / ends if ends else None,
         printed,
     )
 
@@ -319,12 +324,28 @@ def in_order(study: Study, runs: Sequence[SettingRun]) -> list[Group]:
     for name in ("compat", "devices"):
         if name not in by and len({run.config[name] for run in runs}) > 1:
             by.append(name)
-    of_folder = {study_files.name_of(run): few_options(run) for run in study.runs}
-    told = {run.config["run_dir"]: of_folder.get(Path(run.config["run_dir"]).name, []) for run in runs}
+    options = {study_files.name_of(run): few_options(run) for run in study.runs}
+    odd = {study_files.name_of(run): names for run, names in once_unusual(study).items()}
+    told = {run.config["run_dir"]: options.get(Path(run.config["run_dir"]).name, []) for run in runs}
     same = {name for name in lengths if len({run.config.get(name) for run in runs}) == 1}
     more = dict.fromkeys(name for names in told.values() for name in names if name not in {*by, *same})
     groups = group(runs, [*by, *(name for name in more if any(name in run.config for run in runs))])
-    return [g._replace(by=said(g, {*by, *told[g.runs[0].config["run_dir"]]})) for g in groups]
+    firsts = [g.runs[0].config["run_dir"] for g in groups]
+    own = [{*by, *told[run]} for run in firsts]
+    usual = [said(g, fields, set()) for g, fields in zip(groups, own, strict=True)]
+    once = [odd.get(Path(run).name, set()) for run in firsts]
+    found = []
+    for g, fields, short in zip(groups, own, usual, strict=True):
+        # runs whose settings are the same today keep one name, whenever they were made
+        alike = [names for names, other in zip(once, usual, strict=True) if other == short]
+        found.append(g._replace(by=said(g, fields, set.intersection(*alike))))
+    return found
+
+
+def once_unusual(study: Study) -> dict[str, set[str]]:
+    """The options of each run that were no defaults when it was made."""
+    rows = study_files.read(study.folder).rows
+    return {row["run"]: {word.partition("=")[0] for word in row["settings"].split()} for row in rows}
 
 
 def few_options(run: str) -> list[str]:
@@ -334,10 +355,11 @@ def few_options(run: str) -> list[str]:
     return [*(own if len(own) <= FEW else ()), *(name for name in names if name.startswith("total_"))]
 
 
-def said(g: Group, told: set[str]) -> dict[str, Any]:
-    """The fields of a group that belong in its name, of those in `told`. A data set goes by its file's
-    name."""
-    named = {"algo.name", "total_steps", "total_updates", "devices", *unusual(g.runs[0].config)}
+def said(g: Group, told: set[str], odd: set[str]) -> dict[str, Any]:
+    """The fields of a group that belong in its name, of those in `told`: what is no default today, or
+    was none when the run was made, as `odd` says. A data set goes by its file's name."""
+    named = {"algo.name", "total_steps", "total_updates", "devices", *odd}
+    named |= {*unusual(g.runs[0].config)}
     found = {name: value for name, value in g.by.items() if name in named & told}
     return found | ({"dataset": Path(g.by["dataset"]).stem} if g.by.get("dataset") else {})
 
@@ -345,33 +367,52 @@ def said(g: Group, told: set[str]) -> dict[str, Any]:
 def pictures_of(
     study: Study, groups: Sequence[Group], known: Mapping[tuple[str, str], Published]
 ) -> list[Picture]:
-    """Return against cost, and curves of at most `CHUNK` settings a figure."""
+    """Return against cost, and curves of at most `HIGH` tasks and `CHUNK` settings a figure."""
     images, name = study.folder.parent / "images", study.folder.name
-    settings = list(dict.fromkeys(g.name for g in groups))
+    looks = styles(groups)
     found = []
-    if 1 < len(settings) <= MOST:
+    if 1 < len(looks) <= MOST:
         theirs = {(g.env, g.name): beside(g, known) for g in groups}
-        draw = functools.partial(plots.trade_off, groups, "last 10 % of training", theirs)
+        draw = functools.partial(trade_off.draw, groups, "last 10 % of training", theirs, looks)
         caption = "Return against cost of last 10% of training, a point a setting"
         if any(theirs.values()):  # these are of evaluated policies, and so are ours then
-            draw = functools.partial(plots.trade_off, final(groups), "evaluated policies", theirs)
+            draw = functools.partial(trade_off.draw, final(groups), "evaluated policies", theirs, looks)
             caption = (
                 "Return against cost of evaluated policies, a point a setting; hollow diamonds are "
                 "published means"
             )
         found.append(Picture(images / f"{name}-trade_off.png", caption, draw))
-    for i, first in enumerate(range(0, len(settings), CHUNK), 1):
-        chunk = settings[first : first + CHUNK]
-        draw = functools.partial(plots.learning, [g for g in groups if g.name in chunk])
-        caption = f"Return, cost and cost rate over training: {', '.join(chunk)}"
+    read = read_ends(study.ends) if study.ends else {}
+    ends = {(g.env, g.name): end for g in groups if (end := end_beside(g, known, read))}
+    parts = chunks(groups)
+    several = len({g.env for g in groups}) > HIGH
+    for i, chunk in enumerate(parts, 1):
+        draw = functools.partial(plots.learning, chunk, looks, ends)
+        where = f" on {', '.join(tasks_of(chunk))}" if several else ""
+        names = dict.fromkeys(g.name for g in chunk)
+        caption = f"Return, cost and cost rate over training{where}: {', '.join(names)}"
         found.append(Picture(images / f"{name}-curves{i}.png", caption, draw))
+    return found
+
+
+def chunks(groups: Sequence[Group]) -> list[list[Group]]:
+    """The groups of each figure of curves: of at most `HIGH` tasks, as even as can be, and of at most
+    `CHUNK` settings."""
+    tasks = tasks_of(groups)
+    count = -(-len(tasks) // HIGH)
+    found = []
+    for part in np.array_split(tasks, count):
+        inside = [g for g in groups if g.env in part]
+        settings = list(dict.fromkeys(g.name for g in inside))
+        for first in range(0, len(settings), CHUNK):
+            found.append([g for g in inside if g.name in settings[first : first + CHUNK]])
     return found
 
 
 def save_small(figure: Figure, path: Path) -> None:
     """Write a PNG of 256 colours, which is a third as large."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=80)
+    figure.savefig(buffer, format="png", dpi=110)
     picture = Image.open(buffer).convert("RGB")
     small = picture.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
     with files.replacing(path) as part:
@@ -395,14 +436,17 @@ def final(groups: Sequence[Group]) -> list[Group]:
 
 
 def matrices(groups: Sequence[Group], known: Mapping[tuple[str, str], Published]) -> str:
-    """What training made of each setting on each task; and what its policies made, beside what is
-    published of evaluated policies."""
-    if not any(beside(g, known) for g in groups):
+    """What training made of each setting on each task; and what its policies made, where they were
+    evaluated, beside what is published of evaluated policies."""
+    played = final(groups)
+    trained = [g for g in groups if g.runs[0].clock == "steps"]  # with a data set, none plays episodes
+    published = "; *in italics* published ones" if any(beside(g, known) for g in groups) else ""
+    words = f"Evaluated policies{published}:"
+    if not played:
         return matrix(groups, {})
-    return (
-        f"The last tenth of training:\n\n{matrix(groups, {})}\n\n"
-        f"Evaluated policies; *in italics* published ones:\n\n{matrix(final(groups), known)}"
-    )
+    if not trained:
+        return f"{words}\n\n{matrix(played, known)}"
+    return f"The last tenth of training:\n\n{matrix(groups, {})}\n\n{words}\n\n{matrix(played, known)}"
 
 
 def matrix(groups: Sequence[Group], known: Mapping[tuple[str, str], Published]) -> str:

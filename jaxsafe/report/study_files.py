@@ -130,14 +130,21 @@ def apart(settings: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     return {"common": common, "runs": rest}
 
 
-def table(rows: Sequence[Mapping[str, str]], curves: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
-    """The curves of one run's seeds as columns of a metrics.csv with a row a point and seed."""
+def table(
+    rows: Sequence[Mapping[str, str]], curves: Sequence[np.ndarray], clock: str = "steps"
+) -> dict[str, np.ndarray]:
+    """The curves of one run's seeds as columns of a metrics.csv with a row a point and seed.
+
+    `clock` is what `steps` of a row counts: 'steps' of the environment, or 'updates' where training
+    takes none.
+    """
     ends = [np.linspace(0, int(row["steps"]), POINTS + 1)[1:] for row in rows]
     seeds = np.repeat([float(row["seed"]) for row in rows], POINTS)
     columns = {
         "iteration": np.tile(np.arange(1.0, POINTS + 1), len(rows)),
-        "steps": np.concatenate(ends),
+        "steps": np.zeros(len(seeds)),
         "seed": seeds,
     }
+    columns |= {clock: np.concatenate(ends)}
     found = {name: np.concatenate([c[i] for c in curves]) for i, name in enumerate(CURVES)}
     return columns | {name: x.astype(float) for name, x in found.items() if np.isfinite(x).any()}

@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 
 from jaxsafe.learn.constraints import cost_title, limits_in_words
-from jaxsafe.report import plots, tables
+from jaxsafe.report import plots, tables, trade_off
 from jaxsafe.report.group import Group, clock, group, period
 from jaxsafe.report.read import or_evaluated, read_one
 from jaxsafe.report.tables import Table
@@ -31,7 +31,7 @@ def summarise(folder: Path, extras: Extras = NO_EXTRAS) -> str:
     files.write(folder / "summary.csv", as_csv(rows))
     title = f"{period(rows)}, mean and 95 % interval"
     title += f"; {plots.ESTIMATED}" * any(row.estimated for row in rows)
-    plots.save(plots.trade_off(rows, title), folder / "summary", ["png"])
+    plots.save(trade_off.draw(rows, title), folder / "summary", ["png"])
     return text
 
 

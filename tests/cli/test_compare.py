@@ -12,9 +12,19 @@ from shell import typed
 
 from jaxsafe import algos, envs
 from jaxsafe.config import ConfigError
-from jaxsafe.report import comparison_tables, group, plots, read, scores, stats, tables
+from jaxsafe.report import (
+    comparison_tables,
+    group,
+    looks,
+    plots,
+    read,
+    scores,
+    stats,
+    tables,
+    trade_off,
+)
 from jaxsafe.report.evaluation import as_json
-from jaxsafe.report.published import beside, read_published
+from jaxsafe.report.published import Published, beside, end_beside, read_ends, read_published
 from jaxsafe.report.stats import Estimate
 from jaxsafe.run import run_folder
 from jaxsafe.run.checkpoint import Progress
@@ -247,13 +257,13 @@ def test_a_table_is_markdown_and_latex():
 
 def test_the_pareto_front_leaves_out_what_costs_more_and_returns_less():
     points = [(3.0, 1.0), (1.0, 2.0), (2.0, 5.0), (4.0, 5.0), (5.0, 6.0), (0.0, np.nan)]
-    assert plots.front(points) == ([1, 2, 2, 5, 5], [2, 2, 5, 5, 6])
+    assert trade_off.front(points) == ([1, 2, 2, 5, 5], [2, 2, 5, 5, 6])
 
 
 def test_the_frame_of_a_trade_off_holds_every_seed_and_cuts_wide_intervals(tmp_path):
     write(tmp_path / "a", "point_goal1", "cpo")
     (group,) = compared(tmp_path / "a")
-    axes = plots.trade_off([group], "").axes[0]
+    axes = trade_off.draw([group], "").axes[0]
     for (low, high), values, wide in (
         (axes.get_xlim(), [*group.costs, group.cost_limit], group.estimate("cost")),
         (axes.get_ylim(), group.returns, group.ret),
@@ -261,6 +271,114 @@ def test_the_frame_of_a_trade_off_holds_every_seed_and_cuts_wide_intervals(tmp_p
         assert low < min(values) <= max(values) < high
         assert high - low < 1.13 * np.ptp(values) < wide.high - wide.low
     assert plots.frame([3.0, np.nan, 3.0]) is None
+
+
+def in_the_legend(figure: Any) -> list[str]:
+    return [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+def points_of(line: Any) -> np.ndarray:
+    return np.array(line.get_xydata())
+
+
+def test_a_sweep_of_limits_is_a_line_an_algorithm_in_the_order_of_the_limits(tmp_path):
+    costs = {10.0: (9.0, 10.0, 12.0), 2.5: (2.0, 3.0, 4.0), 25.0: (20.0, 25.0, 33.0)}
+    for algo in ("cpo", "ppo_lag"):
+        for limit, found in costs.items():
+            returns = tuple(x + (algo == "cpo") for x in found)
+            folder = tmp_path / f"{algo}-{limit:g}"
+            write(folder, algo=algo, returns=returns, costs=found, seeds=(0, 1, 2), cost_limit=limit)
+    figure = trade_off.draw(compared(tmp_path), "")
+    (axes,) = figure.axes
+    assert in_the_legend(figure) == ["cpo", "ppo_lag", "cost limits, the numbers at points"]
+    drawn = [line for line in axes.lines if len(points_of(line)) == 3]
+    lines = [line for line in drawn if line.get_linestyle() == "-"]
+    means = [3, 31 / 3, 26]
+    for line, algo, more in zip(lines, ("cpo", "ppo_lag"), (1, 0), strict=True):
+        assert line.get_color() == looks.color_of(algo)
+        np.testing.assert_allclose(points_of(line), [(mean, mean + more) for mean in means])
+    assert [text.get_text() for text in axes.texts] == 2 * ["2.5", "10", "25"]
+    assert list(axes.get_xticks(minor=True)) == [2.5, 10, 25]
+
+
+def test_a_mean_far_over_the_limit_is_an_arrow_and_not_on_the_front(tmp_path):
+    three: dict[str, Any] = {"seeds": (0, 1, 2)}
+    write(tmp_path / "a", algo="cpo", returns=(1, 2, 3), costs=(18, 20, 22), **three)
+    write(tmp_path / "b", algo="ppo_lag", returns=(4, 5, 6), costs=(28, 30, 32), **three)  # over
+    write(tmp_path / "c", algo="ppo", returns=(9, 9, 9), costs=(10, 10, 10), **three)  # has no limit
+    write(tmp_path / "d", algo="trpo", returns=(40, 40, 40), costs=(900, 900, 900), **three)
+    groups = compared(tmp_path)
+    known = Published((7.0, 1.0), (21.0, 1.0), 25.0, "theirs", "")
+    figure = trade_off.draw(groups, "", {("point_goal1", "cpo"): known})
+    (axes,) = figure.axes
+    assert max(axes.get_xticks()) == 4 * 25 and axes.get_ylim()[1] < 10
+    assert [text.get_text() for text in axes.texts] == ["return", "cost", "40", "900"]
+    (front,) = [line for line in axes.lines if line.get_label() == "front within the limit"]
+    np.testing.assert_allclose(points_of(front), [[20, 2]])
+    assert {"published, same colour", "costs more than the axis shows"} < {*in_the_legend(figure)}
+
+
+def test_most_points_are_never_cut_off(tmp_path):
+    for algo, cost in (("cpo", 300.0), ("ppo_lag", 200.0), ("ppo", 90.0)):
+        write(tmp_path / algo, algo=algo, costs=(cost, cost + 1))
+    (axes,) = trade_off.draw(compared(tmp_path), "").axes
+    assert axes.get_xlim()[1] > 300 and not axes.texts
+
+
+def test_an_algorithm_has_its_colour_in_every_figure_and_a_setting_a_line_and_shade(tmp_path):
+    for algo in ("cpo", "ppo_lag"):
+        for clip in (0.0, 1.0):
+            write(tmp_path / f"{algo}{clip}", algo=algo, entropy_coef=clip)
+    groups = compared(tmp_path)
+    found = looks.styles(groups)
+    assert len({(x["color"], x["ls"]) for x in found.values()}) == 4
+    first, _, third, _ = found.values()
+    assert first["color"] == looks.color_of("cpo")
+    assert third["color"] == looks.color_of("ppo_lag")
+    assert found == looks.styles([*groups, *groups])
+    (axes, *_) = plots.learning(groups[:2], found).axes
+    assert {line.get_color() for line in axes.lines} == {x["color"] for x in [*found.values()][:2]}
+    alone = looks.styles(groups[:2])  # one algorithm's settings have the colours to themselves
+    assert {x["ls"] for x in alone.values()} == {"-"} and len({x["color"] for x in alone.values()}) == 2
+
+
+def test_every_algorithm_has_one_colour():
+    names = [name for names in looks.COLORS.values() for name in names.split()]
+    assert sorted(names) == sorted(algos.ALGOS)
+    assert looks.color_of("mine:priced") in looks.COLORS
+
+
+def test_two_seeds_are_two_lines_and_three_have_a_band(tmp_path):
+    for count in (2, 3):
+        write(
+            tmp_path / str(count), returns=range(count), costs=range(count), seeds=tuple(range(count))
+        )
+        (axes, *_) = plots.learning(compared(tmp_path / str(count))).axes
+        assert len(axes.collections) == (count == 3) and len(axes.lines) == (1 if count == 3 else 2)
+
+
+def test_the_axis_of_training_begins_at_0(tmp_path):
+    write(tmp_path / "a")
+    axes = plots.learning(compared(tmp_path / "a")).axes
+    assert all(x.get_xlim() == (0, 200) for x in axes)
+    words = [plots.steps_in_words(x, 0) for x in (0, 500, 2500, 1.5e6, 1e7)]
+    assert words == ["0", "500", "2.5k", "1.5M", "10M"]
+
+
+def test_the_end_of_a_published_curve_stands_beside_runs_of_its_length(tmp_path):
+    write(tmp_path / "a", algo="cpo")
+    (g,) = compared(tmp_path / "a")
+    (tmp_path / "ends.csv").write_text("env,algo,steps,return,cost\npoint_goal1,cpo,200,3,\n")
+    ends = read_ends(tmp_path / "ends.csv")
+    known = {("point_goal1", "cpo"): Published((9.0, 1.0), (3.0, 1.0), 25.0, "theirs", "")}
+    end = end_beside(g, known, ends)
+    assert end and (end.steps, end.ret) == (200, 3) and np.isnan(end.cost)
+    figure = plots.learning([g], ends={("point_goal1", "cpo"): end})
+    marks = [line for line in figure.axes[0].lines if line.get_marker() == "D"]
+    assert points_of(marks[0]).tolist() == [[200, 3]]
+    assert "end of the published curve" in in_the_legend(figure)
+    longer = {k: x._replace(steps=400.0) for k, x in ends.items()}
+    assert end_beside(g, known, longer) is None and end_beside(g, {}, ends) is None
 
 
 def test_one_command_writes_every_table_and_figure_the_same_each_time(tmp_path, capsys):

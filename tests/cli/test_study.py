@@ -19,7 +19,7 @@ from jaxsafe.config import ConfigError
 from jaxsafe.report import plots, studies, study_files
 from jaxsafe.report.group import Group
 from jaxsafe.report.published import Published
-from jaxsafe.report.read import read, read_one
+from jaxsafe.report.read import defaults, read, read_one
 from jaxsafe.run import files, run_folder
 from jaxsafe.run.arguments import compose
 from jaxsafe.run.checkpoint import Progress
@@ -128,6 +128,21 @@ def test_a_rate_that_no_run_of_a_task_has_is_left_out_of_its_row(toy, tmp_path):
     assert shown == [True, True, True, False, True, True, True, True]
 
 
+def test_learning_from_a_data_set_is_counted_in_gradient_updates(toy, tmp_path):
+    """Also in the files of a study, which has no columns for them."""
+    runs = ["env=point_goal1 algo=bc dataset=data/0.25.hdf5", "env=point_goal1 algo=cpo"]
+    study = toy._replace(runs=runs)
+    for i, run in enumerate(runs):
+        trained(tmp_path / str(i), study.command(run))
+        (found,) = read_one(tmp_path / str(i))
+        studies.add(study, run, found, studies.origin_of(tmp_path / str(i)))
+    offline, online = read([study.folder])
+    assert (offline.clock, online.clock) == ("updates", "steps")
+    assert offline.steps == online.steps == 4000
+    called = [plots.axis_of(run.table) for run in (offline, online)]
+    assert called == ["gradient updates", "environment steps"]
+
+
 def test_a_data_set_is_called_by_its_file(toy, tmp_path):
     runs = [f"env=point_goal1 algo=bc dataset=data/{beta}.hdf5" for beta in ("0.25", "0.75")]
     study = toy._replace(runs=runs)
@@ -156,7 +171,14 @@ def test_evaluated_policies_stand_beside_published_ones_and_training_apart(toy, 
     first, second = studies.matrices(groups, known).split("\n\nEvaluated policies")
     assert studies.matrix(groups, {}) in first and "*" not in first
     assert second.endswith("| `cpo` | 6.0, 1.5<br>*9.0, 3.0* |")
-    assert studies.matrices(groups, {}) == studies.matrix(groups, {})
+    alone = studies.matrices(groups, {})  # nothing is published
+    assert alone.endswith(
+        "Evaluated policies:\n\n| | `point_goal1` |\n|---|---:|\n| `cpo` | 6.0, 1.5 |"
+    )
+    assert studies.matrix(groups, {}) in alone
+    for run in groups[0].runs:
+        run.values.pop("final cost")
+    assert studies.matrices(groups, known) == studies.matrix(groups, {})
 
 
 def test_a_setting_is_called_by_the_few_options_that_its_run_sets(toy, tmp_path):
@@ -173,6 +195,33 @@ def test_a_setting_is_called_by_the_few_options_that_its_run_sets(toy, tmp_path)
     assert names == ["cpo", "ppo_lag, algo.dual_lr=0.2", "cpo"]
     assert studies.few_options("algo=cpo num_envs=8 algo.a=1 algo.b=2 algo.c=3 algo.d=4") == []
     assert studies.few_options("algo.a=1 total_steps=1e6") == ["algo.a", "total_steps"]
+
+
+def test_a_setting_keeps_the_options_that_were_unusual_when_it_was_made(toy, tmp_path):
+    """The default of `dual_lr` may be 0.2 one day. The run is still called by it."""
+    run = toy.runs[1]
+    trained(tmp_path / "run", toy.command(run))
+    (found,) = read_one(tmp_path / "run")
+    studies.add(toy, run, found, studies.origin_of(tmp_path / "run"))
+    (g,) = studies.in_order(toy, read([toy.folder]))
+    assert g.name == "ppo_lag, algo.dual_lr=0.2"
+    usual = dict(g.runs[0].config) | {
+        "algo.dual_lr": defaults("point_goal1", "ppo_lag")["algo.dual_lr"]
+    }
+    today = g._replace(runs=[g.runs[0]._replace(config=usual)])
+    told = {"algo.name", "algo.dual_lr"}
+    assert studies.said(today, told, set()) == {"algo.name": "ppo_lag"}
+    odd = studies.once_unusual(toy)[run]
+    assert studies.said(today, told, odd) == {"algo.name": "ppo_lag", "algo.dual_lr": 0.2}
+
+
+def test_a_figure_of_curves_has_few_tasks_and_settings():
+    tasks = [f"task{i}" for i in range(6)]
+    groups = [Group(env, {"algo.name": f"a{i}"}, []) for i in range(9) for env in tasks]
+    parts = studies.chunks(groups)
+    assert [sorted({g.env for g in part}) for part in parts] == 2 * [tasks[:3]] + 2 * [tasks[3:]]
+    assert [len({g.name for g in part}) for part in parts] == [8, 1, 8, 1]
+    assert sorted(map(str, groups)) == sorted(str(g) for part in parts for g in part)
 
 
 def test_a_window_has_means_and_the_swing_of_the_cost_by_hand(toy, tmp_path):

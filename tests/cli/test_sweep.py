@@ -15,7 +15,7 @@ from toys import START, Corridor
 from jaxsafe import algos
 from jaxsafe.config import ConfigError, float_fields
 from jaxsafe.learn.offline import OfflineConfig, data_set_like
-from jaxsafe.report import plots
+from jaxsafe.report import plots, trade_off
 from jaxsafe.report.evaluation import evaluate
 from jaxsafe.report.finish import finish
 from jaxsafe.report.group import EVALUATED, LATE
@@ -349,7 +349,7 @@ def test_the_summary_is_the_last_tenth_of_training_over_the_seeds_of_each_settin
 
 def test_the_summary_of_learning_from_data_is_of_the_final_evaluation(tmp_path, monkeypatch):
     titles = []
-    monkeypatch.setattr(plots, "trade_off", lambda rows, title: titles.append(title))
+    monkeypatch.setattr(trade_off, "draw", lambda rows, title: titles.append(title))
     monkeypatch.setattr(plots, "save", lambda *_: None)
     write_dataset(tmp_path / "data.npz", data_set_like(Corridor()))
     offline = [
