@@ -414,7 +414,7 @@ def save_small(figure: Figure, path: Path) -> None:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
     picture = Image.open(buffer).convert("RGB")
-    small = picture.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+    small = picture.quantize(256, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
     with files.replacing(path) as part:
         small.save(part, optimize=True)
 

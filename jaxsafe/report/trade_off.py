@@ -112,8 +112,7 @@ def draw_panel(axes: Axes, points: Sequence[Point]) -> None:
         axes.set_xticks(sorted({*swept}), minor=True)
         axes.tick_params("x", which="minor", direction="in", length=8, width=1.5, color=GREY)
         axes.plot([], [], "|", color=GREY, ms=8, mew=1.5, label="cost limits, the numbers at points")
-    else:
-        kept = [(p.cost.mean, p.ret.mean) for p in points if keeps_limit(p)]
+    elif kept := [(p.cost.mean, p.ret.mean) for p in points if keeps_limit(p)]:
         axes.plot(*front(kept), color="0.8", lw=3, zorder=0, label="front within the limit")
     draw_limits(axes, [chain[0] for chain in sweeps if len(chain) == 1])
     for (ret, cost), color in theirs(points).items():
