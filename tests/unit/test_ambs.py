@@ -16,6 +16,7 @@ from toys import START, Corridor, Ledge, Ticker
 
 from jaxsafe.algos import ALGOS, ambs, dreamer
 from jaxsafe.config import ConfigError
+from jaxsafe.learn import dreaming
 from jaxsafe.learn.acting import Learned, Player
 from jaxsafe.learn.dreaming import Judged, Scene, no_range
 from jaxsafe.learn.next_step_rollout import collect_records, started
@@ -592,6 +593,34 @@ def test_in_the_simulator_it_knows_what_comes(monkeypatch):
         known = Learned(of, {}, (), ())
         p = ambs.true_risk(env, known, latent, jnp.array([back]), state, jax.random.key(1))
         assert p == expected
+
+
+@pytest.mark.parametrize("turns_at, p", [(0.2, 0.0), (0.4, 1.0)])
+def test_in_the_simulator_the_policy_knows_what_it_did_and_where_it_got(monkeypatch, turns_at, p):
+    """It goes on as it last went, to the right, and is at 0.3 after a step. Beyond `turns_at` it turns
+    back. If it does not, the next step is a violation."""
+
+    class Glass:
+        """Remembers the action, and sees the place."""
+
+        def apply(self, params, *args, method):
+            return getattr(self, method)(*args)
+
+        def embed(self, obs):
+            return obs
+
+        def observe(self, latent, action, embedded, key):
+            return Latent(action, embedded)
+
+    def goes_on(env, learned, name, latent, key):
+        return jnp.where(latent.stoch < turns_at, latent.deter, -latent.deter)
+
+    monkeypatch.setattr(dreaming, "world_of", lambda *_: Glass())
+    monkeypatch.setattr(ambs, "chosen", goes_on)
+    cfg = dataclasses.replace(CFG, shield_horizon=2, shield_rollouts=2)
+    env, learned = Ledge(), Learned(cfg, {"model": ()}, (), ())
+    here, state = Latent(jnp.ones(1), jnp.zeros(1)), env.reset(jax.random.key(0))
+    assert ambs.true_risk(env, learned, here, jnp.ones(1), state, jax.random.key(1)) == p
 
 
 def test_in_the_simulator_what_comes_after_an_end_is_no_violation(monkeypatch):

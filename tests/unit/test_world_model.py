@@ -10,10 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+import scipy.stats
 from compiling import FAST
 from toys import START, Corridor, Ticker
 
-from jaxsafe.algos import ALGOS, dreamer
+from jaxsafe.algos import ALGOS, ambs, dreamer
 from jaxsafe.learn import dreaming, world_model
 from jaxsafe.learn.acting import Player
 from jaxsafe.learn.dreaming import Behaviour, Outcome, Range, Scene, dreaming_learner, moved
@@ -131,6 +132,65 @@ def test_a_dream_weighs_how_likely_it_still_goes_on():
     np.testing.assert_allclose(dreams.read["cont"], [[1, 0], [0.8, 0.8], [0.25, 0.25]], rtol=1e-5)
 
 
+def test_a_dream_tells_of_each_state_the_action_that_leads_on_from_it():
+    """In a model that adds the actions up, by an actor whose mean and deviation depend on the state."""
+
+    class Adding:
+        def apply(self, params, *args, method):
+            return getattr(self, method)(*args)
+
+        def imagine(self, latent, action, key):
+            return rssm.Latent(latent.deter + action, latent.stoch)
+
+        def read(self, features):
+            return {"cont": jnp.ones((*features.shape[:-1], 1))}
+
+    def actor(params, features):
+        x = features[..., :1]
+        return Gaussian(jnp.sin(x), 0.1 * x)
+
+    world: Any = Adding()
+    start = rssm.Latent(jnp.linspace(-3, 3, 6)[:, None], jnp.zeros((6, 1)))
+    args = start, jnp.ones(6), jax.random.key(0), dreamer.DreamerConfig(imagine_steps=4)
+    dreams = world_model.dream(world, {}, actor, (), *args)
+    x, action = np.asarray(dreams.features[..., 0]), np.asarray(dreams.action[..., 0])
+    np.testing.assert_allclose(x[1:] - x[:-1], action, atol=1e-5)
+    dist = scipy.stats.norm(np.sin(x[:-1]), np.exp(0.1 * x[:-1]))
+    np.testing.assert_allclose(dreams.log_prob, dist.logpdf(action), rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(dreams.entropy, dist.entropy(), rtol=1e-4)
+
+
+def test_a_critic_is_told_of_each_state_the_return_that_follows_it(monkeypatch):
+    """A critic that says the state's first number has nothing to learn, in dreams and of rows, where
+    the returns and rewards are those that make it right. An episode ends in one of the rows."""
+
+    def error(scene, trained, name, features, returns):
+        return (features[..., 0] - returns) ** 2
+
+    monkeypatch.setattr(Scene, "_loss", error)
+    value = jax.random.normal(jax.random.key(0), (4, 2))  # of the rows
+    terminated = jnp.zeros((4, 2), bool).at[2, 0].set(True)
+    discount = 0.5
+    earned = value[:-1] - discount * value[1:] * ~terminated[1:]
+    reward = jnp.concatenate([jnp.full((1, 2), 9.0), earned])
+    zeros, no = jnp.zeros((4, 2, 1)), jnp.zeros((4, 2), bool)
+    rows = Record(zeros, zeros, reward, reward, zeros, no, terminated, no)
+    latents = rssm.Latent(value[..., None], zeros)
+    cfg, unused = dreamer.DreamerConfig(replay_value=1.0), None
+    batch = SequenceBatch(rows, jnp.array([0.75, 0.25]))
+    scene: Any = Scene(Corridor(), unused, {}, batch, latents, (), cfg, None)
+    features = jax.random.normal(jax.random.key(1), (4, 8, 1)).at[0, :, 0].set(value.reshape(-1))
+    dreams = SimpleNamespace(features=features, weight=jnp.ones((4, 8)))
+
+    def losses(returns):
+        found = scene.critic_loss({}, "critic_r", dreams, returns)
+        both = scene.critic_loss_with_rows({}, "critic_r", dreams, returns, reward, discount)
+        return [float(found), float(both)]
+
+    np.testing.assert_allclose(losses(features[:-1, :, 0]), 0, atol=1e-10)
+    assert min(losses(features[1:, :, 0])) > 0.1
+
+
 def test_actors_and_critics_learn_from_a_dream_as_much_as_it_weighs(monkeypatch):
     """And dreams begin at all rows of the batch, with k_0 = 0 where an episode failed, and 1 where it
     ran out of time."""
@@ -201,13 +261,16 @@ def test_steps_rise_to_the_learning_rate_and_forget_the_size_of_gradients():
 
 class Glass:
     """A model one can look through: its latent is the observation, what was observed before, and the
-    action in between. It foretells the clock of `Ticker` from what was observed before, and the reward
-    of `Echo`. It stands for `WorldModel` in the loss, in `filtered` and in the policy."""
+    action in between. It foretells the clock of `Ticker` from what was observed before, and what `Echo`
+    earns and costs. It stands for `WorldModel` in the loss, in `filtered` and in the policy."""
 
     decoder = SimpleNamespace(loss=lambda decoded, obs: ((decoded - obs) ** 2).sum(-1))
 
     def apply(self, params: Any, *args: Any, method: str) -> Any:
         return getattr(self, method)(*args)
+
+    def init(self, key, obs, action, method):
+        return {"nothing": jnp.zeros(1)}
 
     def embed(self, obs):
         return obs
@@ -228,19 +291,25 @@ class Glass:
         return [jax.nn.log_softmax(x[..., None, :]) for x in of_clock]
 
     def read(self, features):
-        return {"reward": echoed(rssm.Latent(features[..., :4], features[..., 4:]))}
+        reward = echoed(rssm.Latent(features[..., :4], features[..., 4:]))
+        _, clock, life = jnp.moveaxis(features[..., 4:], -1, 0)
+        safe = jnp.float32(reward <= DEAR)
+        cost = ambs.AMBSConfig.violation_cost * (1 - safe)
+        return {"reward": reward, "cost": cost, "safe": safe, "cont": jnp.float32(clock < life)}
 
 
 GLASS: Any = Glass()
+DEAR = 20.5
 
 
 @dataclasses.dataclass(frozen=True)
 class Echo(Ticker):
-    """A ticker that earns its name, its clock and the action."""
+    """A ticker that earns its name, its clock and the action. It costs 1 where that is above `DEAR`."""
 
     def step(self, state, action):
         after = super().step(state, action)
-        return dataclasses.replace(after, reward=state.obs[0] + 10 * state.obs[1] + action[0])
+        reward = state.obs[0] + 10 * state.obs[1] + action[0]
+        return dataclasses.replace(after, reward=reward, cost=jnp.float32(reward > DEAR))
 
 
 def echoed(latents: rssm.Latent) -> jax.Array:
@@ -322,6 +391,31 @@ def test_the_model_s_loss_meets_each_row_with_its_own_latent(monkeypatch):
     np.testing.assert_allclose(found["train/model_kl"], expected, rtol=1e-4)
     late = losses(reward=jnp.roll(known.reward, 1, axis=0))
     assert late["train/model_reward_loss"] > 1
+
+
+def test_a_gradient_step_gives_each_head_of_the_model_the_target_of_its_row(monkeypatch):
+    """Through `Glass` nothing is left to learn of `Echo`: of its reward, of the costs that the shield
+    foresees, and of its ends. The latents that the behaviour is given are those of the rows, too."""
+    monkeypatch.setattr(world_model, "head_loss", lambda outputs, target: (outputs - target) ** 2)
+    monkeypatch.setattr(dreaming, "world_of", lambda *_: GLASS)
+    rows: Any = recorded(Echo(episode_length=5, lives=(3, 9)), 24)
+    starts = rows.first.at[0].set(True)  # there nothing is remembered
+    reward, cost = (jnp.where(starts, 0.0, x) for x in (rows.reward, rows.cost))
+    known: Any = rows.replace(reward=reward, cost=cost)
+    assert 0.1 < known.cost.mean() < 0.9 and known.terminated.any()
+
+    def idle(trained, memory, scene, key):
+        worst = jnp.abs(echoed(scene.latents) - scene.batch.rows.reward).max()
+        return Outcome(jnp.zeros(()), memory, {"worst": worst})
+
+    behaviour = ambs.shielded_behaviour._replace(learn=idle, actors=(), critics=())
+    learner, cfg = dreaming_learner(Echo(), behaviour), ambs.AMBSConfig(size="tiny", overshoot=0)
+    nets = learner.init(jax.random.key(0), 3, 1, cfg)
+    batch, at = SequenceBatch(known, jnp.full(3, 1 / 3)), GradientStep(0, 1.0, jax.random.key(1))
+    _, metrics = learner.step(nets, batch, at, cfg, None)
+    heads = [f"train/model_{name}_loss" for name in behaviour.all_heads]
+    found = jnp.stack([metrics[name] for name in ("worst", *heads)])
+    np.testing.assert_allclose(found, 0, atol=1e-6)
 
 
 def test_the_policy_remembers_what_the_model_learns_from():
