@@ -1,6 +1,7 @@
 """The shield by hand: what a dream counts for, what is learned of it, and where it overrules."""
 
 import dataclasses
+import operator
 from functools import cache, partial
 from types import SimpleNamespace
 from typing import Any
@@ -14,6 +15,7 @@ from compiling import FAST
 from jax.flatten_util import ravel_pytree
 from toys import START, Corridor, Ledge, Ticker
 
+from jaxsafe import envs
 from jaxsafe.algos import ALGOS, ambs, dreamer
 from jaxsafe.config import ConfigError
 from jaxsafe.learn import dreaming
@@ -758,6 +760,72 @@ def test_an_evaluation_takes_the_sampled_actions_that_training_takes():
     assert 4 < overruled.sum() < 20
     for x, y in zip(training, evaluation, strict=True):
         np.testing.assert_allclose(x, jnp.swapaxes(y, 0, 1), atol=1e-5)
+
+
+def numbers(state: Any) -> list[np.ndarray]:
+    """Copies of all arrays of a state, and of its random keys."""
+    arrays = jax.tree.leaves(state)
+    keys = [jnp.issubdtype(x.dtype, jax.dtypes.prng_key) for x in arrays]
+    return [np.array(jax.random.key_data(x) if k else x) for x, k in zip(arrays, keys, strict=True)]
+
+
+@pytest.mark.slow
+def test_a_shield_in_the_simulator_of_a_real_task_leaves_the_world_as_it_was():
+    """In point_goal1 with a hazard just ahead, five steps under a shield that never overrules are those
+    without one. p is the share of worlds with a violation, stepped one by one with the same keys."""
+    places: dict[str, Any] = {"robot_locations": ((0.0, 0.0),), "hazards_locations": ((0.21, 0.0),)}
+    near: dict[str, Any] = {"robot_keepout": 0.0, "hazards_keepout": 0.0, "robot_rot": 0.0}
+    env = envs.make("point_goal1", engine="c", **near, **places)
+    behaviour, horizon, rollouts = ambs.shielded_behaviour, 6, 8
+    cfg = ambs.AMBSConfig(
+        size="tiny", shield="true_dynamics", overshoot=0, delta=jnp.inf, verify_action=True,
+        shield_horizon=horizon, shield_rollouts=rollouts,
+    )  # fmt: skip
+    init = dreaming.dreaming_learner(env, behaviour).init
+    params = jax.jit(lambda key: init(key, env.obs_size, env.action_size, cfg).params)(
+        jax.random.key(0)
+    )
+    learned = Learned(cfg, params, (), ())
+    bare = dreaming.dreaming_policy(env, behaviour)
+    begun, keys = jax.jit(env.reset)(jax.random.key(1)), jax.random.split(jax.random.key(2), 5)
+    before = numbers(begun)
+
+    def played(policy, keys):
+        player = Player(policy, learned, env)
+
+        def step(now, key):
+            state, carry = now
+            action, carry, said = player.decide(carry, state, key)
+            after = env.step(state, action)
+            return (after, carry), (after, carry, said)
+
+        return jax.jit(lambda: jax.lax.scan(step, (begun, player.begin()), keys)[1])()
+
+    states, carries, said = played(ambs.shielded(env, bare), keys)
+    act_keys, shield_keys = jnp.moveaxis(jax.vmap(jax.random.split)(keys), 1, 0)
+    plain, _, _ = played(bare, act_keys)
+    for x, y in zip(numbers(states) + numbers(begun), numbers(plain) + before, strict=True):
+        np.testing.assert_array_equal(x, y)
+
+    step_one = jax.jit(env.step)
+    see = jax.jit(lambda memory, obs, key: dreaming.seen(env, behaviour, learned, memory, obs, key))
+    act = jax.jit(lambda latent, key: ambs.chosen(env, learned, "actor", latent, key))
+    for t in range(len(keys)):
+        state = begun if t == 0 else jax.tree.map(operator.itemgetter(t - 1), states)
+        latent, action = jax.tree.map(operator.itemgetter(t), (carries.latent, carries.action))
+        dream_key = jax.random.split(shield_keys[t])[1]
+        unsafe = []
+        for key in jax.random.split(dream_key, rollouts):
+            world, here, doing, hit = state, latent, action, False
+            for h, step_key in enumerate(jax.random.split(key, horizon)):
+                act_key, latent_key = jax.random.split(step_key)
+                doing = doing if h == 0 else act(here, act_key)
+                world = step_one(world, doing)
+                here = see(dreaming.Memory(here, doing), world.obs, latent_key)
+                hit |= bool(world.cost > 0)
+            unsafe.append(hit)
+        assert said["risk"][t] == np.mean(unsafe)
+    assert ((said["risk"] > 0) & (said["risk"] < 1)).any()
 
 
 # ---- evaluation --------------------------------------------------------------------------------
