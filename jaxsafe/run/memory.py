@@ -29,15 +29,18 @@ def check_memory(env: Env, settings: Settings) -> None:
     Lower bounds. Of a trajectory: observations before and after each step, actions and a few scalars.
     """
     limit, what = device_memory()
-    seen = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(observation_like(env)))
+    like = observation_like(env)
+    seen = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(like))
     step = 2 * seen + 4 * (env.action_size + 8 + len(env.cost_names))  # bytes
     steps = settings.row.make(env, None).clocks(settings.algo).steps
     members = len(settings.configs) * settings.train.num_seeds
     need = step * steps * members // settings.train.devices
     if need > limit:
+        pictures = isinstance(like, dict) and "vision_size" in settings.env_options
         raise TooLarge(
             f"{steps:,} environment steps an update x {members} seeds needs at least "
             f"{need / 2**30:,.1f} GiB a device, {what} has {limit / 2**30:,.1f}; use fewer num_envs"
+            + (" or a smaller env.vision_size" if pictures else "")
         )
     if isinstance(settings.algo, ModelBasedConfig):
         check_plans(env, settings, members)

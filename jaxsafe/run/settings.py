@@ -419,15 +419,35 @@ def check_option(name: str, known: dict[str, Any]) -> None:
     options = {**groups[head], **flat(groups[head])}
     whose = options.pop("name")
     named = head == "algo" and option.startswith(f"{COST_LIMITS}.") and option.count(".") == 1
-    if (COST_LIMITS if named else option) in options:
+    asked = COST_LIMITS if named else option
+    if asked in options:
         return
-    takers = [n for n, row in algos.ALGOS.items() if COST_LIMITS in algo_options(row)]
-    if head == "algo" and (named or option == COST_LIMITS) and takers:
-        raise ConfigError(
-            f"{name}: {whose} takes one limit, algo.cost_limit; several are for {', '.join(takers)}"
-        )
-    hint = f"; choose with {head}=" if option == "name" else nearest(option, options)
+    if option == "name":
+        hint = f"; choose with {head}="
+    elif others := having(head, asked):
+        close = difflib.get_close_matches(asked, options, 1, cutoff=0.8)
+        hint = f"; did you mean {close[0]!r}? " if close else "; "
+        hint += f"{some_of(others)} {'has' if len(others) == 1 else 'have'} {asked}"
+    else:
+        hint = nearest(option, options)
     raise ConfigError(f"unknown option {name} of {whose}{hint}")
+
+
+def having(kind: str, option: str) -> list[str]:
+    """The registered environments ('env') or algorithms ('algo') that have this option."""
+    if kind == "env":
+        groups = {name: to_plain(envs.env_defaults(name)) for name in envs.ENVS}
+    else:
+        groups = {name: algo_options(row) for name, row in algos.ALGOS.items()}
+    return [name for name, options in groups.items() if option in {**options, **flat(options)}]
+
+
+def some_of(names: list[str], most: int = 3) -> str:
+    """'a, b, c and 4 more', or all where no more than `most` + 1 are."""
+    if len(names) > most + 1:
+        return f"{', '.join(names[:most])} and {len(names) - most} more"
+    *others, last = names
+    return f"{', '.join(others)} and {last}" if others else last
 
 
 def check_agreement(given: Mapping[str, Any]) -> None:

@@ -57,6 +57,9 @@ BAD = {
     "algo=cop": "did you mean 'cpo'?",
     "algo.cost_limt=3": "did you mean 'cost_limit'?",
     "env.hazard_num=3": "did you mean 'hazards_num'?",
+    "algo.shield=true_dynamics": "unknown option algo.shield of ppo_lag; ambs has shield",
+    "algo.size=12m": "of ppo_lag; ambs, dreamer, dreamer_lag and",
+    "env=ant_velocity env.observe_vision=true": "of ant_velocity; point_goal0, point_goal1,",
     "total_step=5": "did you mean 'total_steps'?",
     "cost_limit=5": "did you mean 'algo.cost_limit'?",
     "total_steps=-1": "expected a whole number between 1 and",
@@ -76,7 +79,8 @@ BAD = {
     "env.engine=quick": "quick",
     "env.hazards_num=many": "hazards_num",
     "env.placements_extents=[1,2]": "placements_extents",
-    "num_envs=1e7": "GiB",
+    "num_envs=1e7": "use fewer num_envs",
+    "num_envs=1e6 env.observe_vision=true algo.encoder=cnn": "num_envs or a smaller env.vision_size",
     "num_envs=1e9": "expected a whole number between 1 and 16777216",
     "devices=512": "devices=512",
     "seed=1,2": "--multirun",
@@ -98,7 +102,7 @@ def test_bad_input_is_one_line_and_status_2(argument, tmp_path, monkeypatch, cap
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     monkeypatch.setattr(loop, "train", lambda *a, **k: pytest.fail("it went on to train"))
-    assert typed("train", argument) == 2
+    assert typed("train", *argument.split()) == 2
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1 and lines[0].startswith("error: ") and BAD[argument] in lines[0]
     assert not list(tmp_path.glob("runs/*"))

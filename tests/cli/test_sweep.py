@@ -424,7 +424,7 @@ BAD = {
     "env=point_goal2 algo.cost_limits.hazard=5,10": "unknown cost 'hazard'; did you mean 'hazards'?",
     "env=point_goal2 algo.cost_limits.hazards=5,-1": "algo.cost_limits.hazards=-1: expected",
     "env=point_goal2 algo.cost_limits.hazards=5,wide": "algo.cost_limits.hazards='wide': expected a",
-    "env=point_goal2 algo=p3o algo.cost_limits.hazards=5,10": "p3o takes one limit, algo.cost_limit;",
+    "env=point_goal2 algo=p3o algo.cost_limits.hazards=5,10": "of p3o; did you mean 'cost_limit'?",
     "algo.cost_limit.hazards=5,10": "did you mean 'cost_limits'?",
     "algo=ppo_lag,cop": "did you mean 'cpo'?",
     "env=point_goal1,car_gaol1": "did you mean 'car_goal1'?",

@@ -407,11 +407,11 @@ BAD = {
     "algo.cost_limits=5": "expected names with a number",
     "env=point_goal2 algo.cost_limits.hazard=5": "unknown cost 'hazard'; did you mean 'hazards'?",
     "algo.cost_limits.hazards=-1": "algo.cost_limits.hazards=-1: expected a number between 0 and",
-    "algo=ppo algo.cost_limits.hazards=5": "ppo takes one limit",
+    "algo=ppo algo.cost_limits.hazards=5": "of ppo; did you mean 'cost_limit'?",
     "algo.clip.hazards=5": "unknown option algo.clip.hazards",
     "algo.cost_limits.hazards.x=5": "unknown option algo.cost_limits.hazards.x",
-    "algo=p3o algo.cost_limits={hazards: 5}": "takes one limit, algo.cost_limit; several are for ",
-    "algo=ppo algo.cost_limits={hazards: 5}": "ppo takes one limit",
+    "algo=p3o algo.cost_limits={hazards: 5}": "more have cost_limits",
+    "algo=ppo algo.cost_limits={hazards: 5}": "of ppo; did you mean 'cost_limit'?",
     "env=point_goal0 algo.cost_limits={hazards: 5}": "the environment has none",
 }
 
