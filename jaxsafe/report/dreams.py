@@ -4,10 +4,11 @@ from typing import Any, NamedTuple
 
 import jax
 
-from jaxsafe.algos import ambs
+from jaxsafe.algos import ALGOS, ambs
+from jaxsafe.config import ConfigError
 from jaxsafe.learn.acting import Player, Playing
 from jaxsafe.learn.observations import vector_of, with_vector
-from jaxsafe.learn.world_model import world_of
+from jaxsafe.learn.world_model import WorldModelConfig, world_of
 from jaxsafe.nn.rssm import Latent
 from jaxsafe.nn.two_hot import symexp
 from jaxsafe.types import PyTree, State
@@ -34,8 +35,9 @@ def play(player: Player, key: jax.Array, steps: int | None = None) -> Episode:
     """An episode of sampled actions, up to its time limit or for so many `steps`.
 
     Raises:
-        AttributeError: the policy has no world model.
+        ConfigError: the policy has no world model.
     """
+    check_model(player, WorldModelConfig, "no world model")
     reset_key, act_key = jax.random.split(key)
 
     def step(now: Playing, key: jax.Array) -> tuple[Playing, Episode]:
@@ -96,12 +98,29 @@ def shield_dreams(player: Player, episode: Episode, step: int, key: jax.Array) -
     With `verify_action` they begin with the action that was taken. Where the shield overruled, that is
     not the one that it looked at. With `shield=true_dynamics` the shield looked ahead in the simulator;
     these are the model's dreams.
+
+    Raises:
+        ConfigError: the policy has no shield.
     """
+    check_model(player, ambs.AMBSConfig, "no shield")
     latent, action = jax.tree.map(lambda x: x[step], (episode.latent, episode.action))
     return jax.jit(lambda: ambs.dreamt(player.task, player.learned, latent, action, key))()
 
 
+def check_model(player: Player, kind: type[Any], lacking: str) -> None:
+    """Raise ConfigError unless the policy learned with a config of this kind, with the algorithms that
+    have one."""
+    config = player.learned.config
+    if isinstance(config, kind):
+        return
+    whose = [name for name, row in ALGOS.items() if row.config is type(config)]
+    valid = [name for name, row in ALGOS.items() if issubclass(row.config, kind)]
+    name = " or ".join(whose) or type(config).__name__
+    raise ConfigError(f"{name} has {lacking} to look into; valid: {', '.join(valid)}")
+
+
 def applied(player: Player, *args: Any, method: str) -> Any:
     """A method of the policy's world model that reads none of its heads."""
+    check_model(player, WorldModelConfig, "no world model")
     world = world_of(player.task, {}, player.learned.config)
     return world.apply(player.learned.params["model"], *args, method=method)

@@ -6,9 +6,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from toys import Corridor
 
-from jaxsafe.learn.acting import Player
+from jaxsafe.algos import ALGOS, dreamer
+from jaxsafe.config import ConfigError
+from jaxsafe.learn.acting import Learned, Player
 from jaxsafe.learn.dreaming import Memory
 from jaxsafe.nn.rssm import Latent
 from jaxsafe.nn.two_hot import symlog
@@ -39,7 +42,7 @@ def test_what_is_lived_seen_and_foreseen_belongs_to_its_step(monkeypatch):
         return action, Memory(Latent(obs, jnp.zeros(1)), action), {"risk": obs[0]}
 
     policy = Policy(lambda learned: Memory(Latent(jnp.zeros(4), jnp.zeros(1)), jnp.zeros(2)), act)
-    learned: Any = SimpleNamespace(config=None, params={"model": None})
+    learned: Any = SimpleNamespace(config=dreamer.DreamerConfig(), params={"model": None})
     player = Player(policy, learned, env)
     monkeypatch.setattr(dreams, "world_of", lambda *_: Adding())
     episode = dreams.play(player, jax.random.key(0), 12)
@@ -52,3 +55,19 @@ def test_what_is_lived_seen_and_foreseen_belongs_to_its_step(monkeypatch):
     found = dreams.foreseen(player, episode, 3, 4, jax.random.key(1))
     told = episode.action[3:7].sum(-1).cumsum()
     np.testing.assert_allclose(found.deter, episode.state.obs[3] + told[:, None], rtol=1e-5)
+
+
+def test_a_policy_without_a_world_model_or_a_shield_is_refused_by_name():
+    unused: Any = None
+    player, key = (
+        Player(unused, Learned(ALGOS["cpo"].config(), {}, (), ()), Corridor()),
+        jax.random.key(0),
+    )
+    of_dreamer = player._replace(learned=Learned(ALGOS["dreamer"].config(), {}, (), ()))
+    no_model = "cpo has no world model to look into; valid: ambs, dreamer, "
+    with pytest.raises(ConfigError, match=no_model):
+        dreams.play(player, key)
+    with pytest.raises(ConfigError, match=no_model):
+        dreams.decoded(player, Latent(jnp.zeros(1), jnp.zeros(1)))
+    with pytest.raises(ConfigError, match=r"dreamer has no shield to look into; valid: ambs$"):
+        dreams.shield_dreams(of_dreamer, unused, 0, key)
