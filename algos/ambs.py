@@ -1,6 +1,7 @@
 """AMBS: Dreamer with a shield. Where its dreams look unsafe, a safe policy acts instead."""
 
 import dataclasses
+import itertools
 import math
 import operator
 from typing import Annotated, Any, Literal, NamedTuple
@@ -34,6 +35,7 @@ from jaxsafe.nn.rssm import Latent
 from jaxsafe.nn.two_hot import BINS
 from jaxsafe.types import Algorithm, Env, Metrics, Policy, PyTree, State
 
+MOST_ROLLOUTS = 2**16  # beyond that 32 bits do not tell the exact bound
 ROUNDING = 1e-5  # a sum of costs that is above a bound by less is at the bound
 
 
@@ -107,7 +109,7 @@ class AMBSConfig(dreamer.ForesightConfig):
     rule: Literal["hoeffding", "binomial"] = "binomial"
     # m, dreams of the shield at each step. The paper has 512. More than 65,536 are beyond what 32 bits
     # tell of the exact bound.
-    shield_rollouts: Annotated[int, Bounds(1, 2**16)] = 64
+    shield_rollouts: Annotated[int, Bounds(1, MOST_ROLLOUTS)] = 64
     shield_horizon: Iterations = 30  # T, steps within which a violation counts, as in the paper.
     # H, steps of the shield's dreams with verdict=summed, as in the paper.
     shield_steps: Iterations = 15
@@ -442,8 +444,28 @@ def check(cfg: Any, env: Env, data: Any = ()) -> None:
     if least > cfg.shield_rollouts:
         raise ConfigError(f"confidence={confidence:g}: expected less, or the shield never acts")
     if least == 0:
-        more = f"eps={float(cfg.eps):g}" if cfg.rule == "hoeffding" else "that, or more shield_rollouts"
-        raise ConfigError(f"delta={delta:g}: expected at least {more}, or the shield always acts")
+        expected = f"eps={float(cfg.eps):g}" if cfg.rule == "hoeffding" else acceptable(cfg)
+        raise ConfigError(f"delta={delta:g}: expected at least {expected}, or the shield always acts")
+
+
+def acceptable(cfg: Any) -> str:
+    """The least delta, of two digits, with which a shield by the exact bound may rest, and the dreams
+    that the present delta takes. Where no dream is unsafe it rests if  (1 - delta)^m <= confidence."""
+    m, delta, confidence = cfg.shield_rollouts, float(cfg.delta), float(cfg.confidence)
+
+    def rests(**settings: Any) -> bool:
+        return overruled_from(dataclasses.replace(cfg, **settings)) > 0
+
+    exact = -math.expm1(math.log(confidence) / m)
+    unit = 10.0 ** (math.floor(math.log10(exact)) - 1)
+    rounded = (float(f"{n * unit:.2g}") for n in itertools.count(math.ceil(exact / unit)))
+    least = next(x for x in rounded if rests(delta=x))
+    found = f"{least:g} with shield_rollouts={m}"
+    few = math.ceil(math.log(confidence) / math.log1p(-delta)) if delta > 0 else MOST_ROLLOUTS + 1
+    for more in range(few, MOST_ROLLOUTS + 1):
+        if rests(shield_rollouts=more):
+            return f"{found}, or shield_rollouts of at least {more}"
+    return found
 
 
 def note(cfg: Any) -> str:

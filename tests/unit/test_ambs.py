@@ -2,6 +2,7 @@
 
 import dataclasses
 import operator
+import re
 from functools import cache, partial
 from types import SimpleNamespace
 from typing import Any
@@ -87,7 +88,9 @@ def test_the_exact_bound_allows_more_than_hoeffdings(rollouts, allowed):
 @pytest.mark.parametrize(
     "options, told",
     [({"delta": 0.05}, "delta=0.05: expected at least eps=0.09"),
-     ({"rule": "binomial", "shield_rollouts": 43}, "expected at least that, or more shield_rollouts"),
+     ({"rule": "binomial", "shield_rollouts": 43},
+      "delta=0.1: expected at least 0.11 with shield_rollouts=43, or shield_rollouts of at least 44,"),
+     ({"rule": "binomial", "delta": 0.0}, "at least 0.009 with shield_rollouts=512, or the shield"),
      ({"rule": "binomial", "confidence": 1.0}, "confidence=1: expected less"),
      ({"discount": 1.0}, "discount=1: expected less")],
 )  # fmt: skip
@@ -95,6 +98,19 @@ def test_a_shield_that_always_or_never_acts_is_refused(options, told):
     ambs.check(CFG, Corridor())
     with pytest.raises(ConfigError, match=told):
         ambs.check(dataclasses.replace(CFG, **options), Corridor())
+
+
+@pytest.mark.parametrize("rollouts, delta", [(1, 0.9), (64, 0.05), (200, 0.003)])
+def test_the_settings_that_a_refusal_names_are_the_first_to_be_accepted(rollouts, delta):
+    cfg = dataclasses.replace(CFG, rule="binomial", shield_rollouts=rollouts, delta=delta)
+    with pytest.raises(ConfigError) as refused:
+        ambs.check(cfg, Corridor())
+    least, more = re.findall(r"least ([\d.]+)", str(refused.value))
+    ambs.check(dataclasses.replace(cfg, delta=float(least)), Corridor())
+    ambs.check(dataclasses.replace(cfg, shield_rollouts=int(more)), Corridor())
+    for fewer in ({"delta": 0.9 * float(least)}, {"shield_rollouts": int(more) - 1}):
+        with pytest.raises(ConfigError, match="or the shield always acts"):
+            ambs.check(dataclasses.replace(cfg, **fewer), Corridor())
 
 
 @pytest.mark.parametrize("hazard, share, summed", [(0.01, 0.26, False), (0.03, 0.6, True)])
