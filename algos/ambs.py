@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import math
 import operator
+from functools import partial
 from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
@@ -554,10 +555,16 @@ def brier_score(found: Course, horizon: int) -> jax.Array:
 
 def examine(algo: Algorithm, learned: PyTree, keys: jax.Array, sampled: bool) -> dict[str, np.ndarray]:
     """What the shield does, and what episodes are without it: float [S, N] by name, of the episodes of
-    `keys` [S, N], by the S policies in `learned`, with mean or with `sampled` actions."""
-    delta, horizon = learned.config.delta, learned.config.shield_horizon
+    `keys` [S, N], by the S policies in `learned`, with mean or with `sampled` actions.
 
-    def of_one(learned: PyTree, keys: jax.Array, delta: jax.Array) -> dict[str, jax.Array]:
+    The Brier score is always of sampled actions without the shield: the shield dreams of those.
+    """
+    horizon = learned.config.shield_horizon
+    delta, never = learned.config.delta, jnp.full_like(learned.config.delta, jnp.inf)
+
+    def of_one(
+        learned: PyTree, keys: jax.Array, delta: jax.Array, sampled: bool
+    ) -> dict[str, jax.Array]:
         learned = dataclasses.replace(learned, config=dataclasses.replace(learned.config, delta=delta))
         player = Player(algo.policy, learned, algo.task(learned))
         found = jax.vmap(lambda key: course(player, key, sampled))(keys)
@@ -569,16 +576,19 @@ def examine(algo: Algorithm, learned: PyTree, keys: jax.Array, sampled: bool) ->
             "Brier score": jax.vmap(lambda x: brier_score(x, horizon))(found),
         }
 
-    play = jax.jit(jax.vmap(of_one))
-    shielded, bare = (
-        jax.tree.map(np.asarray, play(learned, keys, x)) for x in (delta, jnp.full_like(delta, jnp.inf))
-    )
+    def play(delta: jax.Array, sampled: bool) -> dict[str, np.ndarray]:
+        found = programs[sampled](learned, keys, delta)
+        return {name: np.asarray(x) for name, x in found.items()}
+
+    programs = {x: jax.jit(jax.vmap(partial(of_one, sampled=x))) for x in (False, True)}
+    shielded, bare = play(delta, sampled), play(never, sampled)
+    drawn = bare if sampled else play(never, True)
     return {
         "override rate": shielded["override rate"],
         "violations": shielded["violations"],
         "violations, no shield": bare["violations"],
         "return, no shield": bare["return"],
-        "Brier score": bare["Brier score"],
+        "Brier score": drawn["Brier score"],
     }
 
 

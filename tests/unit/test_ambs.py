@@ -30,7 +30,7 @@ from jaxsafe.learn.world_model import Dreams, dream, dream_returns, world_of
 from jaxsafe.nn.gaussian import Gaussian
 from jaxsafe.nn.rssm import Latent
 from jaxsafe.run.evaluate import episode
-from jaxsafe.types import Algorithm
+from jaxsafe.types import Algorithm, Policy
 
 CFG = ambs.AMBSConfig(discount=1 - 1 / 333, rule="hoeffding", shield_rollouts=512, delta=0.1)
 
@@ -862,6 +862,27 @@ def test_the_shield_is_examined_in_the_episodes_of_evaluation(sampled):
     np.testing.assert_allclose(examined.reward.sum(1), evaluated.ret, atol=1e-5)
     np.testing.assert_array_equal(examined.alive.sum(1), evaluated.length)
     assert len({*evaluated.ret.tolist()}) > 1
+
+
+@pytest.mark.parametrize("sampled, violations", [(False, 0), (True, 9)])
+def test_the_risk_is_scored_by_sampled_actions_without_the_shield(sampled, violations):
+    """A sampled action goes beyond the ledge, a mean one stays, and the shield's goes back. The policy
+    says that a violation is certain, which is right for sampled actions alone."""
+
+    def act(learned, carry, obs, key):
+        overruled = learned.config.delta < 1
+        proposed = 0.0 if key is None else 1.0
+        action = jnp.where(overruled, -1.0, proposed)[None]
+        return action, carry, {"risk": jnp.float32(1), "overruled": overruled}
+
+    policy = Policy(lambda learned: (), act)
+    algo: Any = SimpleNamespace(policy=policy, task=lambda learned: Ledge())
+    cfg = jax.tree.map(lambda x: jnp.full(1, x), dataclasses.replace(CFG, shield_horizon=4))
+    keys = jax.random.split(jax.random.key(0), (1, 2))
+    found = ambs.examine(algo, Learned(cfg, {}, (), ()), keys, sampled)
+    assert (found["Brier score"] == 0).all()
+    assert (found["violations, no shield"] == violations).all()
+    assert (found["violations"] == 0).all() and (found["override rate"] == 1).all()
 
 
 def test_the_brier_score_by_hand():
