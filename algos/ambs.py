@@ -70,11 +70,16 @@ class AMBSConfig(dreamer.ForesightConfig):
     With `verdict=drawn` a dream has T steps and no V_i. Each of its states has a violation as likely as
     the model says, and one is enough.
 
-    What the shield guarantees with `verdict=drawn` or in the simulator: where it lets pi act, pi has a
-    violation within T steps with a probability below delta. This is wrong with a probability of
-    `confidence` at most. It needs an exact model and m of at least ln(1 / confidence) / (2 eps^2). But
-    the model is learned, and the bound says nothing of the safe policy. With `verdict=summed` it also
-    needs a V_i that is C or 0 at the end of a dream. V_i is a mean, so nothing is guaranteed there.
+    What the shield guarantees with `verdict=drawn` or in the simulator: where pi has a violation within
+    T steps with a probability of delta or more, the shield lets pi act with a probability of
+    `confidence` at most. With `rule=hoeffding` this takes m of at least ln(1 / confidence) / (2 eps^2).
+    It holds for each decision, and not for an episode of hundreds. It does not say how likely a
+    violation is where the shield has let pi act. It says nothing of the safe policy.
+
+    In dreams the guarantee needs an exact model, too, and the model is learned. All dreams begin in one
+    latent. Its z is one draw, with mean actions the likeliest one. So p is of that latent. Where the
+    observation leaves z open, the guarantee does not cover it. With `verdict=summed` V_i would have to
+    be C or 0 at the end of a dream. V_i is a mean, so nothing is guaranteed there.
 
     Source: Goodall and Belardinelli (2023), "Approximate Model-Based Shielding for Safe Reinforcement
     Learning", arXiv:2308.00707, and (2024), "Leveraging Approximate Model-based Shielding for
@@ -414,14 +419,15 @@ def required_rollouts(
     eps: float, confidence: float, *, one_sided: bool = False, learned: bool = False
 ) -> int:
     """The dreams after which an estimated probability is off by `eps` at most, but for a probability of
-    `confidence`.
+    `confidence`. This is of one decision, and of the latent in which its dreams begin.
 
         m >= ln(2 / confidence) / (2 eps^2)
 
     Args:
         one_sided: only too low an estimate counts: 1 in place of 2.
         learned: half of `eps` is left for the model, whose probabilities of the next state may be off
-            by eps / T in total variation. m is 4 times as large.
+            by eps / T: the sum of their absolute differences, which is twice what many call total
+            variation. m is 4 times as large.
     """
     share = 0.5 if learned else 1.0
     return math.ceil(math.log((1 if one_sided else 2) / confidence) / (2 * (share * eps) ** 2))
