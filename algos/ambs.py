@@ -483,20 +483,20 @@ def note(cfg: Any) -> str:
     half = (least - 1 / 3) / (m + 1 / 3)  # the median of Beta(least, m - least + 1)
     line = f"shield: overrules from {least} of {m} {what} with a violation"
     line += f" within {cfg.shield_horizon} steps, half the time where that has P = {half:.2g}"
-    goal = f"P < {float(cfg.delta):g} with confidence {1 - confidence:g}"
+    allowed = f"the policy act with probability {confidence:g} at most where P >= {float(cfg.delta):g}"
     unknown = ""
     if cfg.shield == "dreams":
         unknown = "; how wrong the learned model is, nobody knows"
         if cfg.verdict == "summed":
             unknown += "; and verdict=summed takes means for violations, for which none of this holds"
     if cfg.rule == "binomial":
-        return f"{line}: {goal}, if the model is exact{unknown}"
+        return f"{line}; lets {allowed}, if the model is exact{unknown}"
     exact = required_rollouts(eps, confidence, one_sided=True)
     off = required_rollouts(eps, confidence, one_sided=True, learned=True)
     enough = "enough" if m >= exact else "too few"
     return (
-        f"{line}. {goal} takes {exact} with an exact model ({m} are {enough}), and {off} with a model "
-        f"that is off by {eps:g} / {cfg.shield_horizon} a step at most{unknown}"
+        f"{line}. To let {allowed} takes {exact} with an exact model ({m} are {enough}), and {off} "
+        f"with a model that is off by {eps:g} / {cfg.shield_horizon} a step at most{unknown}"
     )
 
 
