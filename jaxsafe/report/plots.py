@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
+from matplotlib.ticker import EngFormatter
 
 from jaxsafe.report import stats
 from jaxsafe.report.group import Group, Suite
@@ -214,7 +215,7 @@ def learning(
             axes.set_visible(bool(axes.lines))  # not a rate that no run of this task has
             what = RATES.get(name) or f"{name.removeprefix('train/')} of an episode"
             axes.set(title=env, ylabel=what, xlim=(0, edges[-1]), ylim=frame(held[name]))
-            axes.xaxis.set_major_formatter(steps_in_words)
+            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         clocks = dict.fromkeys(axis_of(run.table) for run in runs)
         for axes in panels:
             axes.set_xlabel(" or ".join(clocks))
@@ -222,14 +223,6 @@ def learning(
         rows[0, 0].plot([], [], "D", mfc="none", ms=6, color="0.45", label="end of the published curve")
     legend(figure, rows.ravel(), looks)
     return figure
-
-
-def steps_in_words(x: float, _: int) -> str:
-    """2500000.0 as '2.5M', on an axis."""
-    for unit, letter in ((1e6, "M"), (1e3, "k")):
-        if abs(x) >= unit:
-            return f"{x / unit:.6g}{letter}"
-    return f"{x:.6g}"
 
 
 def extent(values: np.ndarray) -> list[float]:

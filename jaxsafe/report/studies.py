@@ -389,8 +389,10 @@ def pictures_of(
     for i, chunk in enumerate(parts, 1):
         draw = functools.partial(plots.learning, chunk, looks, ends)
         where = f" on {', '.join(tasks_of(chunk))}" if several else ""
-        names = dict.fromkeys(g.name for g in chunk)
-        caption = f"Return, cost and cost rate over training{where}: {', '.join(names)}"
+        names, algos = (dict.fromkeys(x) for x in ((g.name for g in chunk), (g.algo for g in chunk)))
+        told = ", ".join(map(str, algos))  # the legend has the options
+        told += f", {len(names)} settings" if len(names) > len(algos) else ""
+        caption = f"Return, cost and cost rate over training{where}: {told}"
         found.append(Picture(images / f"{name}-curves{i}.png", caption, draw))
     return found
 
