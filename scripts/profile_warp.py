@@ -1,7 +1,7 @@
 """Time every kernel of engine `warp`: python scripts/profile_warp.py point_goal2 --num-envs 16384
 
 Needs an NVIDIA GPU. The worlds are those of 60 steps of random actions. Prints the constraint rows and
-solver iterations, the slowest kernels of a physics pass, launched one by one, and the speed of ten
+solver iterations, the slowest kernels of a physics step, launched one by one, and the speed of all
 substeps and a forward pass in one CUDA graph, as it is and with less work or less room.
 """
 # MuJoCo's bindings come without types:
@@ -21,8 +21,10 @@ import numpy as np
 
 from jaxsafe import envs
 from jaxsafe.config import ConfigError
+from jaxsafe.envs.engines import Simulation
 from jaxsafe.envs.safety_gym import scene as scenes
 from jaxsafe.envs.safety_gym import sleeping
+from jaxsafe.envs.velocity.task import Velocity
 
 VARIANTS = {  # name -> options of the model, factors on the room for contacts and for rows
     "as it is": ({}, 1.0, 1.0),
@@ -35,12 +37,28 @@ VARIANTS = {  # name -> options of the model, factors on the room for contacts a
 }
 
 
-def states(env: envs.SafetyGym, small: scenes.Scene, worlds: int) -> dict[str, np.ndarray]:
-    """What `small` simulates of `worlds` after 60 random steps, by field of MuJoCo's data."""
+NAMES = ("qpos", "qvel", "qacc_warmstart", "mocap_pos", "mocap_quat")  # of MuJoCo's data
+
+
+def stepped(env: envs.SafetyGym | Velocity, worlds: int):
+    """The states of `worlds` after 60 random steps."""
 
     def step(state, key):
         action = jax.random.uniform(key, (worlds, env.action_size), minval=-1)
         return jax.vmap(env.step)(state, action), None
+
+    begin = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), worlds))
+    keys = jax.random.split(jax.random.key(1), 60)
+    return jax.jit(lambda state: jax.lax.scan(step, state, keys)[0])(begin)
+
+
+def simulated(env: envs.SafetyGym | Velocity, state) -> tuple[Simulation, dict[str, np.ndarray]]:
+    """What engine warp simulates of `env`, and the worlds of `state` in it, by `NAMES`."""
+    if isinstance(env, Velocity):
+        physics = state.physics.physics
+        fields = physics.qpos, physics.qvel, physics.warmstart, physics.mocap_pos, physics.mocap_quat
+        return env.simulation, dict(zip(NAMES, jax.device_get(fields), strict=True))
+    small = scenes.build(sleeping.small_config(env.config, sleeping.awake(env.config, "warp")))
 
     def awake(p):
         chosen = {k: sleeping.awake_objects(p, env.scene, small, k) for k in sleeping.SLEEPERS}
@@ -48,12 +66,8 @@ def states(env: envs.SafetyGym, small: scenes.Scene, worlds: int) -> dict[str, n
         velocity, warmstart = p.qvel[at.qvel], p.warmstart[at.qvel]
         return p.qpos[at.qpos], velocity, warmstart, p.mocap_pos[at.mocap], p.mocap_quat[at.mocap]
 
-    begin = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), worlds))
-    keys = jax.random.split(jax.random.key(1), 60)
-    end = jax.jit(lambda state: jax.lax.scan(step, state, keys)[0])(begin)
-    names = ("qpos", "qvel", "qacc_warmstart", "mocap_pos", "mocap_quat")
-    arrays = jax.device_get(jax.jit(jax.vmap(awake))(end.physics.bodies))
-    return {name: x for name, x in zip(names, arrays, strict=True) if x.size}
+    fields = jax.device_get(jax.jit(jax.vmap(awake))(state.physics.bodies))
+    return small.simulation(env.config), dict(zip(NAMES, fields, strict=True))
 
 
 def main() -> int:
@@ -75,28 +89,28 @@ def main() -> int:
 
     from jaxsafe.envs.engines.warp import dynamics
 
-    worlds = args.num_envs
-    small = scenes.build(sleeping.small_config(env.config, sleeping.awake(env.config, "warp")))
-    start = states(env, small, worlds)
-    contacts, rows = small.room()
-    simulated = small.simulation(env.config).compile(count=True)
+    worlds, substeps = args.num_envs, env.substeps
+    simulation, start = simulated(env, stepped(env, worlds))
+    start = {name: x for name, x in start.items() if x.size}
+    assert simulation.room is not None
+    contacts, rows = simulation.room
+    model = simulation.compile(count=True)
     sensors_off = mujoco.mjtDisableBit.mjDSBL_SENSOR.value
 
     def build(options: dict, less_contacts: float, less_rows: float):
-        model = mujoco_warp.put_model(simulated)
-        model.opt.warn_overflow = 0
+        m = mujoco_warp.put_model(model)
+        m.opt.warn_overflow = 0
         for name, value in options.items():
-            setattr(model.opt, name, value)
-        flags = model.opt.disableflags | sensors_off
-        blind = dataclasses.replace(model, opt=dataclasses.replace(model.opt, disableflags=flags))
+            setattr(m.opt, name, value)
+        flags = m.opt.disableflags | sensors_off
+        blind = dataclasses.replace(m, opt=dataclasses.replace(m.opt, disableflags=flags))
         room = {
             "naconmax": int(contacts * less_contacts) * worlds + 128,
             "njmax": int(rows * less_rows),
         }
-        data = mujoco_warp.make_data(simulated, nworld=worlds, **room)
-        pillars = small.simulation(env.config).pillars
-        dynamics.adopt(simulated, model, data, pillars)
-        return model, blind, data
+        data = mujoco_warp.make_data(model, nworld=worlds, **room)
+        dynamics.adopt(model, m, data, simulation.pillars, simulation.fields)
+        return m, blind, data
 
     def load(data) -> None:
         for name, x in start.items():
@@ -104,13 +118,13 @@ def main() -> int:
 
     with wp.ScopedDevice("cuda:0"):
         for name, variant in VARIANTS.items():
-            model, blind, data = build(*variant)
+            m, blind, data = build(*variant)
             load(data)
             dynamics.step(blind, data)  # compiles
             with wp.ScopedCapture() as capture:
-                for _ in range(10):
+                for _ in range(substeps):
                     dynamics.step(blind, data)
-                dynamics.forward(model, data)
+                dynamics.forward(m, data)
             graph: Any = capture.graph
             seconds = []
             for _ in range(7):
@@ -137,7 +151,7 @@ def main() -> int:
         for kernel in wp.timing_end():
             spent[kernel.name].append(kernel.elapsed)
         total = sum(map(sum, spent.values())) / steps
-        print(f"{sum(map(len, spent.values())) / steps:.0f} kernels a pass, {total:.2f} ms")
+        print(f"{sum(map(len, spent.values())) / steps:.0f} kernels a physics step, {total:.2f} ms")
         for name, times in sorted(spent.items(), key=lambda item: -sum(item[1]))[: args.top]:
             print(f"  {sum(times) / steps:8.3f} ms {len(times) / steps:6.1f}  {name[:80]}")
     return 0

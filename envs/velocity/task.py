@@ -60,13 +60,13 @@ class Velocity:
     def __init__(self, cfg: VelocityConfig, engine: str = "auto", name: str = "custom"):
         self.name, self.config, self.robot = name, cfg, ROBOTS[cfg.robot]
         room = self.robot.room
-        simulation = Simulation(
+        self.simulation = Simulation(
             self.spec(),
             substeps=cfg.frame_skip,
             fields=(*SEEN, "subtree_com") if cfg.robot == "humanoid" else (),
             room=Room(*(max(1, round(cfg.contact_room * size)) for size in room)),
         )
-        self._engine = engines.make_engine(engine, simulation)
+        self._engine = engines.make_engine(engine, self.simulation)
         self.engine, self.model = self._engine.name, self._engine.model
         threshold = cfg.velocity_threshold
         self.threshold = self.robot.thresholds[cfg.thresholds] if threshold is None else threshold
