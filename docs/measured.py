@@ -445,6 +445,12 @@ def devices() -> str:
     return "\n".join(lines)
 
 
+def is_navigation(run: SettingRun) -> bool:
+    """Whether it is one of the ten runs of SAC-Lagrangian that stand beside the table."""
+    asked = {"algo.name": "sac_lag", "preset": "navigation", "algo.cost_limit": 25}
+    return all(run.config[name] == value for name, value in asked.items())
+
+
 def pages() -> dict[Path, str]:
     """The text of every page with tables of measurements, by its path."""
     runs = read([RESULTS / name for name in TABLE])
@@ -505,6 +511,7 @@ def main() -> None:
     published = {(g.env, g.name): beside(g, PUBLISHED) for g in groups}
     picture = trade_off.draw(groups, "evaluated policies", published)
     studies.save_small(picture, RESULTS / "images" / "trade_off.png")
+    runs += [run for run in read([RESULTS / "off_policy"]) if is_navigation(run)]
     scored = suite([g for g in ordered(group(runs, ["algo.name"])) if g.name not in EXTRA])
     picture = plots.normalised(list(scored.groups), SCORES, aggregates(scored))
     studies.save_small(picture, RESULTS / "images" / "scores.png")
