@@ -103,9 +103,10 @@ class CRABSConfig(EnsembleConfig, CertificateConfig, sac.SACConfig):
     Zero Training-time Violations", arXiv:2108.01846, and the authors' code, roosephu/crabs @823da6c.
     Differs from it: the models are those of PETS, without gates. States outside of C jump into it; the
     code moves them there by gradient steps. Walks are corrected by the density of their noise; the code
-    takes its square. A step into an unsafe state counts for the critics. Costs are paid for, which the
-    code does on the cart alone. There are several environments, and updates are short. By default the
-    networks are small, and so are the searches. `preset=published` has the sizes of the code.
+    takes its square. A step into an unsafe state counts for the critics. Costs are paid for. In the
+    code the reward of Move and Swing does so, and nothing else. There are several environments, and
+    updates are short. By default the networks are small, and so are the searches. `preset=published`
+    has the sizes of the code.
     """
 
     TAKES_PICTURES: ClassVar = False
@@ -136,7 +137,8 @@ class CRABSConfig(EnsembleConfig, CertificateConfig, sac.SACConfig):
     target_entropy: Annotated[float, Bounds(-100, 100)] = -1.0
     # The temperature at first. The paper's code has 1, where rewards are larger.
     alpha_init: Annotated[float, Bounds(1e-10, 1e6)] = 0.1
-    # What a unit of cost costs in reward, so that it pays to live on. 10, as on the paper's cart.
+    # What a unit of cost costs in reward, so that it pays to live on. Move and Swing pay 10 themselves,
+    # as in the paper's code, which has no other price.
     penalty: Weight = 10.0
     cost_limit: Weight = 0.0  # Of an episode, drawn in plots: there is to be no cost.
     model_hidden: tuple[Units, ...] = (64, 64)  # Units of each model. The paper has four layers of 256.
@@ -370,7 +372,7 @@ PUBLISHED: dict[str, Any] = {
     "lr": 3e-4, "critic_lr": 3e-4, "alpha_init": 1.0, "alpha_lr": 3e-4, "max_grad_norm": math.inf,
     "model_hidden": (256, 256, 256, 256), "refit_every": 6000, "epoch_steps": 1000, "candidates": 100,
     "barrier_hidden": (256, 256), "barrier_lr": 3e-4, "chains": 10_000, "barrier_steps": 20_000,
-    "quiet_steps": 1000, "check_steps": 4000,
+    "quiet_steps": 1000, "check_steps": 4000, "penalty": 0.0,
 }  # fmt: skip
 
 ROWS = {
