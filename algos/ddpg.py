@@ -100,6 +100,10 @@ def make(env: Env, axis_name: str | None = None, treatment: Treatment = no_treat
     return off_policy(env, actor_critic(env, actor, treatment), treatment, axis_name)
 
 
+PRICED = td3.published(sac.LAG, sac.LAG_NAVIGATION)
+# OmniSafe @15603dd, configs/off-policy/DDPGLag.yaml: there costs are normalised, unlike for TD3, SAC.
+PRICED["omnisafe_navigation"] |= {"cost_normalize": True}
+
 ROWS = {
     "ddpg": Row(
         DDPGConfig,
@@ -115,7 +119,7 @@ ROWS = {
         DDPGLagConfig,
         partial(make, treatment=damped_lagrangian),
         "DDPG with an adaptive price on cost",
-        td3.published(sac.LAG, sac.LAG_NAVIGATION),
+        PRICED,
         total_steps=5_000_000,
         omnisafe="DDPGLag",
         lever=td3.LEVER | sac.LEVER_LAG,

@@ -244,6 +244,12 @@ def test_published_settings_build(name):
         assert jax.tree.structure(before) == jax.tree.structure(after)
 
 
+def test_ddpg_alone_normalises_costs_with_omnisafes_settings_of_navigation():
+    rows = ("ddpg_lag", "td3_lag", "sac_lag", "ddpg_pid", "td3_pid", "sac_pid")
+    asked = {name: ALGOS[name].published["omnisafe_navigation"]["cost_normalize"] for name in rows}
+    assert [name for name, normalised in asked.items() if normalised] == ["ddpg_lag"]
+
+
 @pytest.mark.parametrize(
     "settings, message",
     [
