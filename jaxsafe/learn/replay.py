@@ -16,7 +16,6 @@ come first because on a CPU XLA copies an array [R, 1, ...] on its way into a lo
 Positions count from the oldest row that the ring holds: 0 is the oldest, `count - 1` the newest.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import flax.struct
@@ -101,10 +100,6 @@ class Transitions(NamedTuple):
         return (self.weight.reshape(-1, *(1,) * (x.ndim - 1)) * x).sum(0)
 
 
-# (ring, span, index) -> the observations there, pytree [B, ...]
-Look = Callable[[Record, Span, Index], PyTree]
-
-
 def ring_rows(transitions: int, num_envs: int, block: int) -> int:
     """R, rows for about so many transitions of all environments: whole blocks, the nearest number."""
     return max(1, round(transitions / (num_envs * block))) * block
@@ -160,29 +155,6 @@ def draw(key: jax.Array, ring: Record, span: Span, batch: int, ahead: int = 1) -
     )
 
 
-def one_frame(ring: Record, span: Span, index: Index) -> PyTree:
-    return take(ring.obs, span, index)
-
-
-def frames(count: int) -> Look:
-    """Looks at the last `count` observations at once, [B, count, ...], the oldest first.
-
-    Before an episode's first observation, or before the oldest row, the earliest one is repeated.
-    """
-
-    def look(ring: Record, span: Span, index: Index) -> PyTree:
-        back = jnp.arange(count)[:, None]  # [count, 1]
-        earlier = jnp.maximum(index.position - back, 0)
-        begins = take(ring.first, span, Index(earlier, index.env)) | (earlier == 0)
-        age = jnp.argmax(begins, axis=0)  # rows back to the episode's first
-        age = jnp.where(begins.any(axis=0), age, count - 1)
-        source = index.position - jnp.minimum(back, age)[::-1]
-        stacked = take(ring.obs, span, Index(source, jnp.broadcast_to(index.env, source.shape)))
-        return jax.tree.map(lambda x: jnp.moveaxis(x, 0, 1), stacked)
-
-    return look
-
-
 def transitions(
     ring: Record,
     span: Span,
@@ -191,7 +163,6 @@ def transitions(
     discount: jax.Array | float,
     cost_discount: jax.Array | float,
     n_step: int = 1,
-    look: Look = one_frame,
 ) -> Transitions:
     """The transitions that begin at `index`, which has a row after it.
 
@@ -202,7 +173,6 @@ def transitions(
 
     Args:
         discount, cost_discount: scalars, of rewards and of costs within the n steps.
-        look: what is observed at a row, `one_frame` or `frames(count)`.
     """
     ahead = index.position + jnp.arange(n_step + 1)[:, None]  # [n + 1, B]
     inside = ahead[1:] < span.count
@@ -221,12 +191,12 @@ def transitions(
         return jnp.where(counts, factors * x[1:], 0).sum(0)
 
     return Transitions(
-        obs=look(ring, span, index),
+        obs=take(ring.obs, span, index),
         action=take(ring.action, span, index),
         reward=total(reward, discount),
         cost=total(cost, cost_discount),
         costs=total(costs, cost_discount),
-        next_obs=look(ring, span, end),
+        next_obs=take(ring.obs, span, end),
         steps=steps,
         terminated=jnp.take_along_axis(terminated, steps[None], axis=0)[0],
         weight=(steps > 0).astype(jnp.float32),
