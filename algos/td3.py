@@ -93,9 +93,9 @@ class TD3LagConfig(MultiplierConfig, TD3Config):
     takes mu(s') without noise, and unit is 1.
     """
 
-    # Standard deviation of the noise on actions in training, in the boldest environment. TD3 has 0.5.
-    # The price is learned for actions with noise, and with so much the policy without noise breaks the
-    # limit on Goal.
+    # Standard deviation of the noise on actions in training, in the boldest environment. OmniSafe has
+    # 0.1, too, and `td3` here 0.5. The price is learned for actions with noise, and with so much of it
+    # policies without noise cost more on Goal.
     noise_max: Noise = 0.1
 
 
