@@ -241,12 +241,12 @@ def test_soft_weights_by_hand():
 
 
 def test_the_plan_is_worth_the_smaller_value_of_what_the_actor_does_at_its_end():
-    """Q_1(s, a) = a and Q_2 = a + 1, and the actor does tanh(-5 s). From s' = s + a the plan should go
-    down, where Q(s', a) of the action before would have it go up."""
+    """Q_1(s, a) = a + s / 2 and Q_2 = a - s / 2, so that either may be the smaller, and the actor does
+    tanh(-5 s). From s' = s + a the plan should go down, where Q(s', a) of the action before would have
+    it go up."""
     cfg = loop.LOOPConfig(hidden=(), layer_norm=False, plan_steps=2, discount=0.5, true_model=True)
-    bias = jnp.array([[0.0], [1.0]])
-    weight = jnp.broadcast_to(jnp.array([[0.0], [1.0]]), (2, 2, 1))
-    critics = {"params": {"Dense_0": {"kernel": weight, "bias": bias}}}
+    weight = jnp.array([[[0.5], [1.0]], [[-0.5], [1.0]]])
+    critics = {"params": {"Dense_0": {"kernel": weight, "bias": jnp.zeros((2, 1))}}}
     actor = {"params": {"Dense_0": {"kernel": jnp.array([[-5.0, 0.0]]), "bias": jnp.zeros(2)}}}
     learned = learned_by(cfg, critic_r=critics, actor=actor)
     planner = loop.planner(SHORE)
@@ -258,24 +258,28 @@ def test_the_plan_is_worth_the_smaller_value_of_what_the_actor_does_at_its_end()
         return planner.ret(imagined, learned, jax.random.key(0))
 
     s = jnp.array([-1.0, 0.1, 1.0])
-    np.testing.assert_allclose(ret(s), 3 + 0.5 * 4 + 0.25 * np.tanh(-5 * s), rtol=1e-5)
+    smaller = np.tanh(-5 * s) - np.abs(s) / 2
+    np.testing.assert_allclose(ret(s), 3 + 0.5 * 4 + 0.25 * smaller, rtol=1e-5)
     np.testing.assert_allclose(ret(s, alive=False), 3 + 0.5 * 4)  # after an end nothing is left
     assert jnp.argmax(ret(s)) == 0
 
 
 def test_what_the_actor_does_in_each_model_is_among_the_plans():
+    """In model m a step goes m ahead, and the actor does tanh(s / 4)."""
     cfg = loop.LOOPConfig(hidden=(), plan_steps=3, actor_plans=2, particles=4)
-    actor = {"params": {"Dense_0": {"kernel": jnp.zeros((1, 2)), "bias": jnp.array([0.5, -20.0])}}}
+    bias = jnp.array([0.0, -20.0])  # of the mean and of the log standard deviation
+    actor = {"params": {"Dense_0": {"kernel": jnp.array([[0.25, 0.0]]), "bias": bias}}}
 
     def predict(fitted, latent, action, key, cfg):
         zero = jnp.zeros(latent.shape[:-1])
-        return Prediction(latent + action, zero, zero, zero, zero > 0)
+        return Prediction(latent + jnp.arange(5.0).reshape(5, 1, 1, 1), zero, zero, zero, zero > 0)
 
     model = Model(lambda cfg: (5, cfg.particles), predict, lambda latent: latent)
     planner = loop.planner(SHORE)
     (plans,) = planner.propose(model, learned_by(cfg, actor=actor), jnp.zeros(1), jax.random.key(0))
     assert plans.shape == (5 * 2, 3, 1)
-    np.testing.assert_allclose(plans, np.tanh(0.5), rtol=1e-4)
+    seen = np.arange(5)[:, None] * np.arange(3)  # [M, H]
+    np.testing.assert_allclose(plans[..., 0], np.repeat(np.tanh(seen / 4), 2, 0), atol=1e-4)
 
 
 def test_a_narrow_plan_is_not_improved_any_further():
