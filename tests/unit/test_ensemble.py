@@ -146,6 +146,19 @@ def test_the_loss_by_hand():
     np.testing.assert_allclose(ensemble_loss(ensemble, unscaled(1), x, y, 0.3), expected, rtol=1e-5)
 
 
+def test_the_bounds_of_the_variance_follow_the_likelihood_too():
+    """One linear layer says v = 0, with high = 0 and low = -log 2. Then log sigma^2 is 0. Its slope is
+    1/4 in `high` and 1/2 in `low`. At errors of 2 that of the likelihood's part is 1 - 2^2 in it."""
+    ensemble: Any = init_ensemble(jax.random.key(0), 1, 1, (), 1)
+    layer = jax.tree.map(jnp.zeros_like, ensemble.layers[0])
+    zero = jnp.zeros((1, 1))
+    ensemble = ensemble.replace(layers=(layer,), low=zero - jnp.log(2.0), high=zero)
+    x, y = jnp.ones((1, 2, 1)), jnp.array([[[2.0], [-2.0]]])
+    grad = jax.grad(ensemble_loss)(ensemble, unscaled(1), x, y, 0.0)
+    np.testing.assert_allclose(grad.high, [[-3 / 4 + 0.01]], rtol=1e-5)
+    np.testing.assert_allclose(grad.low, [[-3 / 2 - 0.01]], rtol=1e-5)
+
+
 def test_predictions_in_bfloat16_round_to_8_bits_and_stay_float32():
     """Rounding errors of 2^-9 each, some ten of them, one upon the other."""
     ensemble = init_ensemble(jax.random.key(0), 3, 5, (64, 64, 64), 4)
@@ -226,6 +239,58 @@ def test_a_model_is_put_back_to_its_best():
         np.testing.assert_array_equal(a, b)
     assert metrics["train/model_error"] == before["train/model_error"]
     assert metrics["train/model_epochs"] == before["train/model_epochs"] + 3
+
+
+def test_a_fit_goes_on_as_long_as_any_model_becomes_better():
+    """The first model learns a little in each epoch. The second is not finite, and never does."""
+    cfg = dataclasses.replace(
+        Config(), models=2, model_hidden=(), model_lr=1e-3, patience=2, max_epochs=7, epoch_steps=20
+    )
+    x, _ = draw(jax.random.key(0), (64, ENVS))
+    whole = init_model(jax.random.key(1), LINE, cfg)
+    layers = jax.tree.map(lambda w: w.at[1].set(jnp.nan), whole.params.ensemble.layers)
+    ensemble = whole.params.ensemble.replace(layers=layers)
+    model = whole._replace(params=whole.params.replace(ensemble=ensemble))
+    span = Span(jnp.int32(0), jnp.int32(64))
+
+    def train(x):
+        return fit(model, ring_of(x, x), span, jax.random.key(2), cfg)
+
+    _, metrics = jax.jit(train, compiler_options=FAST)(x)
+    assert metrics["train/model_epochs"] == 7 and jnp.isinf(metrics["train/model_error"])
+
+
+def rows_that_count(rows, **options):
+    """Which of `rows` rows train each model, bool [rows, M], and which measure the error, bool [rows].
+
+    A row counts if its reward makes a difference: to Adam's moments or, as the learning rate is 0, to
+    the error of models that stay what they are.
+    """
+    small: dict[str, Any] = {"model_hidden": (), "model_lr": 0.0, "max_epochs": 1, "holdout": 0.5}
+    cfg = dataclasses.replace(Config(), **small, **options)
+    x, y = draw(jax.random.key(0), (rows + 1, 1))  # nothing follows the last row
+    span, model = Span(jnp.int32(0), jnp.int32(rows + 1)), init_model(jax.random.key(1), LINE, cfg)
+
+    def found(y):
+        after, metrics = fit(model, ring_of(x, y), span, jax.random.key(2), cfg)
+        return after.opt_state[0].mu.layers[0].bias, metrics["train/model_error"]
+
+    rewards = y + 10 * jnp.eye(rows + 1)[:, :, None]  # another one of each row; the last does not count
+    moments, error = jax.jit(jax.vmap(found), compiler_options=FAST)(rewards)
+    return (moments[:-1] != moments[-1]).any(-1), error[:-1] != error[-1]
+
+
+def test_rows_either_train_all_models_or_measure_their_error():
+    trained, held_out = rows_that_count(40, epoch_steps=20, model_batch=64)
+    assert 10 < held_out.sum() < 30
+    np.testing.assert_array_equal(trained, np.stack([~held_out] * 3, 1))
+
+
+def test_each_model_has_batches_of_its_own():
+    trained, _ = rows_that_count(40, epoch_steps=1, model_batch=4)
+    count = trained.sum(0)
+    assert (count >= 1).all() and (count <= 4).all()
+    assert all((trained[:, i] != trained[:, j]).any() for i, j in ((0, 1), (0, 2), (1, 2)))
 
 
 def test_an_epoch_with_a_gradient_that_is_not_finite_moves_nothing():
@@ -314,3 +379,21 @@ def test_a_plan_earns_nothing_after_an_end_that_the_observation_tells(foresees):
     np.testing.assert_allclose(imagined.reward.mean((1, 2, 3)), paid, atol=1e-4)
     assert ((imagined.spread > 0).all((1, 2, 3)) == (jnp.array(paid) > 0)).all()
     assert (imagined.alive == (not foresees)).all()
+
+
+def test_a_particle_follows_its_own_model_from_where_it_is():
+    """Model m is sure that a step goes m + a ahead, and pays what x was before it."""
+    cfg = dataclasses.replace(Config(), model_hidden=(), particles=2)
+    model = init_model(jax.random.key(0), LINE, cfg).params
+    weight = jnp.broadcast_to(jnp.array([[1.0, 0, 0, 0], [0, 1.0, 0, 0]]), (3, 2, 4))  # of x and of a
+    bias = jnp.zeros((3, 4)).at[:, 1].set(jnp.arange(3.0))
+    low = jnp.full_like(model.ensemble.low, -30.0)
+    layers = (model.ensemble.layers[0].replace(weight=weight, bias=bias),)
+    ensemble = model.ensemble.replace(layers=layers, low=low, high=low + 1e-3)
+    learned = Learned(cfg, {"model": model.replace(ensemble=ensemble)}, (), ())
+    action = np.array([-0.5, 0.0, 1.0])
+    plans = jnp.broadcast_to(jnp.asarray(action)[:, None, None], (3, 4, 1))
+    imagined = imagine(learned_model(LINE), learned, jnp.ones(1), plans, jax.random.key(1))
+    ahead = np.arange(3)[:, None, None] + np.stack([action] * 2)  # [M, P, S]
+    np.testing.assert_allclose(imagined.obs[..., 0], 1 + 4 * ahead, atol=1e-4)
+    np.testing.assert_allclose(imagined.reward, [1 + h * ahead for h in range(4)], atol=1e-4)
