@@ -42,10 +42,12 @@ class PETSConfig(ModelBasedConfig, ReplayConfig):
 
     Source: Chua et al. (2018), "Deep Reinforcement Learning in a Handful of Trials using Probabilistic
     Dynamics Models", arXiv:1805.12114; the settings are OmniSafe's.
-    Differs from OmniSafe: the bounds of the variances are learned, weights begin with a truncated
-    normal, and each model is put back to its best, as in the papers. Plans see the end of an episode.
-    They begin anew with each, and evaluation has plans of its own. Batches are drawn with replacement.
-    The defaults are for a GPU: many environments, and a fixed number of large steps at each refit.
+    Differs from OmniSafe: the bounds of the variances are learned, and weights begin with a truncated
+    normal, as in the authors' code. A refit of several epochs puts each model back to its best, as in
+    the code of Janner et al. (2019), arXiv:1906.08253. The defaults have one epoch (`max_epochs`), so
+    that its last weights stay. Plans see the end of an episode. They begin anew with each, and
+    evaluation has plans of its own. Batches are drawn with replacement. The defaults are for a GPU:
+    many environments, and a fixed number of large steps at each refit.
     """
 
     # Environments side by side, of all devices together. OmniSafe has 1.

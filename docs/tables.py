@@ -25,7 +25,7 @@ def robots(task: str) -> dict[str, SafetyGym]:
 
 
 PRICE = "there the price moves at every gradient step"
-MODEL = "there the last weights of each model stay, not the best"
+MODEL = "there a refit of several epochs keeps the last weights of each model, not the best"
 LAST = f"{MODEL}; C is of 1000 steps of the planner"
 PERTURBED = "there the next action is perturbed by the present network, not by its target"
 NO_OPTION = {  # what OmniSafe does otherwise, and no option of ours brings back
