@@ -82,7 +82,7 @@ class BCQLagConfig(OfflineCostConfig, BCQConfig):
         minimise_Q    E[sum_j (Q_j(s, a) - y)^2 + sum_j (Q_cj(s, a) - y_c)^2]
         maximise_xi   E[(Q_1(s, a_1) - lam Q_c(s, a_1)) / (1 + lam)]
         minimise_lam  -lam (J_c - cost_limit),  lam >= 0,  by Adam, after each gradient step
-        J_c = (1 - cost_discount) T E[Q'_c(s', a'_i*)],   T the steps of an episode
+        J_c = (1 - cost_discount) T E[(1 - terminated) Q'_c(s', a'_i*)],   T the steps of an episode
 
     Acts with the a_i that earns most at the price, out of as many as the target has: out of more it
     would find cheaper ones, and J_c would not be its cost. J_c is of drawn z_i, so `eval/cost_sampled`

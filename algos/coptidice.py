@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxsafe.algos import bc
-from jaxsafe.config import Bounds, Rate, Real, Weight, config
+from jaxsafe.config import Bounds, Rate, Real, Share, Weight, config
 from jaxsafe.learn.acting import Learned
 from jaxsafe.learn.constraints import each
 from jaxsafe.learn.conventions import Convention
@@ -49,6 +49,9 @@ class COptiDICEConfig(OfflinePriceConfig, OfflineValueConfig):
     of the batch within a KL of `cost_divergence`. T is the steps of an episode. s_0 are the first
     observations of the episodes of the data. The policy is a Gaussian about a mean in (-1, 1).
 
+    e is of one transition. Where rewards or next states are random, a lucky one has a larger e, and w
+    takes its luck for the merit of the action.
+
     Source: Lee et al. (2022), "COptiDICE: Offline Constrained Reinforcement Learning via Stationary
     Distribution Correction Estimation", arXiv:2204.08957, sections 3 and 4, and the authors' code.
     Differs from it: lam and tau are no exponentials, the policy is one Gaussian instead of several, and
@@ -87,6 +90,8 @@ class COptiDICEConfig(OfflinePriceConfig, OfflineValueConfig):
     critic_lr: Rate = 3e-4  # The learning rate of nu and chi, by Adam, as in the paper's code.
     # The log standard deviation of actions at first, as in OmniSafe.
     init_log_std: Real = 0.0
+    # The discount of costs, only for evaluation's discounted cost. nu and chi both have `discount`.
+    cost_discount: Share = 0.99
 
 
 def f(w: jax.Array) -> jax.Array:

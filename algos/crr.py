@@ -76,7 +76,7 @@ class CCRRConfig(OfflineCostConfig, CRRConfig):
         y_c = c + cost_discount (1 - terminated) Q'_c(s', a'),    a' as in CRR
         minimise_Q    E[sum_j (Q_cj(s, a) - y_c)^2], and the loss of Q as in CRR
         minimise_lam  -lam (J_c - cost_limit),  lam >= 0,  by Adam, after each gradient step
-        J_c = (1 - cost_discount) T E[Q'_c(s', a')],   T the steps of an episode
+        J_c = (1 - cost_discount) T E[(1 - terminated) Q'_c(s', a')],   T the steps of an episode
 
     The rest is as in CRR. Q'_c is clipped likewise in y_c and in J_c, by the costs of the data. Values
     go on after the time limit, so J_c is the undiscounted cost of an episode at the rate that Q_c says.
@@ -84,11 +84,11 @@ class CCRRConfig(OfflineCostConfig, CRRConfig):
     Source: CRR of Wang et al. (2020), arXiv:2006.15134, with the multiplier of OmniSafe's CCRR.
     Differs from OmniSafe: there values have no bounds, the critic of reward also learns the costs, and
     the critic of cost learns nothing. Its published numbers depend on that (`compat=omnisafe`). With
-    `cost_critic=idle` Q_c stays what it is at first. A second step moves Q towards y_c. J_c is as
-    above, of V in place of Q'_c:
+    `cost_critic=idle` Q_c stays what it is at first. A second step moves Q towards y_c:
 
         y_c = c + discount (1 - terminated) min_j Q'_j(s', a')
         A_c = Q_c(s, a) - V(s),   V(s) = mean_i min_j Q_j(s, a_i)
+        J_c = (1 - cost_discount) T E[V(s)]
     """
 
     CONVENTIONS: ClassVar = (

@@ -166,9 +166,9 @@ class OfflineConfig:
     obs_normalize: bool = True
     # The discount of rewards. Imitation only uses it for evaluation's discounted return.
     discount: Share = 0.99
-    # The discount of costs. Imitation only uses it for evaluation's discounted cost.
+    # The discount of costs. Without a critic of cost it is only for evaluation's discounted cost.
     cost_discount: Share = 0.99
-    # The undiscounted cost that an episode may have. Imitation only draws it in plots.
+    # The undiscounted cost that an episode may have. Unconstrained algorithms only draw it in plots.
     cost_limit: Weight = 25.0
     lr: Rate = 1e-3  # The policy's learning rate, by Adam, as in OmniSafe's VAE-BC.
     lr_decay: bool = False  # Whether learning rates fall linearly to 0 at `total_iterations`.
