@@ -2,6 +2,7 @@
 
 import itertools
 import statistics
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -48,6 +49,33 @@ def test_the_cost_of_imitation_falls_with_the_share_of_safe_episodes(env):
 def test_imitation_of_the_safe_episodes_alone_holds_the_limit(env, beta):
     run = f"algo=bc_safe dataset=runs/data/{env}/{beta}"
     assert mean(rows_of("offline"), "final cost", env=env, run=run) <= 25
+
+
+def test_c_crr_holds_the_limit_in_three_of_six_runs_on_circle_and_comes_near_in_a_fourth():
+    costs = sorted(
+        mean(rows_of("offline"), "final cost", env=env, run=f"algo=ccrr dataset=runs/data/{env}/{beta}")
+        for env in ("point_circle1", "car_circle1")
+        for beta in ("0.25", "0.50", "0.75")
+    )
+    assert costs[2] <= 25 < costs[3] < 26 < 40 < costs[4]
+
+
+@pytest.mark.parametrize(
+    "env, cells",
+    [
+        ("point_circle1", {"a4bacb1": 4, "81e3279": 5, "4963301": 1, "1113832": 2}),
+        ("car_circle1", {"81e3279": 9, "06f42f6": 1, "4963301": 2}),
+    ],
+)
+def test_the_cells_beside_omnisafes_are_of_data_made_at_these_commits(env, cells):
+    of_run = {
+        row["run"]: row["commit"][:7]
+        for row in rows_of("offline")
+        if row["env"] == env
+        and row["algo"] in ("vae_bc", "ccrr", "bcq_lag", "coptidice")
+        and "total_updates" not in row["run"]
+    }
+    assert Counter(of_run.values()) == cells
 
 
 def test_a_planner_within_a_limit_earns_and_costs_next_to_nothing_and_a_blind_one_costs_much():
