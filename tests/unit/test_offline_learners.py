@@ -744,26 +744,33 @@ NEAR: dict[str, Any] = {"perturbation": 0.02, "kl_weight": 0.005, "latent_clip":
 FEW: dict[str, Any] = {"candidates": 10, "act_candidates": 10, "dual_lr": 1e-3}
 
 
+# where the price moves 2.5 times as fast, as on Lever, it swings, and single seeds cost 0.7 to 1.4
+SLOW: dict[str, Any] = {"temperature": 0.02, "dual_lr": 2e-4}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "name, limit, options",
+    "name, limit, options, ret_off, cost_off",
     [
-        ("bcq", 10.0, NEAR),
-        ("crr", 10.0, {"temperature": 0.01}),
-        ("bcq_lag", 1.0, NEAR | FEW),
-        ("ccrr", 1.0, {"temperature": 0.02}),
+        ("bcq", 10.0, NEAR, 0.05, 0.1),
+        ("crr", 10.0, {"temperature": 0.01}, 0.05, 0.1),
+        ("bcq_lag", 1.0, NEAR | FEW, 0.12, 0.2),
+        ("ccrr", 1.0, SLOW, 0.08, 0.15),
     ],
 )
-def test_the_linear_programs_best_of_the_actions_in_the_data_is_found(name, limit, options):
+def test_the_linear_programs_best_of_the_actions_in_the_data_is_found(
+    name, limit, options, ret_off, cost_off
+):
     """The program is over the hundredths of u that the data have, 0 to 0.6. With all actions it would
-    earn 20% more or better. A limit of 10 does not bind, as no episode can cost more."""
+    earn 20% more or better. A limit of 10 does not bind, as no episode can cost more. The two seeds are
+    held to the program on average, as one seed of bcq_lag costs 0.8 to 1.4."""
     data = slope_data()
     u = (np.unique(np.floor(50 * (data.action + 1))) + 0.5) / 100
     ret, cost = best_on_slope(u, limit)
     assert best_on_slope(np.linspace(0, 1, 101), limit)[0] > 1.2 * ret
     whole = trained(name, Slope(), data, limit, **options)
-    np.testing.assert_allclose(whole.ret, ret, rtol=0.15)
-    np.testing.assert_allclose(whole.cost, cost, rtol=0.25)
+    np.testing.assert_allclose(whole.ret.mean(), ret, rtol=ret_off)
+    np.testing.assert_allclose(whole.cost.mean(), cost, rtol=cost_off)
     assert (whole.costs[..., 1] < 0.01).all()
 
 
@@ -775,5 +782,5 @@ def test_coptidice_finds_the_best_of_the_actions_in_the_data():
     reach = np.random.default_rng(1).choice([EDGE / 2, EDGE], (2000, 1))
     data = lever_data("coptidice", reach=np.repeat(reach, 10, 0))
     whole = trained("coptidice", Lever(), data, LIMIT, alpha=0.01)
-    np.testing.assert_allclose(whole.ret, BEST - 10 * (1 - EDGE), rtol=0.15)
-    np.testing.assert_allclose(whole.cost, LIMIT, rtol=0.25)
+    np.testing.assert_allclose(whole.ret, BEST - 10 * (1 - EDGE), rtol=0.06)
+    np.testing.assert_allclose(whole.cost, LIMIT, rtol=0.2)
