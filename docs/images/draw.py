@@ -51,7 +51,7 @@ def draw(name: str) -> None:
         return jax.random.uniform(action_key, (env.action_size,), minval=-1.0), carry, {}
 
     player = Player(Policy(lambda learned: jax.random.key(seed), act), (), env)
-    states = render.run_episode(player, jax.random.key(seed), steps)
+    states, _ = render.run_episode(player, jax.random.key(seed), steps)
     view = camera(lookat, distance)
     frame = render.Renderer(env, 640, 400, view).frame(jax.tree.map(lambda x: x[-1], states))
     imageio.imwrite(HERE / f"{name}.png", frame)
@@ -99,7 +99,7 @@ def draw_racing(name: str) -> None:
 def draw_policy(run: Path, seed: int, begin: int) -> None:
     """A part of an episode of the policy in `run`, from step `begin` on, as a small GIF."""
     policy = open_run(run).one(0)
-    states = render.run_episode(policy.player, jax.random.key(seed), begin + STEPS)
+    states, _ = render.run_episode(policy.player, jax.random.key(seed), begin + STEPS)
     drawing = render.Renderer(policy.env, 560, 400, camera((0.0, 0.0, 0.0), 4.5, elevation=-55))
     frames = [
         Image.fromarray(drawing.frame(jax.tree.map(lambda x, t=t: x[t], states)))
