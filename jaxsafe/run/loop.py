@@ -158,6 +158,9 @@ def resumed(program: Program, store: Path, report: Reporter) -> Start:
     return Start(distributed.place(ts, program.sharding), iteration, since)
 
 
+LONGEST = 1800.0  # seconds from one checkpoint with a replay to the next, if they take longer than 5%
+
+
 class Saver:
     """When the loop saves, and what.
 
@@ -198,8 +201,14 @@ class Saver:
             policies = of_members(self.program, self.program.learned(state))
             checkpoint.save(self.policies, policies, at)
         self.saved_at = time.perf_counter()
-        if self.saves_replay:  # at most 5% of the time
-            self.pause = max(self.every, 19 * (self.saved_at - begun))
+        if self.saves_replay:
+            self.pause = pause_after(self.saved_at - begun, self.every)
+
+
+def pause_after(took: float, every: float) -> float:
+    """Seconds to the next checkpoint after one with a replay: `every` or more, so that they take at
+    most 5% of the time. One that a slow disk held up puts the next off by `LONGEST` at most."""
+    return max(every, min(19 * took, LONGEST))
 
 
 def of_members(program: Program, learned: PyTree) -> PyTree:

@@ -6,6 +6,7 @@ from jax.flatten_util import ravel_pytree
 
 from jaxsafe.run import checkpoint
 from jaxsafe.run.checkpoint import CheckpointError, NotSaved, Progress, checkpoints, restore, save
+from jaxsafe.run.loop import pause_after
 
 
 def state(scale: float = 1.0):
@@ -137,3 +138,11 @@ def test_a_replay_that_is_left_out_comes_back_empty_and_says_since_when(tmp_path
     assert (manifest.at, manifest.since) == (at(8), 8)
     save(tmp_path, state(), at(9))  # of another algorithm: its replay is not empty but absent
     assert checkpoint.replay_bytes(state()) == 0 and restore(tmp_path, state())[1].since == 0
+
+
+@pytest.mark.parametrize(
+    "took, every, pause",
+    [(1.0, 60.0, 60.0), (10.0, 60.0, 190.0), (1200.0, 60.0, 1800.0), (1200.0, 3600.0, 3600.0)],
+)
+def test_a_slow_checkpoint_puts_the_next_off_by_half_an_hour_at_most(took, every, pause):
+    assert pause_after(took, every) == pause
