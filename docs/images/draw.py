@@ -1,7 +1,7 @@
 """Draw the pictures beside this file: python docs/images/draw.py
 
-With --run RUN it writes policy.gif instead, of a policy trained on point_goal1. The one here is of
-`python scripts/train.py env=point_goal1 algo=ppo_lag total_steps=9e6`.
+With --run RUN it writes policy.gif instead, of a policy trained on car_push1. The one here is of
+`python scripts/train.py env=car_push1 algo=sac_lag preset=navigation total_steps=3e6`, on a CPU.
 """
 
 import argparse
