@@ -206,23 +206,22 @@ ONE_NOISE: dict[str, Any] = {"noise_min": 0.1, "noise_max": 0.1, "learning_start
 def published(
     base: dict[str, Any],
     navigation: dict[str, Any] | None = None,
-    parallel: dict[str, Any] | None = None,
+    parallel: dict[str, Any] = sac.PARALLEL,
 ) -> dict[str, Any]:
     """The settings of a row with the treatment's in `base`, if it has one: OmniSafe's for velocity and
-    for navigation, and ours for 64 environments, with those of `parallel`."""
-    ours = sac.PARALLEL | (parallel or {})
+    for navigation, and ours for 64 environments, `parallel`."""
     of_sac = {"alpha_init", "alpha_lr", "target_entropy", "policy_delay"}
     omnisafe = {k: v for k, v in sac.OMNISAFE.items() if k not in of_sac} | ONE_NOISE
     rates = {"lr": 5e-6, "critic_lr": 1e-3}
     return {
         "omnisafe": omnisafe | base,
         "omnisafe_navigation": omnisafe | rates | (base if navigation is None else navigation),
-        **(sac.priced_parallel(ours, navigation) if navigation else {"parallel": ours}),
+        **(sac.priced_parallel(parallel, navigation) if navigation else {"parallel": parallel}),
     }
 
 
-# What the presets for 64 environments were measured with.
-BOLD: dict[str, Any] = {"noise_max": 0.5}
+# The noise that the presets of TD3-Lagrangian for 64 environments were measured with.
+BOLD: dict[str, Any] = sac.PARALLEL | {"noise_max": 0.5}
 
 # for a problem of two levers
 LEVER: dict[str, Any] = {
