@@ -286,18 +286,25 @@ def training_speeds() -> str:
 
 def off_policy_speeds() -> str:
     """Environment steps a second of SAC's training on one H200, ours and that of peers with as many
-    environments and gradient steps, the fastest first."""
+    environments and gradient steps, the fastest first. `after`: steps of each of our environments."""
     rows = [r for r in benchmark_rows("benchmark_h200.jsonl") if (r["algo"] or "").startswith("sac")]
-    ours = latest([r for r in rows if "peer" not in r and not r.get("options")], "env", "num_seeds")
+    ours = latest(
+        [r | {"options": r.get("options", "")} for r in rows if "peer" not in r],
+        "env", "num_seeds", "options",
+    )  # fmt: skip
     theirs = latest([r for r in rows if "peer" in r], "peer")
     names = {"brax-sac": "Brax {brax}, SAC", "crax-sac-lag": "CRAX {crax-bench}, SAC-Lagrangian"}
     own = {"sac": "jaxsafe, SAC", "sac_lag": "jaxsafe, SAC-Lagrangian"}
-    found = [(own[r["algo"]], seeds, r) for (_, seeds), r in ours.items()]
+    half = {"": "", "algo.hidden_dtype=bfloat16": ", bfloat16"}
+    found = [(own[r["algo"]] + half[options], seeds, r) for (_, seeds, options), r in ours.items()]
     found += [(names[peer].format(**r), 1, r) for (peer,), r in theirs.items()]
-    lines = ["| | task | seeds | steps/s | slowest, fastest run |", "|---|---|---:|---:|---:|"]
+    lines = [
+        "| | task | seeds | after | steps/s | slowest, fastest run |",
+        "|---|---|---:|---:|---:|---:|",
+    ]
     for name, seeds, r in sorted(found, key=lambda x: -x[2]["env_steps_per_s"]):
         rates = f"{r['env_steps_per_s']:,.0f} | {r['slowest']:,.0f}, {r['fastest']:,.0f}"
-        lines.append(f"| {name} | `{r['env']}` | {seeds} | {rates} |")
+        lines.append(f"| {name} | `{r['env']}` | {seeds} | {r.get('warmup', '')} | {rates} |")
     return "\n".join(lines)
 
 

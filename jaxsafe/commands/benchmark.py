@@ -349,7 +349,7 @@ def command() -> int:
         if args.json:
             with args.json.open("a") as file:
                 command = " ".join(sys.argv)
-                row = row | {"command": command, "commit": run_folder.commit(), **about}
+                row = {"command": command, "commit": run_folder.commit(), **about} | row
                 file.write(json.dumps(row) + "\n")
 
     for name in args.envs:

@@ -25,6 +25,7 @@ import argparse
 import functools
 import json
 import os
+import platform
 import statistics
 import sys
 import time
@@ -250,6 +251,17 @@ PEERS: dict[str, tuple[str, Measure]] = {  # name -> (distribution, measurement)
 }
 
 
+def own_versions() -> dict[str, str]:
+    """Of the Python that has the peer, in place of those that `jaxsafe benchmark` runs by."""
+    found = {"python": platform.python_version()}
+    for package in ("jax", "mujoco", "mujoco-mjx"):
+        try:
+            found[package] = version(package)
+        except ImportError:
+            continue
+    return found
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("peer", choices=sorted(PEERS))
@@ -273,10 +285,11 @@ def main() -> int:
     except ImportError:
         print(f"{args.peer}: pip install {distribution} for {sys.executable}", file=sys.stderr)
         return 2
+    about = {"peer": args.peer, distribution: found, **own_versions()}
     show = functools.partial(print, file=sys.__stdout__, flush=True)
     sys.stdout = sys.stderr  # peers talk
     for row in measure(Sizes(args.num_envs, args.batch_size, args.gradient_steps)):
-        show(json.dumps({"peer": args.peer, distribution: found} | row))
+        show(json.dumps(about | row))
     return 0
 
 

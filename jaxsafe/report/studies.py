@@ -23,6 +23,7 @@ study.yaml has these keys; the first four are needed:
 import functools
 import io
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -45,7 +46,7 @@ SPAN = 20  # iterations over which costs are averaged before their swing is take
 CHUNK = 8  # settings in one figure of curves
 HIGH = 4  # tasks in one figure of curves
 FEW = 3  # options of a run that are all in its name
-MOST = 24  # settings whose points can be told apart in one figure
+MOST = 24  # settings of one task whose points can be told apart in one panel
 PAGE = """# {title}
 
 {about}
@@ -371,7 +372,8 @@ def pictures_of(
     images, name = study.folder.parent / "images", study.folder.name
     looks = styles(groups)
     found = []
-    if 1 < len(looks) <= MOST:
+    crowd = max(Counter(g.env for g in groups).values(), default=0)
+    if len(looks) > 1 and crowd <= MOST:
         theirs = {(g.env, g.name): beside(g, known) for g in groups}
         draw = functools.partial(trade_off.draw, groups, "last 10 % of training", theirs, looks)
         caption = "Return against cost of last 10% of training, a point a setting"

@@ -140,6 +140,17 @@ def test_a_peer_s_sac_cannot_take_half_a_gradient_step():
         benchmark.peer_sizes(2048, batches)
 
 
+def test_a_peer_s_row_keeps_the_versions_that_it_ran_by(monkeypatch, tmp_path):
+    row = {"peer": "crax", "algo": None, "env": "e", "num_envs": 1, "env_steps_per_s": 1.0}
+    monkeypatch.setattr(benchmark, "measure_peer", lambda spec, sizes: [row | {"mujoco": "0.0"}])
+    monkeypatch.setattr(sys, "argv", ["benchmark", "--peer", "crax", "--json", str(tmp_path / "rows")])
+    assert benchmark.main() == 0
+    (kept,) = [json.loads(line) for line in (tmp_path / "rows").read_text().splitlines()]
+    assert kept["mujoco"] == "0.0"
+    assert kept["device"] == benchmark.versions()["device"]
+    assert set(peers.own_versions()) == {"python", "jax", "mujoco", "mujoco-mjx"}
+
+
 def test_a_peer_s_rate_is_that_of_its_settled_epochs():
     """A stand-in for Brax's trainer: 10,000 steps fill the replay, then come epochs of 100 steps."""
 
