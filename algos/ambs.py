@@ -29,7 +29,6 @@ from jaxsafe.learn.dreaming import (
     seen,
 )
 from jaxsafe.learn.off_policy import off_policy
-from jaxsafe.learn.replay import Record
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.world_model import CHANCE, dream_returns, read, value_of, world_of
 from jaxsafe.nn.rssm import Latent
@@ -143,7 +142,7 @@ def violated(env: Env, rows: Costs, cfg: Any) -> jax.Array:
     return (costs > 0).any(-1) if cfg.labels else costs > 0
 
 
-def targets(env: Env, rows: Record, cfg: Any) -> dict[str, jax.Array]:
+def targets(env: Env, rows: Costs, cfg: Any) -> dict[str, jax.Array]:
     bad = violated(env, rows, cfg)
     return {"cost": cfg.violation_cost * bad, "safe": 1.0 - bad}
 
@@ -250,7 +249,7 @@ shielded_behaviour = Behaviour(
     memory=lambda cfg: {name: no_range() for name in ("reward", "penalty", "safe")},
     actors=("actor", "safe"),
     critics=("critic_r", "critic_p", "critic_safe", *PAIR),
-    heads=(("cost", BINS), ("safe", CHANCE)),
+    heads=lambda cfg: {"cost": BINS, "safe": CHANCE},
     targets=targets,
 )
 
@@ -287,7 +286,7 @@ def dreamt(env: Env, learned: Learned, latent: Latent, proposed: jax.Array, key:
     """
     cfg, params = learned.config, learned.params
     steps = cfg.shield_horizon if cfg.verdict == "drawn" else cfg.shield_steps
-    world = world_of(env, shielded_behaviour.all_heads, cfg)
+    world = world_of(env, shielded_behaviour.all_heads(cfg), cfg)
     rollouts = (cfg.shield_rollouts,)
     start = jax.tree.map(lambda x: jnp.broadcast_to(x, (*rollouts, *x.shape)), latent)
 
@@ -609,8 +608,7 @@ PENALTIES: dict[str, dict[str, Any]] = {
     "penl": PAPER | {"penalty": "penl", "penalty_coef": 1.0},
     "copt": PAPER | {"penalty": "copt", "penalty_coef": 1.0},
 }
-# its `medium` networks, for pictures of 64 x 64 alone and env.wrap.action_repeat=2; the nearest size
-PIXELS: dict[str, Any] = PENALTIES["plpg"] | {"encoder": "cnn", "size": "50m"}
+PIXELS: dict[str, Any] = PENALTIES["plpg"] | dreamer.PIXELS
 # for two cores, on which foresight takes too long
 CPU: dict[str, Any] = dreamer.CPU_FORESIGHT | {"overshoot": 0, "shield_rollouts": 32}
 # for a problem of a ledge, some steps away

@@ -1,7 +1,7 @@
 """DreamerV3, which learns in the dreams of a world model; and with a price on cost."""
 
 from functools import partial
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxsafe.config import Amount, Bounds, Cap, Iterations, Share, Weight, config
 from jaxsafe.learn.batch import pmean
 from jaxsafe.learn.bill import PriceClockConfig
+from jaxsafe.learn.constraints import Costs
 from jaxsafe.learn.dreaming import (
     Behaviour,
     Judged,
@@ -23,7 +24,7 @@ from jaxsafe.learn.dreaming import (
 from jaxsafe.learn.off_policy import off_policy
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.treatments import CappedPIDConfig, Treatment, capped_pid, no_treatment
-from jaxsafe.learn.world_model import Dreams, SizeName, WorldModelConfig
+from jaxsafe.learn.world_model import CHANCE, Dreams, SizeName, WorldModelConfig
 from jaxsafe.nn.two_hot import BINS
 from jaxsafe.types import Algorithm, Env, Metrics, PyTree
 
@@ -67,7 +68,8 @@ class ForesightConfig(DreamerConfig):
     batch_size: Amount = 1024  # Rows of a gradient step, of all devices together.
     # Environment steps with random actions and without learning.
     learning_starts: Amount = 1_024
-    # The networks' size: about the number of parameters, if pictures are observed.
+    # The networks' size: about the number of parameters, if pictures are observed. small is 12m, medium
+    # 50m, large 100m and xlarge 200m, the nearest to what AMBS's code has by these names.
     size: SizeName = "500k"
     # Steps ahead, at most `n_step`, for which the heads learn in dreams that take the replayed actions.
     overshoot: Annotated[int, Bounds(0, 1000)] = 15
@@ -91,12 +93,13 @@ class DreamerLagConfig(ForesightConfig):
     Shielding for Probabilistic Safety Guarantees in Continuous Environments", arXiv:2402.00816, as in
     their code; the augmented Lagrangian is that of As et al. (2022), "Constrained Policy Optimization
     via Bayesian World Models", arXiv:2201.09802.
-    Differs from it: the head of cost says how much a step costs, with `preset=ambs`, too. In AMBS's
-    code it says how likely a step has a violation, and two in a step count as one. Dreamer is the later
-    one, whose actor learns by reinforce (`actor_grad=backprop` has AMBS's).
+    Differs from it: the model says how much a step costs. In AMBS's code it says how likely a step has
+    a cost, and two in a step count as one (`cost_head=chance`). Dreamer is the later one, whose actor
+    learns by reinforce (`actor_grad=backprop` has AMBS's).
     In the code mu is 1 from the second step on, so lam moves by the whole violation each time
     (`mu_least=1`); `mu_least=0` is the paper's. The model foresees cost (`overshoot`), as that of
-    Dreamer-PID does.
+    Dreamer-PID does. `preset=ambs` is as AMBS's code in all of this. Its `cost_limit` of 1.5 is for an
+    episode of 500 steps: there d is 1.
     """
 
     # The discount of costs.
@@ -107,6 +110,9 @@ class DreamerLagConfig(ForesightConfig):
     mu_growth: Weight = 1e-6  # The growth of mu at each gradient step, as in AMBS's code.
     # mu is at least this from the second step on. In AMBS's code it is 1.
     mu_least: Weight = 0.001
+    # What the model says of a step's cost. amount: how large it is. chance: how likely there is one, so
+    # that a step costs 1 at most, as in AMBS's code.
+    cost_head: Literal["amount", "chance"] = "amount"
 
 
 @config
@@ -214,23 +220,32 @@ def discounted_limit(env: Env, cfg: Any) -> jax.Array:
 
 
 def learn_cost(
-    trained: dict[str, PyTree], dreams: Dreams, scene: Scene
+    trained: dict[str, PyTree], dreams: Dreams, scene: Scene, cost: jax.Array
 ) -> tuple[Judged, jax.Array, Metrics]:
-    """What the actor's dreams cost; the loss of the critic that says so, and metrics."""
+    """What the actor's dreams cost; the loss of the critic that says so, and metrics.
+
+    cost: of the replayed rows, float [T, B].
+    """
     cfg = scene.cfg
     costs = scene.judge("critic_c", dreams, dreams.read["cost"], cfg.cost_discount)
     loss = scene.critic_loss_with_rows(
-        trained, "critic_c", dreams, costs.returns, scene.batch.rows.cost, cfg.cost_discount
+        trained, "critic_c", dreams, costs.returns, cost, cfg.cost_discount
     )
     value = scene.over_dreams(costs.value[:-1])
     return costs, loss, {"train/critic_loss_c": loss, "train/value_c": value}
+
+
+def priced_cost(rows: Costs, cfg: Any) -> jax.Array:
+    """What the head of cost learns to say of rows, float [T, B]."""
+    return rows.cost if cfg.cost_head == "amount" else 1.0 * (rows.cost > 0)
 
 
 def learn_priced(trained: dict[str, PyTree], memory: PyTree, scene: Scene, key: jax.Array) -> Outcome:
     cfg, dual = scene.cfg, memory["dual"]
     found = learn_reward(trained, memory["range"], scene, key)
     dreams = found.dreams
-    costs, critic_loss, of_cost = learn_cost(trained, dreams, scene)
+    paid = priced_cost(scene.batch.rows, cfg)
+    costs, critic_loss, of_cost = learn_cost(trained, dreams, scene, paid)
     limit = discounted_limit(scene.env, cfg)
     violation = costs.returns - limit
     penalty = dual.psi(violation)
@@ -247,8 +262,8 @@ priced = Behaviour(
     learn=learn_priced,
     memory=lambda cfg: {"range": no_range(), "dual": Augmented(cfg.lam_init, cfg.mu_init)},
     critics=("critic_r", "critic_c"),
-    heads=(("cost", BINS),),
-    targets=lambda env, rows, cfg: {"cost": rows.cost},
+    heads=lambda cfg: {"cost": BINS if cfg.cost_head == "amount" else CHANCE},
+    targets=lambda env, rows, cfg: {"cost": priced_cost(rows, cfg)},
 )
 
 
@@ -259,12 +274,18 @@ def learn_at_a_price(
     trained: dict[str, PyTree], memory: PyTree, scene: Scene, key: jax.Array
 ) -> Outcome:
     found = learn_reward(trained, memory["range"], scene, key)
-    costs, critic_loss, metrics = learn_cost(trained, found.dreams, scene)
+    costs, critic_loss, metrics = learn_cost(trained, found.dreams, scene, scene.batch.rows.cost)
     bill = scene.dual.lam * scene.gain(found.dreams, costs.advantage)
     return Outcome(found.loss + bill + critic_loss, {"range": found.range}, found.metrics | metrics)
 
 
-billed = priced._replace(learn=learn_at_a_price, memory=blind.memory)
+billed = Behaviour(
+    learn=learn_at_a_price,
+    memory=blind.memory,
+    critics=priced.critics,
+    heads=lambda cfg: {"cost": BINS},
+    targets=lambda env, rows, cfg: {"cost": rows.cost},
+)
 
 
 # ---- rows --------------------------------------------------------------------------------------
@@ -289,13 +310,14 @@ PROPRIO: dict[str, Any] = PAPER | {
     "num_envs": 16, "learn_every": 1, "replay_ratio": 1024, "replay_size": 5_000_000, "size": "1m",
     "learning_starts": 1024, "model_lr": 4e-5, "lr": 4e-5, "critic_lr": 4e-5,
 }  # fmt: skip
-# sacktock/AMBS @5184901: its settings of Safety Gym's vectors, for env.wrap.action_repeat=2; the size
-# is the nearest to its own
+# sacktock/AMBS @5184901: its settings of Safety Gym's vectors, for env.wrap.action_repeat=2
 AMBS: dict[str, Any] = PAPER | {
     "num_envs": 8, "horizon": 128, "learn_every": 2, "stagger": False, "replay_ratio": 64,
     "learning_starts": 1024, "model_lr": 1e-4, "lr": 3e-5, "critic_lr": 3e-5, "dyn_scale": 0.5,
-    "replay_value": 0.0, "limit_ends": True, "actor_grad": "backprop", "size": "12m",
+    "replay_value": 0.0, "limit_ends": True, "actor_grad": "backprop", "size": "small",
 }  # fmt: skip
+# its `medium` networks, for pictures of 64 x 64 alone
+PIXELS: dict[str, Any] = {"encoder": "cnn", "size": "medium"}
 # PKU-Alignment/SafeDreamer @529221f: on vectors, for env.wrap.action_repeat=4, and 5 for osrp; the
 # size is the nearest to its own
 VECTORS: dict[str, Any] = PAPER | {
@@ -322,6 +344,9 @@ LEVER: dict[str, Any] = {
     "cost_discount": 0.5, "model_lr": 3e-3, "lr": 3e-3, "critic_lr": 3e-3, "lr_warmup": 10,
 }  # fmt: skip
 
+# its Dreamer with a Lagrangian: d = 1 in the 500 steps of an episode
+LAGRANGIAN: dict[str, Any] = AMBS | {"cost_limit": 1.5, "mu_least": 1.0, "cost_head": "chance"}
+
 ROWS = {
     "dreamer": Row(
         DreamerConfig,
@@ -336,9 +361,9 @@ ROWS = {
         DreamerLagConfig,
         partial(make, behaviour=priced),
         "Dreamer with an augmented Lagrangian on the cost of its dreams",
-        # d = 1 in the 500 steps of an episode
         {
-            "ambs": AMBS | {"cost_limit": 1.5, "mu_least": 1.0},
+            "ambs": LAGRANGIAN,
+            "pixels": LAGRANGIAN | PIXELS,
             "safe_dreamer": SAFE_DREAMER,
             "cpu": CPU_FORESIGHT,
         },

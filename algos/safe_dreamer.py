@@ -99,11 +99,11 @@ def learn_with_cost_critic(
 ) -> Outcome:
     """As Dreamer, and a critic of what its actor's dreams cost, which the actor does not see."""
     found = dreamer.learn_reward(trained, memory["range"], scene, key)
-    _, loss, metrics = dreamer.learn_cost(trained, found.dreams, scene)
+    _, loss, metrics = dreamer.learn_cost(trained, found.dreams, scene, scene.batch.rows.cost)
     return Outcome(found.loss + loss, {"range": found.range}, found.metrics | metrics)
 
 
-planned = dreamer.blind._replace(heads=dreamer.priced.heads, targets=dreamer.priced.targets)
+planned = dreamer.blind._replace(heads=dreamer.billed.heads, targets=dreamer.billed.targets)
 planned_at_a_price = planned._replace(learn=learn_with_cost_critic, critics=("critic_r", "critic_c"))
 
 
@@ -134,7 +134,7 @@ def scores(
     With a critic of cost it earns R - lam R_c.
     """
     cfg, params = learned.config, learned.params
-    world = world_of(env, behaviour.all_heads, cfg)
+    world = world_of(env, behaviour.all_heads(cfg), cfg)
     shape = (cfg.particles, len(plans))
     start = particles_of(latent, shape)
 

@@ -33,7 +33,8 @@ FIRST, EVERY, DREAMS = 20, 3, 8  # the first start, steps between two, dreams of
 
 
 class Costs(NamedTuple):
-    """Of each depth, what the model predicts and what came: float [depth, S] of S starts."""
+    """Of each depth, what the model predicts and what came, as the model counts cost: float [depth, S]
+    of S starts. With ambs a violation counts `violation_cost`."""
 
     predicted: np.ndarray
     paid: np.ndarray
@@ -44,7 +45,7 @@ def costs_ahead(
 ) -> Costs:
     """Of dreams from steps of whole `episodes`, leaves [N, T, ...]."""
     learned = player.learned
-    world = world_of(player.task, behaviour.all_heads, learned.config)
+    world = world_of(player.task, behaviour.all_heads(learned.config), learned.config)
     count, length = episodes.alive.shape
     starts = jnp.arange(FIRST, length - depth, EVERY)
 
@@ -63,7 +64,8 @@ def costs_ahead(
             return jax.vmap(lambda key: dreamed(episode, start, key))(keys).mean(0)
 
         later = starts[:, None] + 1 + jnp.arange(depth)
-        return jax.vmap(mean)(starts), episode.state.cost[later]
+        paid = behaviour.targets(player.task, episode.state, learned.config)["cost"]
+        return jax.vmap(mean)(starts), paid[later]
 
     found = jax.lax.map(lambda x: of_one(*x), (episodes, jax.random.split(key, count)))
     return Costs(*(np.asarray(x).reshape(-1, depth).T for x in found))

@@ -16,9 +16,9 @@ import jax.numpy as jnp
 
 from jaxsafe.config import ConfigError
 from jaxsafe.learn.acting import Learned
+from jaxsafe.learn.constraints import Costs
 from jaxsafe.learn.learner import GradientStep, Learner
 from jaxsafe.learn.observations import blank, observation_like
-from jaxsafe.learn.replay import Record
 from jaxsafe.learn.sequences import SequenceBatch, drawn_sequences, lambda_returns
 from jaxsafe.learn.steps import Trainable, descend_each, follow
 from jaxsafe.learn.world_model import (
@@ -199,8 +199,8 @@ class Behaviour(NamedTuple):
     """What a method learns in dreams.
 
     actors, critics: their names. The policy acts by `actor`.
-    heads: name -> BINS for a number, CHANCE for a probability: heads of the model besides `reward` and
-        `cont`.
+    heads(cfg) -> {name: BINS for a number, CHANCE for a probability}, heads of the model besides
+        `reward` and `cont`.
     targets(env, rows, cfg) -> {name: float [T, B]}, what these heads learn to say.
     memory(cfg) -> what is remembered besides networks, a pytree.
     learn(trained, memory, scene, key) -> Outcome. `trained` are the actors and critics.
@@ -210,12 +210,11 @@ class Behaviour(NamedTuple):
     memory: Callable[[Any], PyTree]
     actors: tuple[str, ...] = ("actor",)
     critics: tuple[str, ...] = ("critic_r",)
-    heads: tuple[tuple[str, int], ...] = ()
-    targets: Callable[[Env, Record, Any], dict[str, jax.Array]] = lambda env, rows, cfg: {}
+    heads: Callable[[Any], dict[str, int]] = lambda cfg: {}
+    targets: Callable[[Env, Costs, Any], dict[str, jax.Array]] = lambda env, rows, cfg: {}
 
-    @property
-    def all_heads(self) -> dict[str, int]:
-        return {"reward": BINS, "cont": CHANCE, **dict(self.heads)}
+    def all_heads(self, cfg: Any) -> dict[str, int]:
+        return {"reward": BINS, "cont": CHANCE, **self.heads(cfg)}
 
 
 # ---- the policy --------------------------------------------------------------------------------
@@ -232,7 +231,7 @@ def dreaming_policy(env: Env, behaviour: Behaviour) -> Policy:
     """Acts by `actor` in the latent of the present observation."""
 
     def init(learned: Learned) -> Memory:
-        world = world_of(env, behaviour.all_heads, learned.config)
+        world = world_of(env, behaviour.all_heads(learned.config), learned.config)
         start: Any = world.apply({}, method="start")
         return Memory(start, jnp.zeros(env.action_size))
 
@@ -256,7 +255,8 @@ def seen(
     key: jax.Array | None,
 ) -> Latent:
     """The latent of the present observation, the likeliest one where `key` is None."""
-    world, params = world_of(env, behaviour.all_heads, learned.config), learned.params["model"]
+    cfg, params = learned.config, learned.params["model"]
+    world = world_of(env, behaviour.all_heads(cfg), cfg)
     embedded = world.apply(params, obs, method="embed")
     latent: Any = world.apply(params, *carry, embedded, key, method="observe")
     return latent
@@ -294,7 +294,7 @@ def dreaming_learner(env: Env, behaviour: Behaviour, policy: Policy | None = Non
         obs, action = blank(observation_like(env)), jnp.zeros(action_size)
         features = jnp.zeros(size.deter + size.latents * size.classes)
         model_key, actor_key, critic_key = jax.random.split(key, 3)
-        world = world_of(env, behaviour.all_heads, cfg)
+        world = world_of(env, behaviour.all_heads(cfg), cfg)
         params = {"model": world.init(model_key, obs, action, method="everything")}
         for i, name in enumerate(behaviour.actors):
             params[name] = actor_of(env, cfg).init(jax.random.fold_in(actor_key, i), features)
@@ -314,7 +314,7 @@ def dreaming_learner(env: Env, behaviour: Behaviour, policy: Policy | None = Non
     def step(
         nets: Trainable, batch: SequenceBatch, at: GradientStep, cfg: Any, axis_name: str | None
     ) -> tuple[Trainable, Metrics]:
-        world = world_of(env, behaviour.all_heads, cfg)
+        world = world_of(env, behaviour.all_heads(cfg), cfg)
         model_key, dream_key = jax.random.split(at.key)
         targets = {"reward": batch.rows.reward, "cont": goes_on(batch.rows, cfg)}
         targets |= behaviour.targets(env, batch.rows, cfg)

@@ -25,7 +25,10 @@ from jaxsafe.nn.rssm import SIZES, Head, Latent, Size, WorldModel, kl
 from jaxsafe.nn.two_hot import BINS, two_hot_loss, two_hot_mean
 from jaxsafe.types import Env, Metrics, PyTree
 
-SizeName = Literal["tiny", "300k", "500k", "1m", "12m", "25m", "50m", "100m", "200m"]
+SizeName = Literal[
+    "tiny", "300k", "500k", "1m", "12m", "25m", "50m", "100m", "200m",
+    "small", "medium", "large", "xlarge",
+]  # fmt: skip
 CHANCE = 1  # outputs of a head that gives a probability; one that gives a number has BINS
 STD = (0.1, 1.0)  # range of the actor's standard deviation, as in the authors' code
 
@@ -52,6 +55,8 @@ class WorldModelConfig(EncoderConfig, RoundConfig):
     discount: Share = 0.997
     cost_discount: Share = 0.997  # The discount of costs where one is limited, and in evaluations.
     # The networks' size: about the number of parameters, if pictures are observed. The paper's is 200m.
+    # small is 12m, medium 50m, large 100m and xlarge 200m, the nearest to what AMBS's code has by these
+    # names.
     size: SizeName = "300k"
     # What hidden layers are computed in. bfloat16 has 8 bits, and is meant for large networks on a GPU.
     # What it gains there has not been measured.

@@ -47,7 +47,7 @@ def layers_of(depth: int) -> tuple[int, ...]:
 
 # by the number of parameters, about, that they have with a picture for observation. `300k` and, with
 # more latents, `500k` are ours, for CPUs and vectors, and `tiny` is for tests
-SIZES = {
+BY_COUNT = {
     "tiny": Size(32, 16, classes=4, units=16, channels=(8,), latents=4, layers=1, blocks=2),
     "300k": Size(128, 64, classes=8, units=64, channels=layers_of(4), latents=8, layers=2, blocks=4),
     "500k": Size(128, 64, classes=8, units=64, channels=layers_of(4), layers=2, blocks=4),
@@ -58,6 +58,10 @@ SIZES = {
     "100m": Size(6144, 768, classes=48, units=768, channels=layers_of(48)),
     "200m": Size(8192, 1024, classes=64, units=1024, channels=layers_of(64)),
 }
+# the names in Dreamer's first version and in AMBS's code, where they have 18, 37, 77 and 200 million
+# parameters: the size that is nearest by ratio
+NAMED = {"small": "12m", "medium": "50m", "large": "100m", "xlarge": "200m"}
+SIZES = BY_COUNT | {name: BY_COUNT[size] for name, size in NAMED.items()}
 
 
 class Latent(NamedTuple):

@@ -72,9 +72,10 @@ def test_foresight_compares_dreams_with_what_came(trained):
     episodes = jax.vmap(lambda key: play(player, key))(jax.random.split(jax.random.key(0), 3))
     cost = np.asarray(episodes.state.cost)
     found = foresight["costs_ahead"](player, ambs.shielded_behaviour, episodes, 4, jax.random.key(1))
+    counted = 10.0 * (cost > 0)  # as violation_cost
     starts = np.arange(20, cost.shape[1] - 4, 3)
     for k in range(4):
-        np.testing.assert_array_equal(found.paid[k].reshape(3, -1), cost[:, starts + k + 1])
+        np.testing.assert_array_equal(found.paid[k].reshape(3, -1), counted[:, starts + k + 1])
     assert found.predicted.shape == found.paid.shape and np.isfinite(found.predicted).all()
 
 

@@ -41,17 +41,14 @@ def test_a_command_of_ambs_keeps_task_seed_frames_and_penalty():
 def test_a_command_of_ambs_sees_what_its_configs_say():
     """Pictures of 64 x 64 and nothing else, or vectors."""
     settings = compose(ambs(AMBS).argv)
-    assert (settings.algo.encoder, settings.algo.size, settings.algo.replay_ratio) == (
-        "cnn",
-        "100m",
-        512,
-    )
+    cfg = settings.algo
+    assert (cfg.encoder, cfg.size, cfg.replay_ratio) == ("cnn", "large", 512)
     seen = observation_like(make_env(settings))
     assert seen["vision"].shape == (64, 64, 3) and seen["vector"].shape == (0,)
     for configs, lost in (("safetygym", []), ("safetygym_lambda", ["configs"])):
         vectors = ambs(AMBS.replace("safetygym_vision large", configs))
         cfg = compose(vectors.argv).algo
-        assert (cfg.encoder, cfg.size, cfg.replay_ratio) == ("none", "12m", 64)
+        assert (cfg.encoder, cfg.size, cfg.replay_ratio) == ("none", "small", 64)
         assert [line.key for line in vectors.lines if line.lost] == lost
 
 

@@ -391,7 +391,7 @@ def test_without_a_weight_the_task_s_actor_learns_what_dreamer_s_does(actor_grad
     program, which adds up in another order."""
     (_, learned), env, key = newborn(), Corridor(), jax.random.key(1)
     options: dict[str, Any] = {"actor_grad": actor_grad, "penalty": "penl", "imagine_steps": 3}
-    world = world_of(env, ambs.shielded_behaviour.all_heads, learned.config)
+    world = world_of(env, ambs.shielded_behaviour.all_heads(learned.config), learned.config)
     start: Any = world.apply({}, method="start")
     no, reward = jnp.zeros((4, 2), bool), jax.random.normal(key, (4, 2))
     zeros = jnp.zeros((4, 2, 4))

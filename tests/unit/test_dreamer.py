@@ -12,8 +12,11 @@ from toys import Corridor
 from jaxsafe.algos import ALGOS, dreamer
 from jaxsafe.learn.dreaming import Judged, Scene, no_range
 from jaxsafe.learn.treatments import CappedPID
+from jaxsafe.learn.world_model import CHANCE
+from jaxsafe.nn.two_hot import BINS
 
 CFG = dreamer.DreamerLagConfig(mu_least=1.0, cost_limit=3.0)
+BATCH: Any = SimpleNamespace(rows=SimpleNamespace(cost=jnp.full((3, 2), 2.0)))
 
 
 class Averaging(Scene):
@@ -80,6 +83,21 @@ def test_the_preset_of_ambs_has_the_numbers_of_its_lagrangian():
     numbers = (cfg.mu_growth, cfg.mu_least, cfg.cost_discount, cfg.td_lambda, cfg.replay_value)
     assert numbers == (1e-6, 1.0, 0.997, 0.95, 0.0)
     assert (cfg.actor_grad, cfg.limit_ends, cfg.overshoot) == ("backprop", True, 0)
+    assert row.config(**row.published["pixels"]) == dataclasses.replace(
+        cfg, encoder="cnn", size="medium"
+    )
+
+
+def test_the_model_says_what_a_step_costs_or_with_ambs_preset_how_likely_it_costs():
+    row = ALGOS["dreamer_lag"]
+    rows: Any = SimpleNamespace(cost=jnp.array([0.0, 0.5, 2.0]))
+    for cfg, outputs, target in (
+        (row.config(), BINS, [0.0, 0.5, 2.0]),
+        (row.config(**row.published["ambs"]), CHANCE, [0.0, 1.0, 1.0]),
+    ):
+        assert dreamer.priced.all_heads(cfg) == {"reward": BINS, "cont": CHANCE, "cost": outputs}
+        told = dreamer.priced.targets(Corridor(), rows, cfg)
+        np.testing.assert_array_equal(told["cost"], target)
 
 
 def test_the_multiplier_s_actor_pays_for_its_dreams_and_the_multiplier_moves_by_their_mean(monkeypatch):
@@ -90,16 +108,22 @@ def test_the_multiplier_s_actor_pays_for_its_dreams_and_the_multiplier_moves_by_
     weight = jnp.array([[1.0, 1.0], [0.5, 0.5], [0.25, 0.25]])
     dual = dreamer.Augmented(jnp.float32(0.5), jnp.float32(2.0))
     cfg = dataclasses.replace(CFG, cost_limit=0.75, cost_discount=0.95)  # of 20 steps: d = 0.75
+    paid_to_critic: list[jax.Array] = []
 
     def outcome(actor_grad: str, log_prob: jax.Array, returns: jax.Array) -> Any:
         dreams: Any = SimpleNamespace(weight=weight, log_prob=log_prob)
         wishes = dreamer.Wishes(dreams, no_range(), jnp.float32(7), {})
-        unused: Any = [None] * 4
         of = dataclasses.replace(cfg, actor_grad=actor_grad)
-        scene = Averaging(Corridor(), *unused, dual=(), cfg=of, axis_name=None)
+        nothing: Any = None
+        scene = Averaging(Corridor(), nothing, nothing, BATCH, nothing, (), of, None)
         monkeypatch.setattr(dreamer, "learn_reward", lambda *args: wishes)
         found = Judged(returns, value), jnp.float32(2), {}
-        monkeypatch.setattr(dreamer, "learn_cost", lambda *args: found)
+
+        def learn_cost(trained, dreams, scene, cost):
+            paid_to_critic.append(cost)
+            return found
+
+        monkeypatch.setattr(dreamer, "learn_cost", learn_cost)
         memory = {"range": no_range(), "dual": dual}
         return dreamer.learn_priced({}, memory, scene, jax.random.key(0))
 
@@ -118,8 +142,11 @@ def test_the_multiplier_s_actor_pays_for_its_dreams_and_the_multiplier_moves_by_
     np.testing.assert_allclose(loss("reinforce", log_prob, returns), expected, rtol=1e-5)
     slopes = jax.grad(loss, argnums=(1, 2))("reinforce", log_prob, returns)
     np.testing.assert_allclose(slopes, [beyond / 4, jnp.zeros((2, 2))], rtol=1e-5)
+    assert (paid_to_critic[-1] == 2).all()
+    cfg = dataclasses.replace(cfg, cost_head="chance")
     after = outcome("backprop", log_prob, returns).memory["dual"]  # R - d is 1 on average
     np.testing.assert_allclose(after, (0.5 + 2 * 1.0, 2 * (1 + 1e-6)), rtol=1e-5)
+    assert (paid_to_critic[-1] == 1).all()
 
 
 def test_at_a_price_the_actor_pays_for_what_its_dreams_cost_beyond_the_mean(monkeypatch):
@@ -134,8 +161,8 @@ def test_at_a_price_the_actor_pays_for_what_its_dreams_cost_beyond_the_mean(monk
         wishes = dreamer.Wishes(dreams, no_range(), jnp.float32(7), metrics)
         cfg = SimpleNamespace(actor_grad=actor_grad)
         price = CappedPID(*(jnp.float32(x) for x in (0.5, 0, 0)))
-        unused: Any = [None] * 5
-        scene = Averaging(*unused, dual=price, cfg=cfg, axis_name=None)
+        nothing: Any = None
+        scene = Averaging(nothing, nothing, nothing, BATCH, nothing, price, cfg, None)
         monkeypatch.setattr(dreamer, "learn_reward", lambda *args: wishes)
         found = Judged(returns, value), jnp.float32(2), {"b": 2}
         monkeypatch.setattr(dreamer, "learn_cost", lambda *args: found)

@@ -3,7 +3,7 @@
 import dataclasses
 from functools import cache, partial
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, get_args
 
 import jax
 import jax.numpy as jnp
@@ -415,7 +415,7 @@ def test_a_gradient_step_gives_each_head_of_the_model_the_target_of_its_row(monk
     nets = learner.init(jax.random.key(0), 3, 1, cfg)
     at = GradientStep(jnp.int32(0), jnp.float32(1), jax.random.key(1))
     _, metrics = learner.step(nets, SequenceBatch(known, jnp.full(3, 1 / 3)), at, cfg, None)
-    heads = [f"train/model_{name}_loss" for name in behaviour.all_heads]
+    heads = [f"train/model_{name}_loss" for name in behaviour.all_heads(cfg)]
     found = jnp.stack([metrics[name] for name in ("worst", *heads)])
     np.testing.assert_allclose(found, 0, atol=1e-6)
 
@@ -444,7 +444,7 @@ def test_the_policy_remembers_what_the_model_learns_from():
 
     rows, acted = both(ts.stepping, jax.random.split(jax.random.key(1), 16))
     assert rows.first[1:].any()
-    world = world_model.world_of(env, dreamer.blind.all_heads, cfg)
+    world = world_model.world_of(env, dreamer.blind.all_heads(cfg), cfg)
     latents = world_model.filtered(world, learned.params["model"], rows, None)
     np.testing.assert_allclose(acted.features, latents.features, atol=1e-5)
     late = rows.replace(action=jnp.roll(rows.action, 1, axis=0))
@@ -456,7 +456,7 @@ def test_the_policy_remembers_what_the_model_learns_from():
 def tiny() -> tuple[rssm.WorldModel, Any]:
     """The smallest model of Ticker, and its parameters."""
     cfg = dreamer.DreamerConfig(size="tiny")
-    world = world_model.world_of(Ticker(), dreamer.blind.all_heads, cfg)
+    world = world_model.world_of(Ticker(), dreamer.blind.all_heads(cfg), cfg)
     init = jax.jit(partial(world.init, method="everything"), compiler_options=FAST)
     return world, init(jax.random.key(0), jnp.zeros(3), jnp.zeros(1))
 
@@ -607,7 +607,7 @@ def test_a_task_without_failures_is_foreseen_to_go_on_beyond_its_time_limit():
     # without actor and critics, of which the model learns nothing
     model_alone = Behaviour(idle, lambda cfg: (), actors=(), critics=())
     learner = dreaming_learner(env, model_alone)
-    world = world_model.world_of(env, model_alone.all_heads, cfg)
+    world = world_model.world_of(env, model_alone.all_heads(cfg), cfg)
     init = jax.jit(lambda key: learner.init(key, env.obs_size, env.action_size, cfg))
 
     @jax.jit
@@ -629,6 +629,11 @@ def test_a_task_without_failures_is_foreseen_to_go_on_beyond_its_time_limit():
 
     assert learned_from(rows) > 0.9995
     assert learned_from(fails) < 0.9
+
+
+def test_settings_take_every_size_by_its_name():
+    assert get_args(world_model.SizeName) == tuple(rssm.SIZES)
+    assert rssm.SIZES["medium"] is rssm.SIZES["50m"]
 
 
 def test_hidden_layers_in_bfloat16_change_a_loss_and_its_gradient_little():

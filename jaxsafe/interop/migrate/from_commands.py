@@ -17,11 +17,10 @@ from typing import Any, NamedTuple
 from jaxsafe import envs
 from jaxsafe.config import ConfigError, Seed, convert, nearest
 from jaxsafe.interop.migrate.found import Line, Migrated, as_option
+from jaxsafe.nn.rssm import NAMED
 from jaxsafe.run.settings import nested, settings_from_options
 
 AMBS_REPEAT = 2  # raw steps in a step, of AMBS's safetygym configs
-# the networks of AMBS, and ours of about as many parameters
-AMBS_SIZES = {"small": "12m", "medium": "50m", "large": "100m", "xlarge": "200m"}
 PICTURES: dict[str, Any] = {  # AMBS's safetygym_vision, which sees nothing else
     "env.observe_vision": True, "env.vision_size": [64, 64], "algo.encoder": "cnn",
     "algo.replay_ratio": 512,
@@ -58,7 +57,7 @@ def ambs_steps(value: Any) -> dict[str, Any]:
 def ambs_configs(value: Any) -> dict[str, Any]:
     names = str(value).split()
     seen = PICTURES if "safetygym_vision" in names else {}
-    size = next((ours for theirs, ours in AMBS_SIZES.items() if theirs in names), None)
+    size = next((size for size in NAMED if size in names), None)
     return seen | ({"algo.size": size} if size else {})
 
 
@@ -86,7 +85,7 @@ AMBS: dict[str, Flag] = {
     "run.steps": Flag(ambs_steps),
     "envs.amount": Flag(lambda value: {"num_envs": value}),
     "logdir": Flag(note="run_dir names a run's folder", lost=never),
-    "configs": Flag(ambs_configs, "vectors, and size=12m", lambda value: value != "safetygym"),
+    "configs": Flag(ambs_configs, "vectors, and size=small", lambda value: value != "safetygym"),
     "penalty_coeff": Flag(lambda value: {"algo.penalty_coef": value}),
     "plpg": Flag(lambda value: {"preset": "plpg"} if value else {}, "off", lost=never),
     "copt": Flag(lambda value: {"preset": "copt"} if value else {}, "off", lost=never),
