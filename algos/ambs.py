@@ -29,13 +29,14 @@ from jaxsafe.learn.dreaming import (
     seen,
 )
 from jaxsafe.learn.off_policy import off_policy
-from jaxsafe.learn.row import Row
+from jaxsafe.learn.row import Examined, Row
 from jaxsafe.learn.world_model import CHANCE, dream_returns, read, value_of, world_of
 from jaxsafe.nn.rssm import Latent
 from jaxsafe.nn.two_hot import BINS
 from jaxsafe.types import Algorithm, Env, Metrics, Policy, PyTree, State
 
 MOST_ROLLOUTS = 2**16  # beyond that 32 bits do not tell the exact bound
+PARTS = 10  # of [0, 1], by which the risk is compared with what came
 ROUNDING = 1e-5  # a sum of costs that is above a bound by less is at the bound
 
 
@@ -408,7 +409,11 @@ def shielded(env: Env, policy: Policy) -> Policy:
 
 def make(env: Env, axis_name: str | None = None) -> Algorithm:
     policy = shielded(env, dreaming_policy(env, shielded_behaviour))
-    return off_policy(env, dreaming_learner(env, shielded_behaviour, policy), axis_name=axis_name)
+    learner = dreaming_learner(env, shielded_behaviour, policy)
+    counted = learner._replace(
+        counted=lambda env, steps, cfg: {"violations": violated(env, steps, cfg)}
+    )
+    return off_policy(env, counted, axis_name=axis_name)
 
 
 # ---- what is guaranteed ------------------------------------------------------------------------
@@ -536,9 +541,9 @@ def course(player: Player, key: jax.Array, sampled: bool) -> Course:
     return jax.lax.scan(step, player.start(reset_key), jnp.arange(env.episode_length))[1]
 
 
-def brier_score(found: Course, horizon: int) -> jax.Array:
-    """The mean of (p_t - e_t)^2, float []: e_t is 1 if one of the next `horizon` steps had a violation.
-    Steps whose episode ran out of time before that was known do not count; NaN if none counts."""
+def came_true(found: Course, horizon: int) -> tuple[jax.Array, jax.Array]:
+    """Of each step whether one of the next `horizon` steps had a violation, and whether that is known,
+    bool [T] each. It is not where the episode ran out of time before."""
 
     def backward(
         later: tuple[jax.Array, jax.Array], x: tuple[jax.Array, ...]
@@ -553,16 +558,38 @@ def brier_score(found: Course, horizon: int) -> jax.Array:
     series = (found.violation, found.failed, found.alive)
     until, known = jax.lax.scan(backward, start, series, reverse=True)[1]
     happened = until <= horizon
-    counts = found.alive & (happened | (known >= horizon))
+    return happened, found.alive & (happened | (known >= horizon))
+
+
+def brier_score(found: Course, horizon: int) -> jax.Array:
+    """The mean of (p_t - e_t)^2 over steps of which e_t is known, float []; NaN if there are none.
+
+    e_t is 1 if one of the next `horizon` steps had a violation, and 0 if none had.
+    """
+    happened, counts = came_true(found, horizon)
     total = jnp.where(counts, (found.risk - happened) ** 2, 0.0).sum()
     return jnp.where(counts.any(), total / jnp.maximum(counts.sum(), 1), jnp.nan)
 
 
-def examine(algo: Algorithm, learned: PyTree, keys: jax.Array, sampled: bool) -> dict[str, np.ndarray]:
-    """What the shield does, and what episodes are without it: float [S, N] by name, of the episodes of
-    `keys` [S, N], by the S policies in `learned`, with mean or with `sampled` actions.
+def calibration(found: Course, horizon: int) -> jax.Array:
+    """Of the steps with p in each of `PARTS` equal parts of [0, 1], float [3, PARTS]: how many there
+    are, the sum of their p, and how many had a violation within `horizon` steps.
 
-    The Brier score is always of sampled actions without the shield: the shield dreams of those.
+    Only steps of which that is known count.
+    """
+    happened, counts = came_true(found, horizon)
+    part = jnp.minimum((found.risk * PARTS).astype(int), PARTS - 1)
+    summed = counts * jnp.stack([jnp.ones_like(found.risk), found.risk, 1.0 * happened])  # [3, T]
+    return summed @ jax.nn.one_hot(part, PARTS)
+
+
+def examine(algo: Algorithm, learned: PyTree, keys: jax.Array, sampled: bool) -> Examined:
+    """What the shield does, and what episodes are without it, in the episodes of `keys` [S, N].
+
+    They are those of the S policies in `learned`, with mean or with `sampled` actions.
+
+    The Brier score and the calibration are always of sampled actions without the shield: the shield
+    dreams of those.
     """
     horizon = learned.config.shield_horizon
     delta, never = learned.config.delta, jnp.full_like(learned.config.delta, jnp.inf)
@@ -579,6 +606,7 @@ def examine(algo: Algorithm, learned: PyTree, keys: jax.Array, sampled: bool) ->
             "violations": found.violation.sum(1).astype(jnp.float32),
             "return": found.reward.sum(1),
             "Brier score": jax.vmap(lambda x: brier_score(x, horizon))(found),
+            "calibration": jax.vmap(lambda x: calibration(x, horizon))(found),
         }
 
     def play(delta: jax.Array, sampled: bool) -> dict[str, np.ndarray]:
@@ -588,13 +616,14 @@ def examine(algo: Algorithm, learned: PyTree, keys: jax.Array, sampled: bool) ->
     programs = {x: jax.jit(jax.vmap(partial(of_one, sampled=x))) for x in (False, True)}
     shielded, bare = play(delta, sampled), play(never, sampled)
     drawn = bare if sampled else play(never, True)
-    return {
+    measures = {
         "override rate": shielded["override rate"],
         "violations": shielded["violations"],
         "violations, no shield": bare["violations"],
         "return, no shield": bare["return"],
         "Brier score": drawn["Brier score"],
     }
+    return Examined(measures, drawn["calibration"].sum(1))
 
 
 # ---- rows --------------------------------------------------------------------------------------

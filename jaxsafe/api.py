@@ -401,7 +401,8 @@ def evaluate(
         episode), 'violation rate' (the share of episodes over the limit), 'episode length' (steps), in
         Safety Gym 'goals' (reached in an episode), 'cost rate (training)' (cost a step) and, where
         known, Safety Gym's normalised scores;
-        `scores.seeds` has the mean of each seed.
+        `scores.seeds` has the mean of each seed; `scores.calibration`, of a policy under a shield, how
+        often its risk came true.
 
     Raises:
         ConfigError: no run folder, no checkpoint yet, no such setting, or episodes < 1.

@@ -7,11 +7,12 @@ import jax
 import jax.numpy as jnp
 
 from jaxsafe.learn.acting import Learned
+from jaxsafe.learn.constraints import Costs
 from jaxsafe.learn.next_step_rollout import Stepping, arrival_record
 from jaxsafe.learn.normalise import network_inputs
 from jaxsafe.learn.replay import Record, Source, Transitions, draw, transitions, usable
 from jaxsafe.learn.steps import Trainable
-from jaxsafe.types import Metrics, Policy, PyTree, Shared
+from jaxsafe.types import Env, Metrics, Policy, PyTree, Shared
 
 
 class GradientStep(NamedTuple):
@@ -72,6 +73,7 @@ class Learner(NamedTuple):
     record(cfg) -> what makes a row of the replay: (stepping, action [N, A]) -> Record.
     replayed(key, source, cfg, axis_name) -> (batch, number dropped), what a gradient step draws from a
         replay.
+    counted(env, steps [T, N], cfg) -> {name: bool [T, N]}, real steps that metrics count.
     """
 
     init: Callable[[jax.Array, int, int, Any], Trainable]
@@ -88,6 +90,7 @@ class Learner(NamedTuple):
     replayed: Callable[[jax.Array, Source, Any, str | None], tuple[PyTree, jax.Array]] = (
         drawn_transitions
     )
+    counted: Callable[[Env, Costs, Any], dict[str, jax.Array]] = lambda env, steps, cfg: {}
 
 
 def policy_by(learner: Learner) -> Policy:

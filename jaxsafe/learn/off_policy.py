@@ -173,11 +173,13 @@ def off_policy(
         )
         ts, paid = pay(ts, steps, length, shared)
         names = treatment.constrained_costs(ts.config)
+        counted = learner.counted(env, steps, ts.config)
         metrics = united(
             means_of_gradient_steps(rounds.metrics, rounds.learned),
             {"train/nonfinite": rounds.skipped.sum()},
             paid,
             metrics_of_steps(env, steps, length, names, axis_name),
+            {f"train/{k}": psum((x & steps.real).sum(), axis_name) for k, x in counted.items()},
             refitted,
         )
         return dataclasses.replace(ts, lost_time=lost_time, key=key), metrics

@@ -12,6 +12,18 @@ from jaxsafe.types import Algorithm, Env, PyTree
 NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
+class Examined(NamedTuple):
+    """What evaluation measures beside returns and costs, of N episodes by each of S policies.
+
+    measures: float [S, N] by name.
+    calibration: of steps with a foreseen probability in each of equal parts of [0, 1], float [S, 3,
+        parts]: how many, the sum of the probabilities, and how often it came true; or nothing.
+    """
+
+    measures: Mapping[str, np.ndarray] = NOTHING
+    calibration: np.ndarray | None = None
+
+
 class Row(NamedTuple):
     """An algorithm. Command line, contract tests, tables, pages and migration are made from its row.
 
@@ -28,9 +40,8 @@ class Row(NamedTuple):
     lever: options with which it learns Lever, the small exact problem of tests/toys.py, if its
         defaults do not.
     note: note(cfg), a line to print before training: what its settings promise; '' for nothing.
-    examine: examine(algo, learned, keys, sampled), what else evaluation measures: name -> float [S, N],
-        of the episodes of `keys` [S, N], by the S policies in `learned`, with mean or with `sampled`
-        actions.
+    examine: examine(algo, learned, keys, sampled) -> Examined, what else evaluation measures in the
+        episodes of `keys` [S, N], by the S policies in `learned`, with mean or with `sampled` actions.
     check: check(cfg, env, data) raises ConfigError for settings, or a data set, that cannot serve.
         `data` is () where there is none.
     """
@@ -45,4 +56,4 @@ class Row(NamedTuple):
     lever: Mapping[str, Any] = NOTHING
     check: Callable[[Any, Env, Any], None] = lambda cfg, env, data: None
     note: Callable[[Any], str] = lambda cfg: ""
-    examine: Callable[[Algorithm, PyTree, jax.Array, bool], dict[str, np.ndarray]] = lambda *_: {}
+    examine: Callable[[Algorithm, PyTree, jax.Array, bool], Examined] = lambda *_: Examined()

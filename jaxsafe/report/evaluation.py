@@ -25,6 +25,7 @@ class Scores(NamedTuple):
     episodes: int  # of all its seeds
     rows: dict[str, Estimate]
     seeds: dict[str, list[float]]  # the mean over the episodes of each
+    calibration: dict[str, list[float]]  # of a shield's risk, empty without one: see `calibrated`
 
     def __str__(self) -> str:
         return table(self.rows)
@@ -49,14 +50,33 @@ def evaluate(
         of_setting = Episodes(*(x[i * seeds : (i + 1) * seeds] for x in episodes))
         limits, metrics = limits_of(member.config), tables[i] if i < len(tables) else {}
         found = measures(of_setting, cost_names, limits)
-        found |= {name: x[i * seeds : (i + 1) * seeds] for name, x in examined.items()}
+        found |= {name: x[i * seeds : (i + 1) * seeds] for name, x in examined.measures.items()}
+        counts = examined.calibration
+        of_risk = {} if counts is None else calibrated(counts[i * seeds : (i + 1) * seeds].sum(0))
         rows = summary(settings.env_name, found, float(member.config.cost_limit), metrics)
         if settings.train.dataset is not None:
             rows |= dsrl_scores(settings.env_name, rows, float(member.config.cost_limit))
             rows |= of_data(data, float(member.config.cost_limit))
         by_seed = {name: values.mean(1).tolist() for name, values in found.items()}
-        by_setting.append(Scores(member.setting, limits, of_setting.ret.size, rows, by_seed))
+        size = of_setting.ret.size
+        by_setting.append(Scores(member.setting, limits, size, rows, by_seed, of_risk))
     return by_setting
+
+
+def calibrated(counts: np.ndarray) -> dict[str, list[float]]:
+    """How often a foreseen probability came true, from `counts` [3, parts] of `Row.examine`.
+
+    Of each part of [0, 1] that has any: `steps`, how many; `risk`, the mean probability; `violated`,
+    the share that came true. Empty if no part has.
+    """
+    steps, risk, violated = counts[:, counts[0] > 0].astype(float)
+    if not len(steps):
+        return {}
+    return {
+        "steps": steps.tolist(),
+        "risk": (risk / steps).tolist(),
+        "violated": (violated / steps).tolist(),
+    }
 
 
 def summary(

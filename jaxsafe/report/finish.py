@@ -1,4 +1,4 @@
-"""What follows training in a run folder: curves, the evaluation's file and a film."""
+"""What follows training in a run folder: curves, the evaluation's file and picture, and a film."""
 
 import functools
 import json
@@ -34,17 +34,22 @@ def finish(session: Session, report: Reporter, stop: Interrupts) -> None:
 
     def scores() -> None:
         found = evaluation.evaluate(run(), train.eval_episodes, train.seed, session.program.data)
+        risks = {s.name: s.calibration for s in found if s.calibration}
         tables = {s.name: evaluation.as_json(s.rows) | {"seeds": s.seeds} for s in found}
+        for name, risk in risks.items():
+            tables[name]["calibration"] = risk
         text = json.dumps({"episodes": train.eval_episodes, **tables.get("", tables)}, indent=1)
         files.write(folder / "evaluation.json", text)
-        for name, limits, episodes, rows, _ in found:
-            ret, cost, rate = rows["return"], rows["cost"], rows["violation rate"]
+        for s in found:
+            ret, cost, rate = s.rows["return"], s.rows["cost"], s.rows["violation rate"]
             report.line(
-                f"final policy{name and ', ' + name}: return {ret.mean:.4g} [{ret.low:.4g}, "
+                f"final policy{s.name and ', ' + s.name}: return {ret.mean:.4g} [{ret.low:.4g}, "
                 f"{ret.high:.4g}], cost {cost.mean:.4g} [{cost.low:.4g}, {cost.high:.4g}] "
-                f"(limit {limits_in_words(limits)}), "
-                f"{100 * rate.mean:.0f}% of {episodes} episodes over it"
+                f"(limit {limits_in_words(s.limits)}), "
+                f"{100 * rate.mean:.0f}% of {s.episodes} episodes over it"
             )
+        if risks:
+            plots.calibration(risks, folder / "calibration.png", title)
 
     def video() -> None:
         film([run().one(0)], folder / "video.mp4", train.seed)

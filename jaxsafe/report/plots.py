@@ -92,6 +92,25 @@ def curves(
     write(figure, path, dpi=120)
 
 
+def calibration(risks: Mapping[str, Mapping[str, Sequence[float]]], path: Path, title: str) -> None:
+    """Write the PNG: how often the risk that a shield saw came true, a line a setting, and below it how
+    many steps had such a risk."""
+    figure = Figure(figsize=(5, 5), layout="constrained")
+    FigureCanvasAgg(figure)
+    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
+    above.axline((0, 0), slope=1, color="0.6", lw=1, ls="--", label="as foreseen")
+    for i, (name, of) in enumerate(risks.items()):
+        look = {"marker": "o", "color": f"C{i % 10}"}
+        above.plot(of["risk"], of["violated"], label=name or "without the shield", **look)
+        below.plot(of["risk"], of["steps"], ls="", **look)
+    above.set(ylabel="share with a violation", xlim=(-0.03, 1.03), ylim=(-0.03, 1.03))
+    below.set(xlabel="risk that the shield saw", ylabel="steps", yscale="log")
+    below.yaxis.set_major_formatter(EngFormatter(sep=""))
+    above.legend(frameon=False, fontsize="small")
+    figure.suptitle(title)
+    write(figure, path, dpi=120)
+
+
 def drawn_of(table: Mapping[str, np.ndarray], name: str) -> tuple[str, bool]:
     """The column to draw for a metric: its estimate, and True, where no episode has ended yet."""
     other = run_folder.estimate_of(name)

@@ -46,6 +46,7 @@ SPAN = 20  # iterations over which costs are averaged before their swing is take
 CHUNK = 8  # settings in one figure of curves
 HIGH = 4  # tasks in one figure of curves
 FEW = 3  # options of a run that are all in its name
+STAGES = 4  # of training, after which costs are summed
 MOST = 24  # settings of one task whose points can be told apart in one panel
 PAGE = """# {title}
 
@@ -288,8 +289,8 @@ def write_page(study: Study) -> None:
 def page(study: Study) -> tuple[str, list[Picture]]:
     """The text of README.md, and the figures that it shows.
 
-    Tables stand between marks. A README.md that is there keeps its own words around them; without one,
-    `about` is all that the page says.
+    Tables stand between marks, as `<!-- measured: so far -->` and `<!-- end -->`. A README.md that is
+    there keeps its own words around them; without one, `about` is all that the page says.
     """
     path = study.folder / "README.md"
     text = (
@@ -307,6 +308,7 @@ def page(study: Study) -> tuple[str, list[Picture]]:
     makers: dict[str, Callable[[], str]] = {
         "figures": lambda: "\n\n".join(shown),
         "matrix": lambda: matrices(groups, known),
+        "so far": lambda: costs_so_far(groups),
         "runs": lambda: run_table(study, runs, known),
     }
     made = {name: make() for name, make in makers.items() if f"<!-- measured: {name} -->" in text}
@@ -470,6 +472,50 @@ def matrix(groups: Sequence[Group], known: Mapping[tuple[str, str], Published]) 
             cells.append("<br>".join(cell))
         lines.append(f"| `{name}` | {' | '.join(cells)} |")
     return "\n".join(lines)
+
+
+def costs_so_far(groups: Sequence[Group]) -> str:
+    """What training has cost in all after each of `STAGES` equal parts of the longest run.
+
+    A cell has the mean over seeds, and the least and the most.
+    """
+    found = []
+    for env in tasks_of(groups):
+        shown = [g for g in groups if g.env == env and g.runs[0].clock == "steps"]
+        if not shown:
+            continue
+        end = max(float(run.config["total_steps"]) for g in shown for run in g.runs)
+        stages = np.linspace(0, end, STAGES + 1)[1:]
+        found += [
+            f"| `{env}`, steps | {' | '.join(f'{step:,.0f}' for step in stages)} |",
+            "|---|" + "---:|" * STAGES,
+        ]
+        for g in shown:
+            sums = np.concatenate([cost_so_far(run, stages) for run in g.runs])  # [S, STAGES]
+            cells = [
+                f"{x.mean():,.0f} ({x.min():,.0f} to {x.max():,.0f})" if np.isfinite(x).all() else ""
+                for x in sums.T
+            ]
+            found.append(f"| `{g.name}` | {' | '.join(cells)} |")
+        found.append("")
+    return "\n".join(found).rstrip()
+
+
+def cost_so_far(run: SettingRun, steps: np.ndarray) -> np.ndarray:
+    """The summed cost of each seed after so many `steps` [T], [S, T]; NaN beyond its end.
+
+    A cost rate is of the policy's steps. Where an action is repeated, these are fewer.
+    """
+    found = np.full((len(run.seeds), len(steps)), np.nan)
+    for row, seed in zip(found, run.seeds, strict=True):
+        of_seed = run.table["seed"] == seed
+        at, rate = run.table["steps"][of_seed], run.table["train/cost_rate"][of_seed]
+        taken = np.diff(at, prepend=0) / run.config.get("env.wrap.action_repeat", 1)
+        sums = np.cumsum(np.nan_to_num(rate) * taken)
+        # the last iteration may end some steps before or after the round number of a run
+        reached = steps <= 1.01 * at.max()
+        row[reached] = np.interp(steps[reached], np.append(0, at), np.append(0, sums))
+    return found
 
 
 def run_table(

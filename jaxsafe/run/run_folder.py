@@ -7,7 +7,7 @@ metrics.csv     a row for each iteration and seed, or metrics.csv.xz. A cell wit
 tensorboard/    the same for TensorBoard, a folder for each seed (and setting)
 checkpoints/    train states, to resume from: see jaxsafe.run.checkpoint
 policy/         the policies alone: all that evaluation, films and init_from read
-curves.png, video.mp4, evaluation.json   written at the end
+curves.png, video.mp4, evaluation.json   written at the end; calibration.png of a shield
 """
 
 import csv

@@ -61,6 +61,9 @@ def test_evaluation_says_what_the_shield_does_and_a_film_has_where(trained):
     found = json.loads((trained / "evaluation.json").read_text())
     assert 0 <= found["override rate"]["mean"] <= 1 and found["violations"]["mean"] >= 0
     assert {"violations, no shield", "return, no shield", "Brier score"} <= found.keys()
+    assert {len(x) for x in found["calibration"].values()} != {0}
+    assert (trained / "calibration.png").exists()
+    assert "train/violations" in run_folder.read_metrics(trained)
     run = open_run(trained, (TOY,))
     states, said = render.run_episode(run.one(0).player, jax.random.key(0), 20)
     assert np.isfinite(states.obs).all() and said["overruled"].shape == (20,)

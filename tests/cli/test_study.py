@@ -181,6 +181,22 @@ def test_evaluated_policies_stand_beside_published_ones_and_training_apart(toy, 
     assert studies.matrices(groups, known) == studies.matrix(groups, {})
 
 
+def test_what_training_has_cost_is_told_along_the_way(toy, tmp_path):
+    """Every step of the policy costs 0.1, for 4,000 and for 2,000 steps of the environment."""
+    for i, (repeat, steps) in enumerate(((1, 4000), (2, 2000))):
+        trained(tmp_path / str(i), toy.command(toy.runs[i]), steps=steps)
+        (run,) = read_one(tmp_path / str(i))
+        run.config["env.wrap.action_repeat"] = repeat
+        studies.add(toy, toy.runs[i], run, studies.origin_of(tmp_path / str(i)))
+    found = studies.costs_so_far(studies.in_order(toy, read([toy.folder])))
+    header, _, whole, half = found.splitlines()
+    assert header == "| `point_goal1`, steps | 1,000 | 2,000 | 3,000 | 4,000 |"
+    told = ["100 (100 to 100)", "200 (200 to 200)", "300 (300 to 300)", "400 (400 to 400)"]
+    assert [cell.strip() for cell in whole.split("|")[2:-1]] == told
+    told = ["50 (50 to 50)", "100 (100 to 100)", "", ""]
+    assert [cell.strip() for cell in half.split("|")[2:-1]] == told
+
+
 def test_a_setting_is_called_by_the_few_options_that_its_run_sets(toy, tmp_path):
     """Even where another algorithm tells it apart. A length that all have is not named, nor what is
     set as it is anyway."""

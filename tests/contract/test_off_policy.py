@@ -17,9 +17,11 @@ from two_devices import agree, on_two_devices, split
 from jaxsafe.algos import ALGOS
 from jaxsafe.config import ConfigError
 from jaxsafe.learn.acting import Player
+from jaxsafe.learn.learner import Learner
 from jaxsafe.learn.models import EnsembleConfig
 from jaxsafe.learn.next_step_rollout import collect_records
-from jaxsafe.learn.off_policy import OffPolicyConfig
+from jaxsafe.learn.off_policy import OffPolicyConfig, off_policy
+from jaxsafe.learn.steps import Trainable
 from jaxsafe.learn.timetable import ReplayConfig, timetable_of
 from jaxsafe.types import Env, State
 
@@ -507,3 +509,17 @@ def test_learning_goes_on_after_any_number_of_gradient_steps(name):
     assert metrics["train/nonfinite"] == 0
     moved = jax.tree.map(lambda a, b: bool((a != b).any()), before, ts.params)
     assert all(jax.tree.leaves(moved))
+
+
+def test_a_learner_counts_real_steps_and_no_resets():
+    """In episodes of 4 steps a fifth row is a reset. Every step of Ticker costs 2."""
+    learner = Learner(
+        init=lambda *_: Trainable({}, {}),
+        step=lambda nets, *_: (nets, {}),
+        act=lambda learned, obs, key: jnp.zeros((*obs.shape[:-1], 1)),
+        counted=lambda env, steps, cfg: {"paid": steps.cost > 1, "any": steps.cost > -1},
+    )
+    algo = off_policy(Ticker(episode_length=4), learner)
+    cfg = OffPolicyConfig(**TINY, stagger=False)
+    metrics = jax.jit(algo.update)(algo.init(jax.random.key(0), cfg, START), START)[1]
+    assert metrics["train/paid"] == metrics["train/any"] == 8 * 5

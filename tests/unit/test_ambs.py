@@ -29,6 +29,7 @@ from jaxsafe.learn.sequences import SequenceBatch
 from jaxsafe.learn.world_model import Dreams, dream, dream_returns, world_of
 from jaxsafe.nn.gaussian import Gaussian
 from jaxsafe.nn.rssm import Latent
+from jaxsafe.report import evaluation
 from jaxsafe.run.evaluate import episode
 from jaxsafe.types import Algorithm, Policy
 
@@ -880,9 +881,13 @@ def test_the_risk_is_scored_by_sampled_actions_without_the_shield(sampled, viola
     cfg = jax.tree.map(lambda x: jnp.full(1, x), dataclasses.replace(CFG, shield_horizon=4))
     keys = jax.random.split(jax.random.key(0), (1, 2))
     found = ambs.examine(algo, Learned(cfg, {}, (), ()), keys, sampled)
-    assert (found["Brier score"] == 0).all()
-    assert (found["violations, no shield"] == violations).all()
-    assert (found["violations"] == 0).all() and (found["override rate"] == 1).all()
+    measures = found.measures
+    assert (measures["Brier score"] == 0).all()
+    assert (measures["violations, no shield"] == violations).all()
+    assert (measures["violations"] == 0).all() and (measures["override rate"] == 1).all()
+    steps, risk, violated = np.asarray(found.calibration)[0]
+    assert steps[-1] > 9 and (steps == risk).all() and (steps == violated).all()
+    assert not steps[:-1].any()
 
 
 def test_the_brier_score_by_hand():
@@ -899,3 +904,19 @@ def test_the_brier_score_by_hand():
     short = found._replace(alive=yes.at[4:].set(False))
     np.testing.assert_allclose(ambs.brier_score(short, 2), np.mean(errors[:4]), rtol=1e-6)
     assert jnp.isnan(ambs.brier_score(found._replace(violation=no), 9))
+
+
+def test_the_risk_is_compared_with_what_came_part_by_part():
+    """The steps of the test above: risks of 0, 0.5, 1, 0.5 and 0.2, after which 0 0 1 1 0 came."""
+    yes, no = jnp.ones(6, bool), jnp.zeros(6, bool)
+    risk = jnp.array([0.0, 0.5, 1.0, 0.5, 0.2, 0.9])
+    counts = ambs.calibration(ambs.Course(yes, risk, no, risk, no.at[3].set(True), no), 2)
+    expected = np.zeros((3, ambs.PARTS))
+    for part, of in {0: (1, 0, 0), 2: (1, 0.2, 0), 5: (2, 1, 1), 9: (1, 1, 1)}.items():
+        expected[:, part] = of
+    np.testing.assert_allclose(counts, expected, atol=1e-6)
+    assert evaluation.calibrated(2 * np.asarray(counts)) == {
+        "steps": [2, 2, 4, 2],
+        "risk": pytest.approx([0, 0.2, 0.5, 1]),
+        "violated": [0, 0, 0.5, 1],
+    }
