@@ -3,6 +3,8 @@
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 
 from jaxsafe.algos import ALGOS, ambs
 from jaxsafe.config import ConfigError
@@ -90,6 +92,26 @@ def foreseen(player: Player, episode: Episode, step: int, steps: int, key: jax.A
         return jax.lax.scan(ahead, start, (actions, jax.random.split(key, steps)))[1]
 
     return jax.jit(dreamed)()
+
+
+def strip(player: Player, episode: Episode, step: int, steps: int, key: jax.Array) -> np.ndarray:
+    """Pictures of steps `step` to `step` + `steps` side by side, uint8 [3 H, (steps + 1) W, C].
+
+    Above what was observed, then what the model makes of its latents, and below what it foresees: there
+    it sees the first step alone. Of several frames the newest is shown.
+
+    Raises:
+        ConfigError: the policy sees no pictures.
+    """
+    shown = slice(step, step + steps + 1)
+    obs, latent = jax.tree.map(lambda x: x[shown], (episode.state.obs, episode.latent))
+    if not isinstance(obs, dict):
+        raise ConfigError("this policy sees no pictures: expected env.observe_vision=true")
+    ahead = foreseen(player, episode, step, steps, key)
+    closed = jax.tree.map(lambda now, later: jnp.concatenate([now[:1], later]), latent, ahead)
+    painted = (255 * decoded(player, x)["vision"] for x in (latent, closed))
+    rows = [np.asarray(x)[..., :3] for x in (obs["vision"], *painted)]
+    return np.concatenate([np.concatenate(row.round().astype(np.uint8), axis=1) for row in rows])
 
 
 def shield_dreams(player: Player, episode: Episode, step: int, key: jax.Array) -> ambs.Dreamt:

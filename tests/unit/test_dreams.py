@@ -57,6 +57,36 @@ def test_what_is_lived_seen_and_foreseen_belongs_to_its_step(monkeypatch):
     np.testing.assert_allclose(found.deter, episode.state.obs[3] + told[:, None], rtol=1e-5)
 
 
+def test_a_strip_has_true_and_imagined_frames_of_the_same_steps_below_each_other(monkeypatch):
+    """Frames of 2 x 2 pixels that are as bright as their step, in a model that counts on by 2."""
+
+    class Counting:
+        def apply(self, params, *args, method):
+            return getattr(self, method)(*args)
+
+        def imagine(self, latent, action, key):
+            return Latent(latent.deter + 2, latent.stoch)
+
+        def decode(self, latent):
+            frame = latent.deter[..., None, None] / 255 * jnp.ones((2, 2, 6))
+            return {"vision": frame, "vector": latent.deter}
+
+    player: Any = SimpleNamespace(
+        task=None, learned=SimpleNamespace(config=dreamer.DreamerConfig(), params={"model": None})
+    )
+    monkeypatch.setattr(dreams, "world_of", lambda *_: Counting())
+    t = jnp.arange(9.0)[:, None]
+    vision = (t[:, :, None, None] * jnp.ones((2, 2, 6))).astype(jnp.uint8)
+    state: Any = SimpleNamespace(obs={"vision": vision, "vector": t})
+    episode: Any = SimpleNamespace(state=state, latent=Latent(t, t), action=t)
+    found = dreams.strip(player, episode, 3, 2, jax.random.key(0))
+    assert found.shape == (6, 6, 3) and found.dtype == np.uint8
+    np.testing.assert_array_equal(found[::2, ::2, 0], [[3, 4, 5], [3, 4, 5], [3, 5, 7]])
+    blind: Any = SimpleNamespace(state=SimpleNamespace(obs=t), latent=Latent(t, t), action=t)
+    with pytest.raises(ConfigError, match="sees no pictures"):
+        dreams.strip(player, blind, 3, 2, jax.random.key(0))
+
+
 def test_a_policy_without_a_world_model_or_a_shield_is_refused_by_name():
     unused: Any = None
     player, key = (
