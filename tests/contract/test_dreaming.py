@@ -16,8 +16,9 @@ from two_devices import on_two_devices, same_parameters_own_replays
 from jaxsafe.algos import ALGOS, ambs
 from jaxsafe.config import ConfigError
 from jaxsafe.learn.acting import Player
-from jaxsafe.learn.world_model import WorldModelConfig
+from jaxsafe.learn.world_model import CHANCE, WorldModelConfig
 from jaxsafe.nn.rssm import SIZES
+from jaxsafe.nn.two_hot import BINS
 from jaxsafe.types import Env
 
 NAMES = [name for name, row in ALGOS.items() if issubclass(row.config, WorldModelConfig)]
@@ -63,6 +64,18 @@ def test_an_update_keeps_the_structure(name, actor_grad):
     assert {"train/return", "train/cost_estimate", "train/model_kl", "train/nonfinite"} <= {*metrics}
     assert algo.clocks(cfg) == (32, 2)
     assert before.normaliser == () and before.replay.obs.shape == (4, 24, 4)
+
+
+def test_a_head_of_the_chance_of_a_cost_has_one_output_in_place_of_many():
+    algo, outputs = ALGOS["dreamer_lag"].make(Corridor()), []
+    for kind in ("amount", "chance"):
+        cfg = settings_of("dreamer_lag", cost_head=kind)
+        before = jax.eval_shape(lambda cfg=cfg: algo.init(jax.random.key(0), cfg, START))
+        after, _ = jax.eval_shape(algo.update, before, START)
+        assert jax.tree.leaves(before) == jax.tree.leaves(after)
+        head = before.params["model"]["params"]["readers_cost"]["Dense_0"]
+        outputs.append(head["bias"].shape)
+    assert outputs == [(BINS,), (CHANCE,)]
 
 
 def test_a_shield_in_the_simulator_keeps_the_structure_and_sees_the_state():
