@@ -75,7 +75,7 @@ class CRABSConfig(EnsembleConfig, CertificateConfig, sac.SACConfig):
 
         acts by       the first of `candidates` actions with u(s, a) <= 0, else pi(s), with h, pi, T of
                       the last certificate
-        y           = r - penalty c + discount (min_i Q'_i(s', a') - alpha log pi(a' | s'))
+        y           = r + discount (min_i Q'_i(s', a') - alpha log pi(a' | s'))
         minimise_Q    E[1{u(s', a') <= 0} sum_i (Q_i(s, a) - y)^2],                      a' ~ pi(s')
         maximise_pi   E[min_i Q_i(s, a) if u(s, a) <= 0 else -1000 - u(s, a)] + entropy, a ~ pi(s)
         minimise_pi   the mean of u(s, pi(s)) over those s in C that violate the condition
@@ -87,6 +87,9 @@ class CRABSConfig(EnsembleConfig, CertificateConfig, sac.SACConfig):
     its steps against violations. If that takes more than `barrier_steps`, f goes back to that of the
     last certificate, and the policy takes more of these steps. Nothing is proved for all states of C: a
     step can be unsafe where the models are wrong, or where a violation was not found.
+
+    Only the reward and the certificate steer the policy. Where an unsafe step would pay, the reward
+    has to charge for it, as those of Move and Swing do.
 
     The paper is given a safe policy that earns little. Its code loads one for Swing, with models and a
     certificate, which seem to come from training on Upright. Violations before that do not count. Here
@@ -103,10 +106,9 @@ class CRABSConfig(EnsembleConfig, CertificateConfig, sac.SACConfig):
     Zero Training-time Violations", arXiv:2108.01846, and the authors' code, roosephu/crabs @823da6c.
     Differs from it: the models are those of PETS, without gates. States outside of C jump into it; the
     code moves them there by gradient steps. Walks are corrected by the density of their noise; the code
-    takes its square. A step into an unsafe state counts for the critics. Costs are paid for. In the
-    code the reward of Move and Swing does so, and nothing else. There are several environments, and
-    updates are short. By default the networks are small, and so are the searches. `preset=published`
-    has the sizes of the code.
+    takes its square. A step into an unsafe state counts for the critics. There are several
+    environments, and updates are short. By default the networks are small, and so are the searches.
+    `preset=published` has the sizes of the code.
     """
 
     TAKES_PICTURES: ClassVar = False
@@ -137,9 +139,6 @@ class CRABSConfig(EnsembleConfig, CertificateConfig, sac.SACConfig):
     target_entropy: Annotated[float, Bounds(-100, 100)] = -1.0
     # The temperature at first. The paper's code has 1, where rewards are larger.
     alpha_init: Annotated[float, Bounds(1e-10, 1e6)] = 0.1
-    # What a unit of cost costs in reward, so that it pays to live on. Move and Swing pay 10 themselves,
-    # as in the paper's code, which has no other price.
-    penalty: Weight = 10.0
     cost_limit: Weight = 0.0  # Of an episode, drawn in plots: there is to be no cost.
     model_hidden: tuple[Units, ...] = (64, 64)  # Units of each model. The paper has four layers of 256.
     # Environment steps between two searches for a certificate. The paper's code has 6,000.
@@ -256,8 +255,7 @@ def crabs(env: Env) -> Learner:
 
         action, bonus = actor.next_action(params, params["targets"], batch.next_obs, critic_key, cfg)
         v = q_values(params["targets"]["critic_r"], batch.next_obs, action, cfg).min(0) + bonus
-        paid = batch._replace(reward=batch.reward - cfg.penalty * batch.cost)
-        y = targets_of(paid, jnp.zeros_like(v), Values(v, jnp.zeros_like(v)), (), cfg)
+        y = targets_of(batch, jnp.zeros_like(v), Values(v, jnp.zeros_like(v)), (), cfg)
         free = params["certified"] == 0
         allowed = here.u(core_of(params), batch.next_obs, action, cfg) <= 0
         counted = batch._replace(weight=batch.weight * (allowed | batch.terminated | free))
@@ -372,7 +370,7 @@ PUBLISHED: dict[str, Any] = {
     "lr": 3e-4, "critic_lr": 3e-4, "alpha_init": 1.0, "alpha_lr": 3e-4, "max_grad_norm": math.inf,
     "model_hidden": (256, 256, 256, 256), "refit_every": 6000, "epoch_steps": 1000, "candidates": 100,
     "barrier_hidden": (256, 256), "barrier_lr": 3e-4, "chains": 10_000, "barrier_steps": 20_000,
-    "quiet_steps": 1000, "check_steps": 4000, "penalty": 0.0,
+    "quiet_steps": 1000, "check_steps": 4000,
 }  # fmt: skip
 
 ROWS = {
