@@ -3,6 +3,7 @@ engine, and the rule of the cost by hand."""
 # pyright: reportAttributeAccessIssue=false
 # (MuJoCo's bindings come without types)
 
+import csv
 import functools
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -224,7 +225,7 @@ def compare(robot: str, engine: str, steps: Step) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_a_step_of_engine_c_is_gymnasium_s_to_the_rounding_of_float32(robot):
     """In float64 inside: what is left is that states, rewards and observations are float32."""
-    errors = compare(robot, "c", recorded(robot, 150))
+    errors = compare(robot, "c", recorded(robot, 200))
     eps = np.finfo(np.float32).eps
     assert errors["qpos"].max() < 2 * eps
     assert errors["obs"].max() < (2 * eps if robot != "humanoid" else 1e-4)  # Newton's solver and PGS
@@ -251,7 +252,7 @@ def test_a_step_of_a_trained_gait_is_gymnasium_s_too_and_costs_above_the_thresho
 def test_the_velocity_of_the_last_stage_is_near_that_of_the_end():
     """What Gymnasium pays Ant and Humanoid for; the other robots' velocity is that of the end."""
     for robot in ROBOTS:
-        steps = recorded(robot, 150)
+        steps = recorded(robot, 200)
         off = abs(steps.lagging - steps.velocity)[:, 0]
         assert off.max() < ({"ant": 0.1, "humanoid": 0.01}.get(robot, 1e-9))
         assert np.median(off) < 2e-3
@@ -271,7 +272,7 @@ def within(errors: dict[str, np.ndarray]) -> None:
 @pytest.mark.parametrize("engine", ["jax", "warp"])
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_a_step_of_the_other_engines_is_gymnasium_s_in_float32(robot, engine):
-    within(compare(robot, engine, recorded(robot, 150)))
+    within(compare(robot, engine, recorded(robot, 200)))
 
 
 @pytest.mark.parametrize("engine", ["jax", "warp"])
@@ -306,6 +307,19 @@ def test_a_step_costs_1_above_the_threshold(robot, version):
     assert cost(-2 * limit) == sideways  # backwards
     assert cost(0.0, 2 * limit) == cost(0.0, -2 * limit) == sideways
     assert cost(0.8 * limit, 0.8 * limit) == sideways
+
+
+def test_velocities_cost_what_they_cost_in_safety_gymnasium():
+    """Twelve around each threshold, see tests/data/README.md."""
+    with (DATA / "velocity" / "costs.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    tasks = list(dict.fromkeys(row["task"] for row in rows))
+    assert len(tasks) == 2 * len(ROBOTS) and len(rows) == 12 * len(tasks)
+    for name in tasks:
+        here = [row for row in rows if row["task"] == name]
+        vx, vy, cost = (np.array([float(row[k]) for row in here]) for k in ("vx", "vy", "cost"))
+        ours = jax.vmap(envs.make(name, engine="c").cost)(jnp.stack([vx, vy], -1))
+        np.testing.assert_array_equal(ours, cost, name)
 
 
 def test_a_threshold_of_one_s_own_counts():
