@@ -246,10 +246,59 @@ def test_published_settings_build(name):
         assert jax.tree.structure(before) == jax.tree.structure(after)
 
 
-def test_ddpg_alone_normalises_costs_with_omnisafes_settings_of_navigation():
-    rows = ("ddpg_lag", "td3_lag", "sac_lag", "ddpg_pid", "td3_pid", "sac_pid")
-    asked = {name: ALGOS[name].published["omnisafe_navigation"]["cost_normalize"] for name in rows}
-    assert [name for name, normalised in asked.items() if normalised] == ["ddpg_lag"]
+BASES = ("ddpg", "td3", "sac")
+ROWS = [base + price for base in BASES for price in ("", "_lag", "_pid")]
+
+
+@pytest.mark.parametrize("navigation", [False, True])
+@pytest.mark.parametrize("name", ROWS)
+def test_omnisafes_settings_are_those_of_its_files(name, navigation):
+    """configs/off-policy of OmniSafe @15603dd: a gradient step of 256 transitions for each step of one
+    environment. Its prices move at each of these steps, ours once in 20,000 by as much."""
+    base, _, price = name.partition("_")
+    row = ALGOS[name]
+    cfg: Any = row.config(**row.published["omnisafe_navigation" if navigation else "omnisafe"])
+    table = timetable_of(cfg, None)
+    assert (cfg.num_envs, table.batch, table.rows, table.gradient_steps) == (1, 256, 1, 1)
+    assert cfg.hidden == (256, 256)
+    expected: dict[str, Any] = {
+        "replay_size": 1_000_000, "tau": 0.005, "discount": 0.99, "cost_discount": 0.99, "n_step": 1,
+        "lr": 1e-4 if price == "pid" else 3e-4, "critic_lr": 3e-4, "lr_decay": False,
+        "policy_delay": 1 if base == "ddpg" else 2, "max_grad_norm": 40.0,
+        "learning_starts": 10_000 if base == "sac" else 25_000, "layer_norm": False,
+        "obs_normalize": False, "stagger": False,
+    }  # fmt: skip
+    if base == "sac":
+        expected |= {"alpha_init": 1e-5 if navigation else 0.2, "alpha_lr": 0.0}
+    else:
+        expected |= {"noise_min": 0.1, "noise_max": 0.1, "noise_decay": False}
+    if price:
+        expected |= {
+            "cost_limit": 25.0, "dual_every": 20_000, "dual_starts": 200_000, "lam_init": 1e-3,
+            "cost_reduce": "one", "cost_normalize": not navigation or name == "ddpg_lag",
+        }  # fmt: skip
+    if price == "lag":
+        expected |= {"dual_lr": 20_000 * (5e-7 if navigation else 1e-5), "dual_damping": 0.0}
+        expected["lam_init"] = 0.0 if navigation else 1e-3
+    if price == "pid":
+        gains = (5e-7, 1e-8, 1e-8) if navigation else (1e-6, 1e-7, 1e-7)
+        expected |= {"pid_kp": gains[0], "pid_ki": 20_000 * gains[1], "pid_kd": gains[2]}
+        expected |= {"pid_delay": 10, "pid_smoothing": 0.95}
+    if navigation:
+        expected |= {"lr": 5e-6, "critic_lr": 1e-3}
+    assert {key: getattr(cfg, key) for key in expected} == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_64_environments_have_omnisafes_replay_ratio_in_four_steps_of_4096(name):
+    presets = ALGOS[name].published
+    parallel = [presets[preset] for preset in presets if preset.startswith("parallel")]
+    assert len(parallel) == (2 if "_" in name else 1)
+    for settings in parallel:
+        cfg = ALGOS[name].config(**settings)
+        table = timetable_of(cfg, None)
+        assert (cfg.num_envs, cfg.replay_ratio) == (64, 256)
+        assert (table.batch, table.rows, table.gradient_steps) == (4096, 1, 4)
 
 
 @pytest.mark.parametrize(
