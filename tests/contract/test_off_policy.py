@@ -3,7 +3,7 @@
 import dataclasses
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +20,7 @@ from jaxsafe.learn.acting import Player
 from jaxsafe.learn.learner import Learner
 from jaxsafe.learn.models import EnsembleConfig
 from jaxsafe.learn.next_step_rollout import collect_records
+from jaxsafe.learn.normalise import normalise
 from jaxsafe.learn.off_policy import OffPolicyConfig, off_policy
 from jaxsafe.learn.steps import Trainable
 from jaxsafe.learn.timetable import ReplayConfig, timetable_of
@@ -380,6 +381,74 @@ def test_a_million_transitions_of_point_goal1_take_little_room():
     size = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(ts.replay))
     assert abs(transitions - 1_000_000) <= 16 * 1000
     assert size == transitions * (4 * (60 + 2 + 1 + 1 + 2) + 3) and size < 0.28e9
+
+
+# ---- what the loop tells a learner -------------------------------------------------------------
+
+
+class Told(NamedTuple):
+    """What a gradient step was told: its number, from 1 on, a draw of its key, the share of training
+    that is left, the first transition of its batch, and the sum of its weights."""
+
+    number: jax.Array
+    draw: jax.Array
+    remaining: jax.Array
+    obs: jax.Array
+    next_obs: jax.Array
+    weight: jax.Array
+
+
+def listening(steps: int) -> Learner:
+    """It learns nothing, but writes down what `steps` gradient steps are told. Its action is the first
+    component that it sees, as `obs` is given, and the share of training that is left."""
+    zero, four = jnp.zeros(steps), jnp.zeros((steps, 4))
+    empty = Told(number=zero, draw=zero, remaining=zero, obs=four, next_obs=four, weight=zero)
+
+    def step(nets, batch, at, cfg, axis_name):
+        first = batch.obs[0], batch.next_obs[0], batch.weight.sum()
+        told = Told(at.number + 1, jax.random.uniform(at.key), at.remaining, *first)
+        log = jax.tree.map(lambda x, new: x.at[at.number].set(new), nets.params["log"], told)
+        every_second = jnp.where(at.number % 2, at.number, jnp.nan)
+        return Trainable({"log": log}, {}), {"train/told": every_second}
+
+    def explore(learned, obs, key, remaining):
+        return jnp.stack([obs[:, 0], jnp.full(len(obs), remaining)], -1)
+
+    return Learner(lambda *_: Trainable({"log": empty}, {}), step, explore=explore)
+
+
+def test_a_learner_is_told_the_time_and_sees_normalised_observations_to_act_and_to_learn():
+    """Three rounds of two gradient steps in each of three iterations. The first only warms up."""
+    algo = off_policy(Corridor(), listening(steps=18))
+    sizes = {"learning_starts": 8 * 6, "replay_size": 8 * 18, "total_iterations": 4.0}
+    cfg = ALGOS["sac"].config(**TINY | sizes)
+    ts = jax.jit(lambda key: algo.init(key, cfg, START), compiler_options=FAST)(jax.random.key(0))
+    update, block = jax.jit(algo.update, compiler_options=FAST), np.arange(6)
+    for iteration in range(3):
+        before, (ts, metrics) = ts, update(ts, at(iteration))
+        assert metrics["train/nonfinite"] == 0
+        assert metrics["train/told"] == (5, 9, 15)[iteration]  # the mean of those that have it
+        rows = jax.tree.map(lambda x, i=iteration: np.asarray(x)[:, 6 * i + block], ts.replay)
+        saw, left = np.moveaxis(rows.action, -1, 0)
+        if iteration:
+            np.testing.assert_allclose(left, 1 - iteration / 4)
+            known = normalise(before.normaliser, rows.obs)[..., 0]  # in the first round
+            np.testing.assert_allclose(saw[:, :2], known[:, :2], rtol=1e-4, atol=1e-5)
+    seen = np.asarray(ts.replay.obs).reshape(-1, 4)
+    assert ts.normaliser.count == len(seen) == 8 * 18
+    np.testing.assert_allclose(ts.normaliser.mean, seen.mean(0), rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(ts.normaliser.var, seen.var(0), rtol=1e-3)
+
+    # the last round of the first iteration has as many rows as the warm-up asks for
+    log, begun = jax.tree.map(np.asarray, ts.params["log"]), np.arange(18) >= 4
+    np.testing.assert_array_equal(log.number, np.where(begun, np.arange(18) + 1, 0))
+    np.testing.assert_allclose(log.remaining, begun * (1 - np.repeat([0, 1, 2], 6) / 4))
+    assert len({*log.draw[begun]}) == len({*map(tuple, log.obs[begun])}) == begun.sum()
+    np.testing.assert_allclose(log.weight[begun], 1.0, rtol=1e-5)
+    now = np.asarray(normalise(ts.normaliser, ts.replay.obs))
+    for step in (-2, -1):  # those whose normaliser is the present one
+        env, row = np.argwhere((abs(now - log.obs[step]) < 1e-4).all(-1))[0]
+        np.testing.assert_allclose(log.next_obs[step], now[env, row + 1], atol=1e-4)
 
 
 # ---- environments that reset on the next step --------------------------------------------------
