@@ -69,6 +69,6 @@ def settle(
     moved = jax.lax.fori_loop(0, due, move, dual)
     finite = all_finite(moved)
     paid = Bill(jnp.zeros_like(bill.cost), jnp.float32(0), bill.age - due * cfg.dual_every)
-    emptied = (due > 0) | (bill.age < 0)  # what is charged before `dual_starts` is dropped
+    emptied = (due > 0) | (bill.age <= 0)  # what is charged before `dual_starts` is dropped
     bill = select(emptied, paid, bill)
     return select(finite, moved, dual), bill, ~finite

@@ -465,9 +465,22 @@ def test_below_the_limit_the_price_falls_to_zero_and_stays():
     np.testing.assert_allclose(seen, [0.25, 0.15, 0.05, 0, 0, 0], atol=1e-3)
 
 
-def test_a_bill_is_the_cost_of_real_steps_since_the_last_move_for_each_constraint():
-    """An episode of 5 steps costs 2.5 and 7.5 by name; bad steps and resets do not count."""
-    env: Env = Ticker(episode_length=5)
+def test_what_steps_cost_before_the_price_may_move_is_forgotten():
+    """An episode of 100 steps costs 100 before and 5 after, and its limit is 10."""
+    sizes: dict[str, Any] = {"cost_limit": 10.0, "dual_every": 200, "dual_starts": 200}
+    cfg = jax.tree.map(jnp.float32, sac.SACLagConfig(lam_init=0.35, dual_lr=0.1, **sizes))
+    dual, bill = lagrangian.init(cfg), empty_bill(cfg, ())
+    for cost, lam in ((1.0, 0.35), (1.0, 0.35), (0.05, 0.35), (0.05, 0.25)):
+        bill = charge(bill, jnp.full((10, 10), cost), jnp.ones((10, 10), bool), None)
+        dual, bill, _ = settle(lagrangian, dual, bill, jnp.float32(100.0), cfg, jnp.int32(0))
+        np.testing.assert_allclose(dual.lam, lam, atol=1e-3)
+
+
+@pytest.mark.parametrize("steps, multipliers", [(5, [1.5, 0.5]), (3, [0.5, 0.5])])
+def test_a_bill_is_the_cost_of_real_steps_since_the_last_move_for_each_constraint(steps, multipliers):
+    """Each step costs 0.5 and 1.5 by name; resets do not count. Episodes fail after 3 of 5 steps, or
+    never. J_c is above the first limit, of 2, where they go on to the end alone."""
+    env: Env = Ticker(episode_length=5, lives=(3, 3) if steps == 3 else (99, 99))
     settings: dict[str, Any] = {
         "num_envs": 4, "horizon": 12, "learn_every": 6, "batch_size": 8, "replay_ratio": 1,
         "replay_size": 96, "learning_starts": 10_000, "hidden": (4,), "stagger": False,
@@ -480,9 +493,13 @@ def test_a_bill_is_the_cost_of_real_steps_since_the_last_move_for_each_constrain
         return algo.update(algo.init(key, cfg, START), START)
 
     ts, metrics = jax.jit(first_update, compiler_options=FAST)(jax.random.key(0))
-    np.testing.assert_allclose(metrics["train/cost_estimate_a"], 2.5, rtol=1e-6)
-    np.testing.assert_allclose(metrics["train/cost_estimate_b"], 7.5, rtol=1e-6)
-    np.testing.assert_allclose(metrics["train/cost_estimate"], 10.0, rtol=1e-6)
-    np.testing.assert_allclose(ts.dual.multiplier.lam, [1.5, 0.5], rtol=1e-4)  # above, below the limit
-    np.testing.assert_allclose(ts.dual.lam, [1.5 + 0.2 * 0.5, 0.5 - 0.2 * 0.5], rtol=1e-4)
+    costs = steps * np.array([0.5, 1.5])
+    for name, cost in {"_a": costs[0], "_b": costs[1], "": costs.sum()}.items():
+        np.testing.assert_allclose(metrics[f"train/cost_estimate{name}"], cost, rtol=1e-6)
+    np.testing.assert_allclose(ts.dual.multiplier.lam, multipliers, rtol=1e-4)
+    prices = np.maximum(multipliers + 0.2 * (costs - [2, 8]), 0)
+    np.testing.assert_allclose(ts.dual.lam, prices, rtol=1e-4)
+    lost, taken = ts.lost_time
+    assert taken > 0
+    np.testing.assert_allclose(lost, taken * (5 / steps - 1), rtol=1e-5)
     assert metrics["train/lam_a"] == ts.dual.lam[0] and ts.bill.age == 0
