@@ -398,9 +398,9 @@ class Told(NamedTuple):
     weight: jax.Array
 
 
-def listening(steps: int) -> Learner:
-    """It learns nothing, but writes down what `steps` gradient steps are told. Its action is the first
-    component that it sees, as `obs` is given, and the share of training that is left."""
+def listening(steps: int, fails: int = -1) -> Learner:
+    """It learns nothing, but writes down what `steps` gradient steps are told. Step `fails` makes a
+    NaN. Its action is the first component of `obs` and the share of training that is left."""
     zero, four = jnp.zeros(steps), jnp.zeros((steps, 4))
     empty = Told(number=zero, draw=zero, remaining=zero, obs=four, next_obs=four, weight=zero)
 
@@ -409,21 +409,29 @@ def listening(steps: int) -> Learner:
         told = Told(at.number + 1, jax.random.uniform(at.key), at.remaining, *first)
         log = jax.tree.map(lambda x, new: x.at[at.number].set(new), nets.params["log"], told)
         every_second = jnp.where(at.number % 2, at.number, jnp.nan)
-        return Trainable({"log": log}, {}), {"train/told": every_second}
+        fault = jnp.where(at.number == fails, jnp.nan, 0.0)
+        return Trainable({"log": log, "fault": fault}, {}), {"train/told": every_second}
 
     def explore(learned, obs, key, remaining):
         return jnp.stack([obs[:, 0], jnp.full(len(obs), remaining)], -1)
 
-    return Learner(lambda *_: Trainable({"log": empty}, {}), step, explore=explore)
+    begun = Trainable({"log": empty, "fault": jnp.zeros(())}, {})
+    return Learner(lambda *_: begun, step, explore=explore)
+
+
+def told(learner: Learner):
+    """How a run with this learner begins, and its update."""
+    algo = off_policy(Corridor(), learner)
+    sizes = {"learning_starts": 8 * 6, "replay_size": 8 * 18, "total_iterations": 4.0}
+    cfg = ALGOS["sac"].config(**TINY | sizes)
+    init = jax.jit(lambda key: algo.init(key, cfg, START), compiler_options=FAST)
+    return init(jax.random.key(0)), jax.jit(algo.update, compiler_options=FAST)
 
 
 def test_a_learner_is_told_the_time_and_sees_normalised_observations_to_act_and_to_learn():
     """Three rounds of two gradient steps in each of three iterations. The first only warms up."""
-    algo = off_policy(Corridor(), listening(steps=18))
-    sizes = {"learning_starts": 8 * 6, "replay_size": 8 * 18, "total_iterations": 4.0}
-    cfg = ALGOS["sac"].config(**TINY | sizes)
-    ts = jax.jit(lambda key: algo.init(key, cfg, START), compiler_options=FAST)(jax.random.key(0))
-    update, block = jax.jit(algo.update, compiler_options=FAST), np.arange(6)
+    ts, update = told(listening(steps=18))
+    block = np.arange(6)
     for iteration in range(3):
         before, (ts, metrics) = ts, update(ts, at(iteration))
         assert metrics["train/nonfinite"] == 0
@@ -449,6 +457,16 @@ def test_a_learner_is_told_the_time_and_sees_normalised_observations_to_act_and_
     for step in (-2, -1):  # those whose normaliser is the present one
         env, row = np.argwhere((abs(now - log.obs[step]) < 1e-4).all(-1))[0]
         np.testing.assert_allclose(log.next_obs[step], now[env, row + 1], atol=1e-4)
+
+
+def test_none_of_a_rounds_gradient_steps_takes_effect_if_they_end_in_what_is_not_finite():
+    ts, update = told(listening(steps=12, fails=9))
+    for iteration in range(2):
+        ts, metrics = update(ts, at(iteration))
+        assert metrics["train/nonfinite"] == iteration * 2  # both steps of the round are counted
+    number = np.array([0, 0, 0, 0, 5, 6, 7, 8, 0, 0, 11, 12])  # of the others
+    np.testing.assert_array_equal(ts.params["log"].number, number)
+    assert ts.params["fault"] == 0
 
 
 # ---- environments that reset on the next step --------------------------------------------------
