@@ -329,6 +329,46 @@ def test_a_delayed_policy_is_computed_where_it_is_due_alone_by_members_too(delay
     assert str(program).count("= cond[") == count
 
 
+@pytest.mark.parametrize("decay", [True, False])
+@pytest.mark.parametrize("name", ["sac_lag", "td3_lag"])
+def test_the_rates_of_policy_and_critics_fall_with_what_is_left_of_training_if_asked(name, decay):
+    """Adam's first step is as long as the rate. The temperature has a rate of its own."""
+    settings: dict[str, Any] = {"hidden": (), "policy_delay": 1, "lr_decay": decay}
+    cfg = jax.tree.map(jnp.float32, ALGOS[name].config(**settings))
+    learner = actor_critic(Lever(), ACTORS[name.split("_")[0]](2), lagrangian)
+    nets = jax.jit(lambda key: learner.init(key, 3, 2, cfg), compiler_options=FAST)(jax.random.key(0))
+    batch = jax.tree.map(lambda x: jnp.asarray(x, NARROW.get(x.dtype.kind, x.dtype)), drawn_batch())
+    dual = lagrangian.init(cfg)
+    step = jax.jit(lambda nets, at: learner.step(nets, batch, at, cfg, None), compiler_options=FAST)
+
+    def longest(left: float) -> dict[str, float]:
+        at = GradientStep(jnp.int32(0), jnp.float32(left), jax.random.key(1), dual)
+        moved = jax.tree.map(lambda x, y: abs(x - y).max(), step(nets, at)[0].params, nets.params)
+        return {name: float(max(jax.tree.leaves(x))) for name, x in moved.items() if name != "targets"}
+
+    whole, late = longest(1.0), longest(0.25)
+    for part, rate in (("actor", cfg.lr), ("critic_r", cfg.critic_lr), ("critic_c", cfg.critic_lr)):
+        np.testing.assert_allclose(whole[part], rate, rtol=1e-2)
+        np.testing.assert_allclose(late[part], rate * (0.25 if decay else 1), rtol=1e-2)
+    assert late.get("log_alpha") == whole.get("log_alpha")
+
+
+def test_costs_are_scaled_by_all_that_were_replayed_so_far():
+    """The scale after two batches, of costs from 0 to 1 and of ten times these, is that of both."""
+    cfg = jax.tree.map(jnp.float32, td3.TD3LagConfig(hidden=(), cost_normalize=True))
+    learner = actor_critic(Lever(), ACTORS["td3"](2), lagrangian)
+    nets = jax.jit(lambda key: learner.init(key, 3, 2, cfg), compiler_options=FAST)(jax.random.key(0))
+    batch = jax.tree.map(lambda x: jnp.asarray(x, NARROW.get(x.dtype.kind, x.dtype)), drawn_batch())
+    at = GradientStep(jnp.int32(0), jnp.float32(1), jax.random.key(1), lagrangian.init(cfg))
+    step = jax.jit(lambda nets, x: learner.step(nets, x, at, cfg, None)[0], compiler_options=FAST)
+    for size in (1, 10):
+        nets = step(nets, batch._replace(cost=size * batch.cost, costs=size * batch.costs))
+    cost = np.concatenate([batch.cost[:4], 10 * batch.cost[:4]])  # the last one does not count
+    scale = nets.opt_state["cost_scale"]
+    np.testing.assert_allclose(scale.mean, [cost.mean()], rtol=1e-5)
+    np.testing.assert_allclose(scale.square, [(cost**2).mean()], rtol=1e-5)
+
+
 # ---- values ------------------------------------------------------------------------------------
 
 
@@ -422,6 +462,20 @@ def test_each_environment_has_noise_of_its_own_which_can_fall_to_none(decay, lef
     params = jax.tree.map(jnp.zeros_like, actor.init(jax.random.key(0), 1, 4000, cfg))  # mu(s) = 0
     actions = actor.explore(params, jnp.zeros((3, 1)), jax.random.key(1), cfg, jnp.float32(left))
     np.testing.assert_allclose(actions.std(1), share * np.array([0.1, 0.2, 0.3]), rtol=0.05)
+
+
+def test_a_sampled_action_has_the_noise_of_any_environment_and_none_leaves_its_bounds():
+    cfg = td3.TD3Config(hidden=(), layer_norm=False, noise_min=0.1, noise_max=0.3)
+    actor: Any = ACTORS["td3"](2000)
+    params = jax.tree.map(jnp.zeros_like, actor.init(jax.random.key(0), 1, 2000, cfg))  # mu(s) = 0
+    obs, key = jnp.zeros((200, 1)), jax.random.key(1)
+    spread = actor.act(params, obs, key, cfg).std(1)
+    np.testing.assert_allclose([spread.min(), spread.mean(), spread.max()], [0.1, 0.2, 0.3], atol=0.02)
+    wild = dataclasses.replace(cfg, noise_min=5.0, noise_max=5.0)
+    for actions in (
+        actor.act(params, obs, key, wild), actor.explore(params, obs, key, wild, jnp.float32(1))
+    ):  # fmt: skip
+        assert actions.max() == 1 and actions.min() == -1
 
 
 # ---- the clock of the price --------------------------------------------------------------------
