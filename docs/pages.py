@@ -254,6 +254,7 @@ original do not carry over.
 
 ```sh
 python scripts/train.py env=car_racing1 algo=seditor
+python scripts/train.py env=car_racing1 env.observe_vision=true algo=seditor preset=racing
 python scripts/train.py env=car_racing1 env.observe_vision=true algo=ppo_lag algo.encoder=cnn \\
     algo.trunk=shared algo.num_envs=64
 ```
@@ -290,7 +291,8 @@ and lock.
 
 With `env.observe_vision=true` the observation is that of the original's agents, a dict: `vector` has
 the first 11 numbers, and `vision` is a grey picture, uint8 [96, 96, 1].
-[Which algorithms take it](../howto/pixels.md#learn): `seditor` is not among them, it takes vectors.
+[Many algorithms take it](../howto/pixels.md#learn). `seditor` does so with
+[its authors' settings](../howto/seditor.md#racing).
 
 ## Pictures
 

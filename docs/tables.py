@@ -116,6 +116,7 @@ PRESETS = {  # all but `fast`, which has no settings of its own
     "true_dynamics": "a shield that looks ahead in the simulator",
     "safe_dreamer": "SafeDreamer's settings of vectors, with `env.wrap.action_repeat=4`",
     "paper": "the authors' settings",
+    "racing": "the authors' settings of racing, with `env.observe_vision=true`",
 }
 FEW = 6  # names fit into a cell; more are told by their family
 

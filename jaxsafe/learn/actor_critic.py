@@ -40,12 +40,11 @@ from jaxsafe.learn.critics import (
 )
 from jaxsafe.learn.learner import GradientStep, Learner
 from jaxsafe.learn.normalise import CLIP, MIN_STD, averaged, no_moments, standard
-from jaxsafe.learn.observations import EncoderConfig, blank, observation_like
+from jaxsafe.learn.observations import EncoderConfig, features, init_features
 from jaxsafe.learn.off_policy import OffPolicyConfig
 from jaxsafe.learn.replay import Transitions
 from jaxsafe.learn.steps import Trainable, adam, descend_each, follow
 from jaxsafe.learn.treatments import DampedConfig, PIDConfig, Treatment, no_treatment
-from jaxsafe.nn.cnn import FEATURES, encoded, init_encoder
 from jaxsafe.types import Env, Metrics, PyTree
 
 
@@ -195,13 +194,9 @@ def actor_critic(env: Env, actor: Actor, treatment: Treatment) -> Learner:
 
     def init(key: jax.Array, obs_size: int, action_size: int, cfg: Any) -> Trainable:
         actor_key, critic_key = jax.random.split(key)
-        encoder = {}
-        if cfg.encoder == "cnn":
-            obs_size += FEATURES
-            encoder_key = jax.random.fold_in(key, 1)
-            encoder = {"encoder": init_encoder(encoder_key, blank(observation_like(env)))}
-        parts = actor.init(actor_key, obs_size, action_size, cfg)
-        sizes = obs_size, action_size
+        encoder, seen = init_features(jax.random.fold_in(key, 1), env, obs_size, cfg)
+        parts = actor.init(actor_key, seen, action_size, cfg)
+        sizes = seen, action_size
         critics = init_all_critics(critic_key, sizes, actor.critics, treatment, cfg)
         valued = critics | encoder  # what the critics' loss trains
         optimisers = actor.optimisers(cfg, 1.0) | dict.fromkeys(valued, adam(cfg.critic_lr, cfg))
@@ -298,11 +293,6 @@ def actor_critic(env: Env, actor: Actor, treatment: Treatment) -> Learner:
 
     explore = None if actor.explore is None else acting(actor.explore)
     return Learner(init=init, act=acting(actor.act), step=step, explore=explore)
-
-
-def features(params: dict[str, PyTree], obs: PyTree) -> jax.Array:
-    """`obs` as one vector: what the encoder makes of it, if there is one."""
-    return encoded(params["encoder"], obs) if "encoder" in params else obs
 
 
 def price_unit(batch: Transitions, worth: jax.Array, cfg: Any, axis_name: str | None) -> jax.Array:

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxsafe.config import ConfigError, config
+from jaxsafe.nn.cnn import FEATURES, encoded, init_encoder
 from jaxsafe.types import Env, PyTree
 
 
@@ -43,6 +44,23 @@ def blank(like: PyTree) -> PyTree:
     return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
 
 
+def init_features(
+    key: jax.Array, env: Env, obs_size: int, cfg: EncoderConfig
+) -> tuple[dict[str, PyTree], int]:
+    """The encoder among a learner's networks, if it has one, and how many numbers are in `features`.
+
+    obs_size: of the vector.
+    """
+    if cfg.encoder == "none":
+        return {}, obs_size
+    return {"encoder": init_encoder(key, blank(observation_like(env)))}, obs_size + FEATURES
+
+
+def features(params: dict[str, PyTree], obs: PyTree) -> jax.Array:
+    """`obs` as one vector: what the encoder among `params` makes of it, if there is one."""
+    return encoded(params["encoder"], obs) if "encoder" in params else obs
+
+
 def check_observation(like: PyTree, cfg: Any) -> None:
     """Refuse settings that do not fit what is observed.
 
@@ -57,7 +75,7 @@ def check_observation(like: PyTree, cfg: Any) -> None:
     if shows and not takes:
         raise ConfigError(
             "env.observe_vision=true: this algorithm takes vectors; those that take pictures, as "
-            "ppo_lag, sac_lag, dreamer and bc, have algo.encoder=cnn"
+            "ppo_lag, sac_lag, seditor, dreamer and bc, have algo.encoder=cnn"
         )
     if takes and (cfg.encoder == "cnn") != shows:
         seen = "env.observe_vision=true shows pictures" if shows else "the environment shows none"

@@ -45,6 +45,22 @@ def test_killed_and_resumed_with_its_replay_it_ends_bit_for_bit_as_if_uninterrup
     assert_same_run(run, whole)
 
 
+@pytest.mark.slow
+def test_seditor_on_pictures_resumes_and_is_evaluated(tmp_path):
+    args = (
+        *SAC, "env=toys:Patch", "algo=seditor", "algo.encoder=cnn", "algo.n_step=3",
+        "algo.lr_decay=false",
+    )  # fmt: skip
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    assert typed("train", *args, f"total_steps={8 * STEPS}", f"run_dir={whole}") == 0
+    for updates in (4, 8):
+        again = (*args, f"total_steps={updates * STEPS}", f"run_dir={parts}", "resume=true")
+        assert typed("train", *(again if updates == 8 else again[:-1])) == 0
+    assert np.isfinite(read_metrics(parts)["train/critic_loss"][-1])
+    assert_same_run(parts, whole)
+    assert typed("evaluate", str(whole), "--episodes", "2") == 0
+
+
 def test_resumed_without_its_replay_it_fills_it_anew_before_it_learns_on(tmp_path, capsys):
     run = tmp_path / "run"
     args = (*SAC, f"run_dir={run}", "checkpoint_replay=false", "eval_episodes=0")

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from compiling import BUSY, FAST
 from learners import at, copy, member
-from toys import START, Arriving, Corridor, Lever, Ticker, training
+from toys import START, Arriving, Corridor, Lever, Patch, Ticker, training
 from two_devices import agree, on_two_devices, split
 
 from jaxsafe.algos import ALGOS
@@ -239,11 +239,13 @@ def test_what_acts_is_small_and_its_mean_action_needs_no_key(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_published_settings_build(name):
-    algo = ALGOS[name].make(Corridor())
+    def built(cfg):
+        algo = ALGOS[name].make(Corridor() if cfg.encoder == "none" else Patch())
+        before = jax.eval_shape(lambda key: algo.init(key, cfg, START), jax.random.key(0))
+        return before, jax.eval_shape(algo.update, before, START)[0]
+
     for settings in ALGOS[name].published.values():
-        cfg = ALGOS[name].config(**settings)
-        before = jax.eval_shape(lambda key, cfg=cfg: algo.init(key, cfg, START), jax.random.key(0))
-        after, _ = jax.eval_shape(algo.update, before, START)
+        before, after = built(ALGOS[name].config(**settings))
         assert jax.tree.structure(before) == jax.tree.structure(after)
 
 

@@ -432,11 +432,19 @@ def test_learners_take_the_picture_and_each_episode_begins_with_its_own():
     np.testing.assert_array_equal(state.obs["vision"][..., 0], expected)
 
 
-def test_a_replay_keeps_grey_bytes():
+@pytest.mark.parametrize(
+    "name, options",
+    [("sac_lag", {"encoder": "cnn"}), ("seditor", ALGOS["seditor"].published["racing"])],
+)
+def test_a_replay_keeps_grey_bytes(name, options):
     env = envs.make("car_racing0", observe_vision=True, vision_size=(24, 16))
-    algo, cfg = ALGOS["sac_lag"].make(env), ALGOS["sac_lag"].config(encoder="cnn")
-    kept = jax.eval_shape(lambda: algo.init(jax.random.key(0), cfg, START)).replay.obs["vision"]
-    assert kept.dtype == jnp.uint8 and kept.shape[2:] == (16, 24, 1)
+    algo, cfg = ALGOS[name].make(env), ALGOS[name].config(**options)
+    kept = jax.eval_shape(lambda: algo.init(jax.random.key(0), cfg, START)).replay.obs
+    assert kept["vision"].dtype == jnp.uint8 and kept["vision"].shape[2:] == (16, 24, 1)
+    assert kept["vector"].shape[2:] == (11,)
+
+
+def test_a_picture_has_a_height():
     with pytest.raises(ConfigError, match=r"env\.vision_size\[1\]=0: expected a whole number"):
         envs.make("car_racing0", observe_vision=True, vision_size=(96, 0))
 

@@ -15,7 +15,7 @@ from compiling import EXACT, FAST
 from scipy.special import betainc, psi
 from scipy.stats import beta as scipy_beta
 from scipy.stats import kstest
-from toys import START, Lever, momentum
+from toys import START, Lever, Patch, momentum
 
 from jaxsafe.algos import ALGOS, seditor
 from jaxsafe.config import ConfigError
@@ -399,6 +399,14 @@ def batch_of(key) -> SequenceBatch:
     return SequenceBatch(found, jnp.array([0.5, 0.5, 0.0]))
 
 
+def moved(nets):
+    """Policies and targets that differ from those at the start."""
+    leaves, structure = jax.tree.flatten(nets.params)
+    keys = jax.random.split(jax.random.key(8), len(leaves))
+    other = [x + 0.3 * jax.random.normal(k, x.shape) for k, x in zip(keys, leaves, strict=True)]
+    return nets._replace(params=jax.tree.unflatten(structure, other))
+
+
 def test_each_network_moves_along_its_own_objective_alone():
     """Adam's first moments are a tenth of the gradients: those of the critics by hand, of linear ones,
     and of the policies and temperatures one by one."""
@@ -411,12 +419,6 @@ def test_each_network_moves_along_its_own_objective_alone():
     dual = seditor.init_soft_multiplier(dataclasses.replace(cfg, lam_init=jnp.float32(2)))
     at = GradientStep(jnp.int32(0), jnp.float32(1), jax.random.key(7), dual)
 
-    def wider(nets):  # policies and targets that differ from those at the start
-        leaves, structure = jax.tree.flatten(nets.params)
-        keys = jax.random.split(jax.random.key(8), len(leaves))
-        moved = [x + 0.3 * jax.random.normal(k, x.shape) for k, x in zip(keys, leaves, strict=True)]
-        return nets._replace(params=jax.tree.unflatten(structure, moved))
-
     seen = batch.rows
     target_key, proposer_key, editor_key = jax.random.split(at.key, 3)
 
@@ -425,7 +427,7 @@ def test_each_network_moves_along_its_own_objective_alone():
 
     @functools.partial(jax.jit, compiler_options=EXACT)
     def run(key):
-        before = wider(learner.init(key, 2, 2, cfg))
+        before = moved(learner.init(key, 2, 2, cfg))
         p = before.params
 
         def proposer(net):
@@ -562,6 +564,40 @@ def test_without_an_editor_one_policy_pays_and_its_entropy_counts_in_all_returns
         np.testing.assert_allclose(metrics["train/critic_loss" + "_c" * kind], loss, rtol=1e-4)
 
 
+@pytest.mark.parametrize("edit", ["add", pytest.param("none", marks=pytest.mark.slow)])
+def test_the_critics_alone_train_the_encoder(edit, monkeypatch):
+    """Its gradient is the same where those of the policies are stopped."""
+    cfg = jax.tree.map(
+        jnp.float32,
+        dataclasses.replace(CFG, encoder="cnn", edit=edit, n_step=3, batch_size=8),
+    )
+    env, batch = Patch(), batch_of(jax.random.key(5))
+    obs = jax.vmap(jax.vmap(env.reset))(jax.random.split(jax.random.key(1), (4, 3))).obs
+    seen = dataclasses.replace(batch.rows, obs=obs, action=batch.rows.action[..., :1])
+    learner, batch = seditor.seditor_learner(env), batch._replace(rows=seen)
+    at = GradientStep(
+        jnp.int32(0), jnp.float32(1), jax.random.key(7), seditor.init_soft_multiplier(cfg)
+    )
+
+    def momenta():
+        def run(key):
+            after, _ = learner.step(moved(learner.init(key, 1, 1, cfg)), batch, at, cfg, None)
+            return [momentum(after, name) for name in ("encoder", "proposer")]
+
+        encoder, proposer = jax.jit(run, compiler_options=FAST)(jax.random.key(6))
+        return encoder, optax.tree.norm(proposer)
+
+    encoder, of_proposer = momenta()
+    for name in ("proposer_gain", "editor_gain"):
+        gain = getattr(seditor, name)
+        stopped = functools.partial(lambda gain, *args: jax.lax.stop_gradient(gain(*args)), gain)
+        monkeypatch.setattr(seditor, name, stopped)
+    alone, of_none = momenta()
+    chex.assert_trees_all_close(encoder, alone, rtol=1e-4, atol=1e-7)
+    assert all(jnp.abs(x).max() > 1e-6 for x in jax.tree.leaves(encoder))
+    assert of_proposer > 1e-4 and of_none == 0
+
+
 def test_without_an_editor_the_mode_of_the_only_policy_acts():
     cfg = dataclasses.replace(CFG, edit="none")
     bias = jnp.array([1.0, 3.0])
@@ -584,6 +620,16 @@ def test_the_published_settings_are_one_step_of_1024_sequences_for_160_environme
     rounds = jnp.arange(5_000_000 // 160)
     at = jax.vmap(lambda i: timetable_of(cfg, None).at(0, Shared(i)))(rounds)
     assert at.ready.sum() == 31_188  # gradient steps; the price moves in all 31,250 rounds
+
+
+def test_the_settings_of_racing_are_one_step_of_256_sequences_for_80_environment_steps():
+    row = ALGOS["seditor"]
+    cfg = row.config(**row.published["racing"])
+    assert row.make(Patch()).clocks(cfg) == (80, 1) and cfg.batch_size == 256 * 8
+    assert cfg.n_step + 1 == 8 and cfg.dual_every == 80
+    rounds = jnp.arange(5_000_000 // 80)
+    at = jax.vmap(lambda i: timetable_of(cfg, None).at(0, Shared(i)))(rounds)
+    assert at.ready.sum() == 62_500 - 624  # the 625th round ends with 50,000 steps
 
 
 def test_a_batch_that_is_no_number_of_sequences_is_refused():
