@@ -65,6 +65,25 @@ def test_a_command_of_alf_keeps_task_seed_and_seditor_s_settings():
     assert not [line for line in alone.lines if line.lost]
 
 
+def test_a_command_of_alf_in_racing_sees_pictures():
+    racing = "python -m alf.bin.train --conf safety/seditor/seditor_safe_car_racing_conf.py"
+    found = alf(racing)
+    settings = compose(found.argv)
+    assert (settings.env_name, settings.algo.num_envs, settings.algo.encoder) == (
+        "car_racing1",
+        16,
+        "cnn",
+    )
+    assert observation_like(make_env(settings))["vision"].shape == (96, 96, 1)
+    assert not [line for line in found.lines if line.lost]
+    level = compose(
+        alf(racing + " --conf_param \"create_environment.env_name='SafeCarRacing0-v0'\"").argv
+    )
+    assert (level.env_name, level.algo) == ("car_racing0", settings.algo)
+    alone = compose(alf(racing.replace("seditor", "sac")).argv)
+    assert alone.algo == dataclasses.replace(settings.algo, edit="none")
+
+
 @pytest.mark.parametrize(
     "migrate, command, says",
     [
@@ -80,7 +99,7 @@ def test_a_command_of_alf_keeps_task_seed_and_seditor_s_settings():
             ALF.replace("CarButton2", "CarGoal0"),
             "is no task of SEditor's; did you mean 'car_goal",
         ),
-        (alf, "python -m alf.bin.train --conf seditor_safe_car_racing_conf.py", "env=car_racing1"),
+        (alf, "python -m alf.bin.train --conf focops_safe_car_racing_conf.py", "expected SEditor's"),
         (alf, ALF.replace("random_seed=7", "num_env_steps=0"), "total_steps=0: expected"),
     ],
 )

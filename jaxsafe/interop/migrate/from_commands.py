@@ -3,9 +3,9 @@
     jaxsafe migrate ambs "python train.py --task safetygym_Safexp-PointGoal1-v0 --run.steps 500000"
     jaxsafe migrate alf "python -m alf.bin.train --conf seditor_safety_gym_conf.py --conf_param=..."
 
-SEditor's config becomes `algo=seditor`, and its config without an editor has `algo.edit=none` beside
-it, each on SEditor's own tasks. A command of AMBS becomes `algo=ambs` with the preset of its penalty,
-and pictures or vectors, as its configs say.
+SEditor's configs become `algo=seditor`, and those without an editor have `algo.edit=none` beside it,
+each on SEditor's own tasks. In racing agents see pictures. A command of AMBS becomes `algo=ambs` with
+the preset of its penalty, and pictures or vectors, as its configs say.
 Source: the READMEs and configs of sacktock/AMBS @5184901 and hnyu/seditor @f78b720.
 """
 
@@ -25,9 +25,11 @@ PICTURES: dict[str, Any] = {  # AMBS's safetygym_vision, which sees nothing else
     "env.observe_vision": True, "env.vision_size": [64, 64], "algo.encoder": "cnn",
     "algo.replay_ratio": 512,
 }  # fmt: skip
-STEPS: dict[str, Any] = {"total_steps": 5_000_000}  # of SEditor's configs for Safety Gym
-EDITED = STEPS | {"algo": "seditor", "preset": "published"}
-ALONE = EDITED | {"algo.edit": "none"}
+# of SEditor's configs
+SEDITOR: dict[str, Any] = {"total_steps": 5_000_000, "algo": "seditor", "preset": "published"}
+RACING: dict[str, Any] = SEDITOR | {
+    "preset": "racing", "env": "car_racing1", "env.observe_vision": True,
+}  # fmt: skip
 
 
 def never(value: Any) -> bool:
@@ -67,16 +69,17 @@ def all_but_pictures(env: str) -> dict[str, bool]:
     return {f"env.{k}": False for k, value in defaults if k.startswith("observe_") and value is True}
 
 
-def seditor_tasks() -> list[str]:
-    return [name.removeprefix("seditor_") for name in envs.ENVS if name.startswith("seditor_")]
+def seditor_tasks() -> dict[str, str]:
+    """Our names of SEditor's tasks. Those of its fork have Safety Gym's ids."""
+    tasks = [name for name in envs.ENVS if name.startswith(("seditor_", "car_racing"))]
+    return {name.removeprefix("seditor_"): name for name in tasks}
 
 
 def seditor_task(value: Any) -> dict[str, Any]:
-    """The task of SEditor's fork, which has Safety Gym's id."""
     name = envs.canonical(str(value))
     if name not in seditor_tasks():
         raise ConfigError(f"{value} is no task of SEditor's{nearest(name, seditor_tasks())}")
-    return {"env": f"seditor_{name}"}
+    return {"env": seditor_tasks()[name]}
 
 
 AMBS: dict[str, Flag] = {
@@ -126,17 +129,15 @@ def alf(command: str) -> Migrated:
             flags[key.strip()] = literal(text.strip())
         else:
             flags[name] = value
-    if "seditor" not in conf and "sac_safety_gym" not in conf:
+    name = conf.rpartition("/")[2]
+    if "seditor" not in name and not name.startswith(("sac_safety_gym", "sac_safe_car_racing")):
         raise ConfigError(f"--conf {conf or '?'}: expected SEditor's, as in seditor_safety_gym_conf.py")
-    if "racing" in conf:
-        raise ConfigError(
-            f"--conf {conf} has no counterpart: its agents see pictures, which algo=seditor does not "
-            "take; env=car_racing0 and env=car_racing1 show it the road as numbers"
-        )
     found, lines = turned(flags, ALF)
-    options = EDITED if "seditor" in conf.rpartition("/")[2] else ALONE
-    said = "algo=seditor preset=published" + (" algo.edit=none" if options is ALONE else "")
-    lines.append(Line("conf", conf, said))
+    options = RACING if "racing" in name else SEDITOR
+    if "seditor" not in name:
+        options = options | {"algo.edit": "none"}
+    said = [as_option(k, v) for k, v in options.items() if k.startswith(("algo", "preset"))]
+    lines.append(Line("conf", conf, " ".join(said)))
     return migrated(options | found, lines, "create_environment.env_name")
 
 
