@@ -1,7 +1,8 @@
 """Draw the pictures beside this file: python docs/images/draw.py
 
-With --run RUN it writes policy.gif instead, of a policy trained on car_push1. The one here is of
-`python scripts/train.py env=car_push1 algo=sac_lag preset=navigation total_steps=3e6`, on a CPU.
+With --run RUN it writes policy.gif instead, or what --out names, of a policy trained on that. The
+policy.gif here is of `python scripts/train.py env=car_push1 algo=sac_lag preset=navigation
+total_steps=3e6`, on a CPU, and doggo.gif of the run in docs/results/doggo, --index 2 --seed 7.
 """
 
 import argparse
@@ -96,9 +97,9 @@ def draw_racing(name: str) -> None:
     imageio.imwrite(HERE / "environments" / f"{name}.png", render.beside(frame, large))
 
 
-def draw_policy(run: Path, seed: int, begin: int) -> None:
-    """A part of an episode of the policy in `run`, from step `begin` on, as a small GIF."""
-    policy = open_run(run).one(0)
+def draw_policy(run: Path, index: int, seed: int, begin: int, path: Path) -> None:
+    """A part of an episode of a policy in `run`, from step `begin` on, as a small GIF."""
+    policy = open_run(run).one(index)
     states, _ = render.run_episode(policy.player, jax.random.key(seed), begin + STEPS)
     drawing = render.Renderer(policy.env, 560, 400, camera((0.0, 0.0, 0.0), 4.5, elevation=-55))
     frames = [
@@ -107,19 +108,19 @@ def draw_policy(run: Path, seed: int, begin: int) -> None:
     ]
     colours = frames[0].quantize(128)  # of all frames, so that what rests stays the same pixels
     frames = [frame.quantize(palette=colours, dither=Image.Dither.NONE) for frame in frames]
-    frames[0].save(
-        HERE / "policy.gif", save_all=True, append_images=frames[1:], duration=50, loop=0, optimize=True
-    )
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=50, loop=0, optimize=True)
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--run", type=Path)
-    parser.add_argument("--seed", type=int, default=1, help="of the episode in policy.gif")
-    parser.add_argument("--begin", type=int, default=0, help="step at which policy.gif begins")
+    parser.add_argument("--index", type=int, default=0, help="which policy of RUN, from 0")
+    parser.add_argument("--seed", type=int, default=1, help="of the episode")
+    parser.add_argument("--begin", type=int, default=0, help="step at which the picture begins")
+    parser.add_argument("--out", type=Path, default=HERE / "policy.gif", help="the GIF to write")
     args = parser.parse_args()
     if args.run:
-        draw_policy(args.run, args.seed, args.begin)
+        draw_policy(args.run, args.index, args.seed, args.begin, args.out)
     else:
         for name in SCENES:
             draw(name)
