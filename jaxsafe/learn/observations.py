@@ -78,5 +78,6 @@ def check_observation(like: PyTree, cfg: Any) -> None:
             "ppo_lag, sac_lag, seditor, dreamer and bc, have algo.encoder=cnn"
         )
     if takes and (cfg.encoder == "cnn") != shows:
-        seen = "env.observe_vision=true shows pictures" if shows else "the environment shows none"
-        raise ConfigError(f"encoder={cfg.encoder}: expected {'cnn' if shows else 'none'}, as {seen}")
+        pictures = "env.observe_vision=true"
+        expected = f"cnn for {pictures}" if shows else f"none, or {pictures} for pictures"
+        raise ConfigError(f"algo.encoder={cfg.encoder}: expected {expected}")
