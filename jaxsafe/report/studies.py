@@ -511,7 +511,9 @@ def cost_so_far(run: SettingRun, steps: np.ndarray) -> np.ndarray:
         of_seed = run.table["seed"] == seed
         at, rate = run.table["steps"][of_seed], run.table["train/cost_rate"][of_seed]
         taken = np.diff(at, prepend=0) / run.config.get("env.wrap.action_repeat", 1)
-        sums = np.cumsum(np.nan_to_num(rate) * taken)
+        # a row's rate is of the steps up to it; stretches without a row have that of the row before
+        late = int(np.isnan(rate).argmin())  # stretches before the first row
+        sums = np.cumsum(np.append(rate[late:], np.repeat(rate[-1], late)) * taken)
         # the last iteration may end some steps before or after the round number of a run
         reached = steps <= 1.01 * at.max()
         row[reached] = np.interp(steps[reached], np.append(0, at), np.append(0, sums))

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -195,6 +196,14 @@ def test_what_training_has_cost_is_told_along_the_way(toy, tmp_path):
     assert [cell.strip() for cell in whole.split("|")[2:-1]] == told
     told = ["50 (50 to 50)", "100 (100 to 100)", "", ""]
     assert [cell.strip() for cell in half.split("|")[2:-1]] == told
+
+
+def test_a_stretch_without_an_iteration_has_the_rate_of_the_one_that_follows():
+    """Iterations end after 3, 6 and 9 stretches of 10 steps, with rates of 1, 2 and 3."""
+    rate = [np.nan, np.nan, 1, 1, 1, 2, 2, 2, 3]
+    table = {"seed": np.zeros(9), "steps": np.arange(10, 100, 10), "train/cost_rate": np.array(rate)}
+    run: Any = SimpleNamespace(seeds=[0], table=table, config={})
+    assert studies.cost_so_far(run, np.array([30, 60, 90])).tolist() == [[30, 90, 180]]
 
 
 def test_a_setting_is_called_by_the_few_options_that_its_run_sets(toy, tmp_path):
