@@ -396,7 +396,7 @@ def evaluate(
         sampled: whether actions are sampled, as in training, or the mean ones.
 
     Returns:
-        Printed, a table. `scores.rows` has an estimate (mean, low, high: the 95 % interval
+        Printed, a table. `scores.rows` has an estimate (mean, low, high: the 95% interval
         over seeds, or over the episodes of a lone one) of 'return' and 'cost' (undiscounted sums of an
         episode), 'violation rate' (the share of episodes over the limit), 'episode length' (steps), in
         Safety Gym 'goals' (reached in an episode), 'cost rate (training)' (cost a step) and, where

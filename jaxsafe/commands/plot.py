@@ -5,7 +5,7 @@
 
     OUT/results.md, .tex    return and cost, a row a setting, a column a task; what else is known
     OUT/results.csv         every estimate, a row each
-    OUT/curves.png, .svg    return, cost and cost rate over training, mean and 95 % interval
+    OUT/curves.png, .svg    return, cost and cost rate over training, mean and 95% interval
     OUT/trade_off.png, .svg return against cost, with the limit and the Pareto front
     OUT/scores.png, .svg    Safety Gym's normalised scores over all tasks, mean and IQM
     OUT/profiles.png, .svg  the share of seeds beyond each normalised return and cost

@@ -154,7 +154,7 @@ def table(rows: dict[str, Estimate]) -> str:
         interval = "" if e.low == e.high == e.mean else f"[{e.low:10.4g}, {e.high:10.4g} ]"
         return f"{name:<22}{e.mean:>10.4g}   {interval}".rstrip()
 
-    return "\n".join([f"{'':<22}{'mean':>10}   95 % interval", *(line(n, e) for n, e in rows.items())])
+    return "\n".join([f"{'':<22}{'mean':>10}   95% interval", *(line(n, e) for n, e in rows.items())])
 
 
 def as_json(rows: dict[str, Estimate]) -> dict[str, dict[str, float | None]]:

@@ -24,7 +24,6 @@ FORMATS = ("png", "svg")
 WIDE = 10.5  # inches of the widest figure, which a page shrinks little
 LONG = 30  # letters of a name in the legend that leave the panels too little room
 LETTER = 0.06  # inches, of the legend
-FEWEST = 3  # seeds whose interval is drawn
 ESTIMATED = "estimate, no episode ended yet"
 RATES = {"train/cost_rate": "cost rate so far", "train/overruled": "override rate of the shield"}
 PANELS = (("train/return", "return of an episode"), ("train/cost", "cost of an episode"))
@@ -52,7 +51,7 @@ def curves(
     cost_limit: float,
     own_limits: Mapping[str, float] = MappingProxyType({}),
 ) -> None:
-    """Write the PNG: a line a seed, and for `FEWEST` seeds or more their mean and 95 % interval.
+    """Write the PNG: a line a seed, and for three seeds or more their mean and 95% interval.
 
     Evaluations during training are points on dashed lines, each the mean over seeds.
 
@@ -142,7 +141,7 @@ def draw_setting(
     estimated: bool = False,
 ) -> None:
     """The curves of one setting, `values` [S, T]. Estimates are dashed."""
-    alone, few, ls = len(values) == 1, len(values) < FEWEST, "--" if estimated else "-"
+    alone, few, ls = len(values) == 1, not shows_interval(values), "--" if estimated else "-"
     look = {"lw": 1.2 if few else 0.6, "alpha": 1 if few else 0.4, "color": color, "ls": ls}
     lines = axes.plot(steps, values.T, **look)
     label = ", ".join(filter(None, [setting, ESTIMATED * estimated]))
@@ -151,13 +150,13 @@ def draw_setting(
     else:
         label = label or f"mean of {len(values)} seeds"
         band(axes, measure, steps, values, label, color=color, ls=ls)
-        axes.collections[-1].set_label(None if setting else "95 % interval")
+        axes.collections[-1].set_label(None if setting else "95% interval")
 
 
 def band(
     axes: Axes, measure: str, steps: np.ndarray, values: np.ndarray, label: str, **style: Any
 ) -> None:
-    """Mean over seeds and its 95 % interval, of `values` [S, T] of `measure`."""
+    """Mean over seeds and its 95% interval, of `values` [S, T] of `measure`."""
     e = stats.of_measure(measure, values)
     (line,) = axes.plot(steps, e.mean, lw=2, label=label, **style)
     axes.fill_between(steps, e.low, e.high, color=line.get_color(), alpha=0.2, lw=0)
@@ -167,7 +166,7 @@ def traces(
     axes: Axes, measure: str, steps: np.ndarray, values: np.ndarray, label: str, **style: Any
 ) -> None:
     """A `band`; or a thin line a seed where so few have an interval that says little."""
-    if len(values) >= FEWEST:
+    if shows_interval(values):
         band(axes, measure, steps, values, label, **style)
         return
     first, *_ = axes.plot(steps, values.T, lw=0.9, **style)
@@ -182,8 +181,8 @@ def learning(
     """Return, cost and, where they are known, cost rate so far and override rate over training: a row a
     task, a line a setting.
 
-    A point is the mean over one of at most 50 equal stretches of training; the band is the 95 %
-    interval over seeds. Fewer than `FEWEST` seeds are a thin line each. A line ends where the first of
+    A point is the mean over one of at most 50 equal stretches of training; the band is the 95%
+    interval over seeds. Fewer than three seeds are a thin line each. A line ends where the first of
     its seeds does. The panel holds all means and nearly all seeds. Intervals may reach beyond it.
 
     Args:
@@ -343,6 +342,11 @@ def profiles(suite: Suite) -> Figure:
 
 
 # ---- what the figures share ------------------------------------------------------------------
+
+
+def shows_interval(values: np.ndarray) -> bool:
+    """Whether the interval of these seeds [S, ...] is drawn: that of fewer than three says little."""
+    return len(values) >= 3
 
 
 def grid(count: int, size: tuple[float, float]) -> tuple[Figure, list[Axes]]:

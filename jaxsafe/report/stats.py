@@ -1,4 +1,4 @@
-"""Estimates over seeds and tasks with their 95 % intervals.
+"""Estimates over seeds and tasks with their 95% intervals.
 
 A sample holds one task's values, one a seed: float [S] or, of T numbers at once, [S, T]. Several
 samples are several tasks, whose numbers of seeds may differ. An interval says what other seeds would
@@ -6,7 +6,7 @@ give on the same tasks.
 
 - Means have Student's t interval, over several tasks with Welch's degrees of freedom.
 - Interquartile means have a t interval with the standard error of the stratified bootstrap, which
-  resamples seeds within each task. It covers a little more than 95 %.
+  resamples seeds within each task. It covers a little more than 95%.
 - Shares (profiles, probabilities of improvement) have the stratified bootstrap's percentiles, which
   stay between 0 and 1. With five seeds on one task these cover about 85 %.
 
@@ -33,7 +33,7 @@ DRAWN_AT_ONCE = 10_000_000  # numbers drawn at once
 
 
 class Estimate(NamedTuple):
-    """A number with its 95 % interval; floats, or float [T]."""
+    """A number with its 95% interval; floats, or float [T]."""
 
     mean: float  # or another statistic
     low: float

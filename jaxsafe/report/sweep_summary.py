@@ -29,7 +29,7 @@ def summarise(folder: Path, extras: Extras = NO_EXTRAS) -> str:
     text = markdown(rows)
     files.write(folder / "summary.md", text)
     files.write(folder / "summary.csv", as_csv(rows))
-    title = f"{period(rows)}, mean and 95 % interval"
+    title = f"{period(rows)}, mean and 95% interval"
     title += f"; {plots.ESTIMATED}" * any(row.estimated for row in rows)
     plots.save(trade_off.draw(rows, title), folder / "summary", ["png"])
     return text

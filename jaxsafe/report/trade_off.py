@@ -13,7 +13,7 @@ from jaxsafe.algos import ALGOS
 from jaxsafe.learn.constraints import cost_title
 from jaxsafe.report.group import Group
 from jaxsafe.report.looks import MARKERS, styles
-from jaxsafe.report.plots import FEWEST, PANELS, frame, grid, legend
+from jaxsafe.report.plots import PANELS, frame, grid, legend, shows_interval
 from jaxsafe.report.published import Published
 from jaxsafe.report.stats import Estimate
 
@@ -43,7 +43,7 @@ def draw(
     """Return against cost of each row of a comparison: a panel an environment or, where named costs
     have limits of their own, each of these.
 
-    A point is the mean over seeds, with its 95 % interval if there are `FEWEST` seeds or more. Each
+    A point is the mean over seeds, with its 95% interval if it `shows_interval`. Each
     limit is a dashed line: grey, or in the colour of the one setting it belongs to. Rows that differ in
     their limit alone are a line through their points, in the order of the limits. Each limit stands at
     its point, and is a tick on the axis of cost. Without such rows, grey steps are the Pareto front of
@@ -95,7 +95,7 @@ def draw_panel(axes: Axes, points: Sequence[Point]) -> None:
         for i, p in enumerate(chain):
             axes.plot(p.costs, p.row.returns, ".", color=color, ms=4, alpha=0.5)
             look = {"fmt": marker, "ms": 5, "lw": 1, "color": color, "label": "" if i else label}
-            if len(p.costs) >= FEWEST:
+            if shows_interval(p.costs):
                 look["xerr"] = [[p.cost.mean - p.cost.low], [p.cost.high - p.cost.mean]]
                 look["yerr"] = [[p.ret.mean - p.ret.low], [p.ret.high - p.ret.mean]]
             axes.errorbar(p.cost.mean, p.ret.mean, **look)
