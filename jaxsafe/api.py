@@ -222,7 +222,7 @@ class Run:
 class SweepResult(NamedTuple):
     """A trained sweep; printed, it is the table of its settings.
 
-    folder: with summary.md, summary.csv and summary.png, and a run folder for each program.
+    folder: with the files of the summary, and a run folder for each program.
     rows: one a setting: `row.name`, `row.cost_limit`, `row.ret` and `row.cost` (mean, low, high over
         seeds of the last 10 % of training, or of the final evaluation where training plays no
         episodes), `row.returns` and `row.costs`, float [S], and `row.held`,

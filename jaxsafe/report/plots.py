@@ -395,9 +395,9 @@ def write(figure: Figure, path: Path, **how: Any) -> None:
         figure.savefig(part, **how)
 
 
-def save(figure: Figure, path: Path, formats: Sequence[str] = FORMATS) -> None:
+def save(figure: Figure, path: Path) -> None:
     """Write `path` with each suffix; the same figure is the same file."""
-    for suffix in formats:
+    for suffix in FORMATS:
         with matplotlib.rc_context({"svg.hashsalt": "jaxsafe"}):
             about = {"Date": None} if suffix == "svg" else None
             write(figure, path.with_suffix(f".{suffix}"), dpi=120, metadata=about)

@@ -24,14 +24,15 @@ def rows_of(folder: Path, extras: Extras = NO_EXTRAS) -> list[Group]:
 
 
 def summarise(folder: Path, extras: Extras = NO_EXTRAS) -> str:
-    """Write summary.md, .csv and .png of a sweep; returns the table."""
+    """Write summary.md, .csv, .png and .svg of a sweep; returns the table."""
     rows = rows_of(folder, extras)
     text = markdown(rows)
     files.write(folder / "summary.md", text)
     files.write(folder / "summary.csv", as_csv(rows))
-    title = f"{period(rows)}, mean and 95% interval"
+    title = period(rows)
+    title += ", mean and 95% interval" * any(plots.shows_interval(row.costs) for row in rows)
     title += f"; {plots.ESTIMATED}" * any(row.estimated for row in rows)
-    plots.save(trade_off.draw(rows, title), folder / "summary", ["png"])
+    plots.save(trade_off.draw(rows, title), folder / "summary")
     return text
 
 

@@ -18,6 +18,7 @@ from jaxsafe.report.published import Published
 from jaxsafe.report.stats import Estimate
 
 REACH = 4  # limits that the cost axis shows, where points lie farther out
+NUMBER = 0.04  # of a panel's width and height, which the number of a limit takes
 STRIP = 0.3  # of a panel's width, for the figures of those points
 GREY = "0.45"
 
@@ -32,6 +33,7 @@ class Point(NamedTuple):
     costs: np.ndarray  # [S]
     style: dict[str, Any]  # its colour and line
     published: Published | None
+    swept: bool = False  # others in the panel differ from it in their limit alone
 
 
 def draw(
@@ -43,11 +45,12 @@ def draw(
     """Return against cost of each row of a comparison: a panel an environment or, where named costs
     have limits of their own, each of these.
 
-    A point is the mean over seeds, with its 95% interval if it `shows_interval`. Each
-    limit is a dashed line: grey, or in the colour of the one setting it belongs to. Rows that differ in
-    their limit alone are a line through their points, in the order of the limits. Each limit stands at
-    its point, and is a tick on the axis of cost. Without such rows, grey steps are the Pareto front of
-    the means within their limits. A hollow diamond is the mean that was published.
+    A point is the mean over seeds, with its 95% interval if it `shows_interval`. Each limit is a dashed
+    line: grey, or in the colour of the one setting it belongs to. Rows that differ in their limit alone
+    are a line through their points, in the order of the limits. The number of each limit stands on its
+    point, in one box where points lie on each other, and each limit is a tick on the axis of cost.
+    Without such rows, grey steps are the Pareto front of the means within their limits. A hollow
+    diamond is the mean that was published.
 
     The frame holds all seeds, means and limits. Intervals may reach beyond it. It ends at `REACH`
     limits, unless most points lie beyond. The strip on its right has an arrow for each mean beyond it,
@@ -79,42 +82,25 @@ def draw(
         draw_panel(axes, points)
         axes.set(title=env, xlabel=f"{name or 'cost'} of an episode", ylabel=PANELS[0][1])
     legend(figure, panels, [*looks, *(without_limit(row) for row in rows)])
-    figure.suptitle(title)
+    figure.suptitle(title, wrap=True)
     return figure
 
 
 def draw_panel(axes: Axes, points: Sequence[Point]) -> None:
+    chains = in_chains(points)
+    points = [p for chain in chains for p in chain]
     most = cut(points)
     axes.set(**frames(points, most))
-    sweeps = chains(points)
-    for chain in sweeps:
-        alone = len(chain) == 1
-        label = chain[0].row.name if alone else without_limit(chain[0].row)
-        style = next((p for p in chain if p.row.name == label), chain[0]).style
-        color, marker = style["color"], MARKERS[style["ls"]]
-        for i, p in enumerate(chain):
-            axes.plot(p.costs, p.row.returns, ".", color=color, ms=4, alpha=0.5)
-            look = {"fmt": marker, "ms": 5, "lw": 1, "color": color, "label": "" if i else label}
-            if shows_interval(p.costs):
-                look["xerr"] = [[p.cost.mean - p.cost.low], [p.cost.high - p.cost.mean]]
-                look["yerr"] = [[p.ret.mean - p.ret.low], [p.ret.high - p.ret.mean]]
-            axes.errorbar(p.cost.mean, p.ret.mean, **look)
-            if not alone:
-                place = (p.cost.mean, p.ret.mean)
-                axes.annotate(
-                    f"{p.limit:g}", place, (4, 4), textcoords="offset points", color=GREY, size=7
-                )
-        if not alone:
-            axes.plot([p.cost.mean for p in chain], [p.ret.mean for p in chain], color=color, lw=1)
-    swept = [p.limit for chain in sweeps if len(chain) > 1 for p in chain]
-    if swept:
+    for chain in chains:
+        draw_chain(axes, chain, most)
+    if limits := {p.limit for p in points if p.swept}:
         axes.xaxis.remove_overlapping_locs = False  # a limit of 10 is a tick, too, beside a label of 10
-        axes.set_xticks(sorted({*swept}), minor=True)
+        axes.set_xticks(sorted(limits), minor=True)
         axes.tick_params("x", which="minor", direction="in", length=8, width=1.5, color=GREY)
-        axes.plot([], [], "|", color=GREY, ms=8, mew=1.5, label="cost limits, the numbers at points")
+        axes.plot([], [], "|", color=GREY, ms=8, mew=1.5, label="cost limits, the numbers on points")
     elif kept := [(p.cost.mean, p.ret.mean) for p in points if keeps_limit(p)]:
         axes.plot(*front(kept), color="0.8", lw=3, zorder=0, label="front within the limit")
-    draw_limits(axes, [chain[0] for chain in sweeps if len(chain) == 1])
+    draw_limits(axes, [p for p in points if not p.swept])
     for (ret, cost), color in theirs(points).items():
         if cost <= most:
             axes.plot(cost, ret, "D", mfc="none", ms=6, color=color)
@@ -123,12 +109,62 @@ def draw_panel(axes: Axes, points: Sequence[Point]) -> None:
     draw_beyond(axes, points, most)
 
 
-def chains(points: Sequence[Point]) -> list[list[Point]]:
-    """The points of rows that differ in their limit alone, in the order of the limits."""
+def draw_chain(axes: Axes, chain: Sequence[Point], most: float) -> None:
+    """Means, intervals and seeds. Of several points also the line through them, and their limits."""
+    first = chain[0]
+    color, marker = first.style["color"], MARKERS[first.style["ls"]]
+    label = without_limit(first.row) if first.swept else first.row.name
+    for i, p in enumerate(chain):
+        axes.plot(p.costs, p.row.returns, ".", color=color, ms=4, alpha=0.5)
+        look = {"fmt": marker, "ms": 5, "lw": 1, "color": color, "label": "" if i else label}
+        if shows_interval(p.costs):
+            look["xerr"] = [[p.cost.mean - p.cost.low], [p.cost.high - p.cost.mean]]
+            look["yerr"] = [[p.ret.mean - p.ret.low], [p.ret.high - p.ret.mean]]
+        axes.errorbar(p.cost.mean, p.ret.mean, **look)
+    if not first.swept:
+        return
+    axes.plot([p.cost.mean for p in chain], [p.ret.mean for p in chain], color=color, lw=1)
+    for heap in heaps(axes, [p for p in chain if p.cost.mean <= most]):
+        x, y = np.mean([(p.cost.mean, p.ret.mean) for p in heap], axis=0)
+        axes.text(x, y, ", ".join(f"{p.limit:g}" for p in heap), **boxed(color, "round"))
+
+
+def heaps(axes: Axes, chain: Sequence[Point]) -> list[list[Point]]:
+    """The points, those together whose numbers would cover each other."""
+    width, height = np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim())
+
+    def near(p: Point, q: Point) -> bool:
+        x, y = p.cost.mean - q.cost.mean, p.ret.mean - q.ret.mean
+        return bool(abs(x) < NUMBER * width and abs(y) < NUMBER * height)
+
+    found: list[list[Point]] = []
+    for p in chain:
+        heap = next((heap for heap in found if near(p, heap[0])), None)
+        if heap is None:
+            found.append([p])
+        else:
+            heap.append(p)
+    return found
+
+
+def boxed(color: str, shape: str) -> dict[str, Any]:
+    """How the number of a limit looks, in a box of its line's colour."""
+    box = {"boxstyle": f"{shape},pad=0.15", "fc": "white", "ec": color, "lw": 0.8}
+    return {"size": 7, "ha": "center", "va": "center", "bbox": box}
+
+
+def in_chains(points: Sequence[Point]) -> list[list[Point]]:
+    """The points of rows that differ in their limit alone, in the order of the limits and in one style:
+    that of a row whose name has no limit, or the first's."""
     found: dict[str, list[Point]] = {}
     for p in points:
         found.setdefault(without_limit(p.row), []).append(p)
-    return [sorted(chain, key=lambda p: p.limit) for chain in found.values()]
+    chains = []
+    for name, chain in found.items():
+        style = next((p for p in chain if p.row.name == name), chain[0]).style
+        chain = [p._replace(style=style, swept=len(chain) > 1) for p in chain]
+        chains.append(sorted(chain, key=lambda p: p.limit))
+    return chains
 
 
 def without_limit(row: Group) -> str:
@@ -180,11 +216,15 @@ class Beyond(NamedTuple):
     cost: float
     color: str
     hollow: bool  # it was published
+    limit: str = ""  # of a sweep
 
 
 def beyond(points: Sequence[Point], most: float) -> list[Beyond]:
     """The means that cost more than `most`, the highest return first."""
-    found = [Beyond(p.ret.mean, p.cost.mean, p.style["color"], False) for p in points]
+    found = [
+        Beyond(p.ret.mean, p.cost.mean, p.style["color"], False, f"{p.limit:g}" if p.swept else "")
+        for p in points
+    ]
     found += [Beyond(*mean, color, True) for mean, color in theirs(points).items()]
     return sorted((x for x in found if x.cost > most), key=lambda x: -x.ret)
 
@@ -205,9 +245,12 @@ def draw_beyond(axes: Axes, points: Sequence[Point], most: float) -> None:
             color = "0.2" if i else GREY
             axes.text(x, 0.96 - gap * i, text, ha="right", va="center", size=7, color=color, **look)
     for i, x in enumerate(found, 1):
-        face = "none" if x.hollow else x.color
         place = (1 - 0.92 * STRIP, 0.96 - gap * i)
-        axes.plot(*place, ">", ms=5, color=x.color, mfc=face, **look)
+        if x.limit:
+            axes.text(*place, x.limit, **boxed(x.color, "rarrow"), **look)
+        else:
+            face = "none" if x.hollow else x.color
+            axes.plot(*place, ">", ms=5, color=x.color, mfc=face, **look)
     axes.plot([], [], ">", ms=5, color=GREY, label="costs more than the axis shows")
 
 

@@ -290,7 +290,7 @@ def test_a_sweep_of_limits_is_a_line_an_algorithm_in_the_order_of_the_limits(tmp
             write(folder, algo=algo, returns=returns, costs=found, seeds=(0, 1, 2), cost_limit=limit)
     figure = trade_off.draw(compared(tmp_path), "")
     (axes,) = figure.axes
-    assert in_the_legend(figure) == ["cpo", "ppo_lag", "cost limits, the numbers at points"]
+    assert in_the_legend(figure) == ["cpo", "ppo_lag", "cost limits, the numbers on points"]
     drawn = [line for line in axes.lines if len(points_of(line)) == 3]
     lines = [line for line in drawn if line.get_linestyle() == "-"]
     means = [3, 31 / 3, 26]
@@ -299,6 +299,25 @@ def test_a_sweep_of_limits_is_a_line_an_algorithm_in_the_order_of_the_limits(tmp
         np.testing.assert_allclose(points_of(line), [(mean, mean + more) for mean in means])
     assert [text.get_text() for text in axes.texts] == 2 * ["2.5", "10", "25"]
     assert list(axes.get_xticks(minor=True)) == [2.5, 10, 25]
+
+
+def test_limits_share_a_number_box_where_points_lie_on_each_other_and_have_an_arrow_beyond(tmp_path):
+    for limit, cost in ((1.0, 3.0), (5.0, 3.0), (20.0, 30.0), (2.0, 200.0), (25.0, 300.0)):
+        write(tmp_path / f"{limit:g}", costs=(cost, cost + 1), cost_limit=limit)
+    figure = trade_off.draw(compared(tmp_path), "")
+    (axes,) = figure.axes
+    found = [text.get_text() for text in axes.texts]
+    assert found == ["1, 5", "20", "return", "cost", "2", "200", "2", "300", "2", "25"]
+    boxes = [box for text in axes.texts if (box := text.get_bbox_patch())]
+    assert len({box.get_edgecolor() for box in boxes}) == 1, "a line and its arrows differ in colour"
+
+
+def test_a_long_title_is_not_cut_off_above_one_panel(tmp_path):
+    write(tmp_path / "a")
+    figure = trade_off.draw(compared(tmp_path), 3 * "last 10% of training, mean and 95% interval; ")
+    figure.draw_without_rendering()
+    box = figure.texts[0].get_window_extent()
+    assert 0 <= box.x0 < box.x1 <= figure.bbox.width
 
 
 def test_a_mean_far_over_the_limit_is_an_arrow_and_not_on_the_front(tmp_path):
