@@ -319,14 +319,13 @@ def in_order(study: Study, runs: Sequence[SettingRun]) -> list[Group]:
     """The groups of each setting and task, in the order of the runs, the order of their worth.
 
     A name has what tells settings apart, and the options that a run sets where they are few. What a
-    preset says anyway is not in it. Lengths are, where they differ and the study sets them.
+    preset says anyway is not in it. Lengths are, where they differ and the study's runs set them.
+    Preset, conventions and devices are, too, even before there is a second run to be told apart.
     """
     lengths = {"total_steps", "total_updates"}
-    long = {name for name in lengths if any(f"{name}=" in run for run in study.runs)}
-    by = [name for name in telling(runs) if name not in lengths - long]
-    for name in ("compat", "devices"):
-        if name not in by and len({run.config[name] for run in runs}) > 1:
-            by.append(name)
+    given = {word.partition("=")[0] for run in study.runs for word in run.split()}
+    by = [name for name in telling(runs) if name not in lengths - given]
+    by += [name for name in ("preset", "compat", "devices") if name in given and name not in by]
     options = {study_files.name_of(run): few_options(run) for run in study.runs}
     odd = {study_files.name_of(run): names for run, names in once_unusual(study).items()}
     told = {run.config["run_dir"]: options.get(Path(run.config["run_dir"]).name, []) for run in runs}

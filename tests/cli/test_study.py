@@ -51,7 +51,7 @@ def trained(folder: Path, options: list[str], steps: int = 4000, nonfinite: Any 
     algo = {"name": given["algo"]} | ({"dual_lr": 0.2} if "algo.dual_lr" in given else {})
     folder.mkdir(parents=True)
     config = {"env": {"name": given["env"]}, "algo": algo, "total_steps": 4000, "num_seeds": 2}
-    config |= {"dataset": given["dataset"]} if "dataset" in given else {}
+    config |= {name: given[name] for name in ("dataset", "preset") if name in given}
     run_folder.write_config(folder, config)
     run_folder.append_versions(folder, "abacus", "c")
     names = [*study_files.CURVES, "train/nonfinite"]
@@ -220,6 +220,17 @@ def test_a_setting_is_called_by_the_few_options_that_its_run_sets(toy, tmp_path)
     assert names == ["cpo", "ppo_lag, algo.dual_lr=0.2", "cpo"]
     assert studies.few_options("algo=cpo num_envs=8 algo.a=1 algo.b=2 algo.c=3 algo.d=4") == []
     assert studies.few_options("algo.a=1 total_steps=1e6") == ["algo.a", "total_steps"]
+
+
+def test_a_lone_run_has_its_preset_in_its_name(toy, tmp_path):
+    runs = TOY.replace("algo=cpo", "algo=cpo preset=published")
+    (toy.folder / "study.yaml").write_text(runs)
+    study = studies.read(toy.folder)
+    run = study.runs[0]
+    trained(tmp_path / "run", study.command(run))
+    (found,) = read_one(tmp_path / "run")
+    studies.add(study, run, found, study_files.Origin())
+    assert [g.name for g in studies.in_order(study, read([study.folder]))] == ["cpo, preset=published"]
 
 
 def test_a_setting_keeps_the_options_that_were_unusual_when_it_was_made(toy, tmp_path):
