@@ -12,7 +12,7 @@ from jaxsafe.learn.observations import observation_like
 from jaxsafe.learn.planning import planning_bytes
 from jaxsafe.run import checkpoint, programs
 from jaxsafe.run.programs import Program
-from jaxsafe.run.settings import Settings, TrainConfig
+from jaxsafe.run.settings import Settings
 from jaxsafe.types import Env
 
 WORKING_SIZES = ("batch_size", "model_batch", "plans", "shield_rollouts")
@@ -29,22 +29,26 @@ def check_memory(env: Env, settings: Settings) -> None:
     Lower bounds. Of a trajectory: observations before and after each step, actions and a few scalars.
     """
     limit, what = device_memory()
-    like = observation_like(env)
-    seen = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(like))
+    seen = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(observation_like(env)))
     step = 2 * seen + 4 * (env.action_size + 8 + len(env.cost_names))  # bytes
     steps = settings.row.make(env, None).clocks(settings.algo).steps
     members = len(settings.configs) * settings.train.num_seeds
     need = step * steps * members // settings.train.devices
     if need > limit:
-        pictures = isinstance(like, dict) and "vision_size" in settings.env_options
         raise TooLarge(
             f"{steps:,} environment steps an update x {members} seeds needs at least "
             f"{need / 2**30:,.1f} GiB a device, {what} has {limit / 2**30:,.1f}; use fewer num_envs"
-            + (" or a smaller env.vision_size" if pictures else "")
+            + " or a smaller env.vision_size"
+            * sees_pictures(env, settings)
         )
     if isinstance(settings.algo, ModelBasedConfig):
         check_plans(env, settings, members)
     check_episodes(env, settings.train.eval_episodes, members)
+
+
+def sees_pictures(env: Env, settings: Settings) -> bool:
+    """Whether observations have a picture whose size is an option."""
+    return isinstance(observation_like(env), dict) and "vision_size" in settings.env_options
 
 
 def check_plans(env: Env, settings: Settings, members: int) -> None:
@@ -72,22 +76,24 @@ def check_episodes(env: Env, episodes: int, policies: int) -> None:
         )
 
 
-def check_state_memory(program: Program, train_cfg: TrainConfig) -> None:
+def check_state_memory(program: Program, env: Env, settings: Settings) -> None:
     """Like `check_memory`, for the train state itself, known once it is traced: old and new, but a
     replay only once, as it is written in place. Every device has the whole data set."""
     limit, what = device_memory()
+    devices = settings.train.devices
     like = jax.eval_shape(program.init, program.start, program.shared())
     whole = sum(x.size * x.dtype.itemsize for x in checkpoint.as_data(like).values())
     replay = checkpoint.replay_bytes(like)
     data = sum(x.nbytes for x in jax.tree.leaves(program.data))
-    need = (2 * (whole - replay) + replay) / train_cfg.devices + data
+    need = (2 * (whole - replay) + replay) / devices + data
     if need > limit:
-        part = f" ({replay / train_cfg.devices / 2**30:,.1f} GiB of it replay)" if replay else ""
+        part = f" ({replay / devices / 2**30:,.1f} GiB of it replay)" if replay else ""
         part += f" ({data / 2**30:,.1f} GiB of it the data set)" if data else ""
-        less = "a smaller algo.replay_size or " if replay > whole / 2 else "fewer num_envs or "
+        sizes = ["algo.replay_size"] + ["env.vision_size"] * sees_pictures(env, settings)
+        less = f"a smaller {', '.join(sizes)}" if replay > whole / 2 else "fewer num_envs"
         raise TooLarge(
             f"the train state needs {need / 2**30:,.1f} GiB a device{part}, {what} has "
-            f"{limit / 2**30:,.1f}; use {less}num_seeds"
+            f"{limit / 2**30:,.1f}; use {less} or num_seeds"
         )
 
 

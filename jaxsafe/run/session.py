@@ -170,7 +170,7 @@ def prepare(settings: Settings) -> tuple[Env, Program]:
     for cfg in settings.configs:
         settings.row.check(cfg, env, data)
     program = build(env, settings.row.make, settings.configs, train, data)
-    check_state_memory(program, train)
+    check_state_memory(program, env, settings)
     return env, program
 
 
