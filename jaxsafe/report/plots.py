@@ -199,48 +199,62 @@ def learning(
     looks = looks or styles(groups)
     rows = figure.subplots(len(envs), len(names), squeeze=False)
     for env, panels in zip(envs, rows, strict=True):
-        cost = panels[1]
         shown = [g for g in groups if g.env == env]
-        runs = [run for g in shown for run in g.runs]
-        count = min(50, *(len(np.unique(run.table["iteration"])) for run in runs))
-        edges = np.linspace(0, max(run.steps for run in runs), count + 1)
-        held: dict[str, list[float]] = {name: [] for name in names}  # what the panels must hold
-        for g in shown:
-            for axes, name in zip(panels, names, strict=True):
-                if all(name in run.table for run in g.runs):
-                    guess = g.estimated and name not in RATES
-                    column = run_folder.estimate_of(name) if guess else name
-                    values = np.concatenate([stretches(run.table, column, edges) for run in g.runs])
-                    label = f"{g.name}, {ESTIMATED}" if guess else g.name
-                    style = looks[g.name] | ({"ls": "--"} if guess else {})
-                    if np.isfinite(values).any():
-                        traces(axes, name, edges[1:], values, label, **style)
-                        held[name] += extent(values)
-        limits = [g.cost_limit for g in shown]
-        for g in shown:
-            alone = limits.count(g.cost_limit) == 1 and len(set(limits)) > 1
-            if alone or g is shown[limits.index(g.cost_limit)]:
-                color = looks[g.name]["color"] if alone else "0.4"
-                cost.axhline(g.cost_limit, color=color, ls="--", lw=1)
-                held["train/cost"].append(g.cost_limit)
-        for g in shown:
-            if end := ends.get((env, g.name)):
-                for axes, y in zip(panels, (end.ret, end.cost), strict=False):
-                    color = looks[g.name]["color"]
-                    axes.plot(end.steps, y, "D", mfc="none", ms=6, color=color, clip_on=False, zorder=4)
-                    held[names[[*panels].index(axes)]].append(y)
-        for axes, name in zip(panels, names, strict=True):
-            axes.set_visible(bool(axes.lines))  # not a rate that no run of this task has
-            what = RATES.get(name) or f"{name.removeprefix('train/')} of an episode"
-            axes.set(title=env, ylabel=what, xlim=(0, edges[-1]), ylim=frame(held[name]))
-            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-        clocks = dict.fromkeys(axis_of(run.table) for run in runs)
-        for axes in panels:
-            axes.set_xlabel(" or ".join(clocks))
+        draw_task(dict(zip(names, panels, strict=True)), shown, looks, ends)
     if any((g.env, g.name) in ends for g in groups):
         rows[0, 0].plot([], [], "D", mfc="none", ms=6, color="0.45", label="end of the published curve")
     legend(figure, rows.ravel(), looks)
     return figure
+
+
+def draw_task(
+    panels: Mapping[str, Axes],
+    groups: Sequence[Group],
+    looks: Mapping[str, dict[str, Any]],
+    ends: Mapping[tuple[str, str], CurveEnd],
+) -> None:
+    """The row of one task in `learning`: `panels` by their metric."""
+    runs = [run for g in groups for run in g.runs]
+    count = min(50, *(len(np.unique(run.table["iteration"])) for run in runs))
+    edges = np.linspace(0, max(run.steps for run in runs), count + 1)
+    held: dict[str, list[float]] = {name: [] for name in panels}  # what the panels must hold
+    for g in groups:
+        for name, axes in panels.items():
+            if all(name in run.table for run in g.runs):
+                guess = g.estimated and name not in RATES
+                column = run_folder.estimate_of(name) if guess else name
+                values = np.concatenate([stretches(run.table, column, edges) for run in g.runs])
+                label = f"{g.name}, {ESTIMATED}" if guess else g.name
+                style = looks[g.name] | ({"ls": "--"} if guess else {})
+                if np.isfinite(values).any():
+                    traces(axes, name, edges[1:], values, label, **style)
+                    held[name] += extent(values)
+    colors = [looks[g.name]["color"] for g in groups]
+    for limit, color in limit_colors([g.cost_limit for g in groups], colors, "0.4").items():
+        panels["train/cost"].axhline(limit, color=color, ls="--", lw=1)
+        held["train/cost"].append(limit)
+    for g, color in zip(groups, colors, strict=True):
+        if end := ends.get((g.env, g.name)):
+            for name, y in (("train/return", end.ret), ("train/cost", end.cost)):
+                look = {"mfc": "none", "ms": 6, "color": color, "clip_on": False, "zorder": 4}
+                panels[name].plot(end.steps, y, "D", **look)
+                held[name].append(y)
+    clocks = " or ".join(dict.fromkeys(axis_of(run.table) for run in runs))
+    for name, axes in panels.items():
+        axes.set_visible(bool(axes.lines))  # not a rate that no run of this task has
+        what = RATES.get(name) or f"{name.removeprefix('train/')} of an episode"
+        frames = {"xlim": (0, edges[-1]), "ylim": frame(held[name])}
+        axes.set(title=groups[0].env, xlabel=clocks, ylabel=what, **frames)
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+
+
+def limit_colors(limits: Sequence[float], colors: Sequence[str], grey: str) -> dict[float, str]:
+    """The colour of each limit's line: of the one setting that it belongs to, or grey where the others
+    have it, too. `limits` and `colors` are of settings; NaN is no limit."""
+    known = [x for x in limits if not np.isnan(x)]
+    alone = {x for x in known if known.count(x) == 1 and len({*known}) > 1}
+    pairs = zip(limits, colors, strict=True)
+    return {x: color if x in alone else grey for x, color in pairs if not np.isnan(x)}
 
 
 def extent(values: np.ndarray) -> list[float]:

@@ -13,7 +13,7 @@ from jaxsafe.algos import ALGOS
 from jaxsafe.learn.constraints import cost_title
 from jaxsafe.report.group import Group
 from jaxsafe.report.looks import MARKERS, styles
-from jaxsafe.report.plots import PANELS, frame, grid, legend, shows_interval
+from jaxsafe.report.plots import PANELS, frame, grid, legend, limit_colors, shows_interval
 from jaxsafe.report.published import Published
 from jaxsafe.report.stats import Estimate
 
@@ -200,13 +200,9 @@ def frames(points: Sequence[Point], most: float) -> dict[str, tuple[float, float
 
 
 def draw_limits(axes: Axes, points: Sequence[Point]) -> None:
-    limits = [p.limit for p in points]
-    several = len({x for x in limits if not np.isnan(x)}) > 1
-    for i, p in enumerate(points):
-        if p.limit not in limits[:i] and not np.isnan(p.limit):
-            alone = several and limits.count(p.limit) == 1
-            color = p.style["color"] if alone else "0.5"
-            axes.axvline(p.limit, color=color, ls="--", lw=1, label="" if alone else "cost limit")
+    colors = [p.style["color"] for p in points]
+    for limit, color in limit_colors([p.limit for p in points], colors, "0.5").items():
+        axes.axvline(limit, color=color, ls="--", lw=1, label="cost limit" if color == "0.5" else "")
 
 
 class Beyond(NamedTuple):

@@ -320,6 +320,12 @@ def test_a_long_title_is_not_cut_off_above_one_panel(tmp_path):
     assert 0 <= box.x0 < box.x1 <= figure.bbox.width
 
 
+def test_a_limit_has_the_colour_of_the_one_setting_that_it_belongs_to_and_else_is_grey():
+    limits, colors = [5.0, 25.0, np.nan, 25.0], ["red", "green", "blue", "black"]
+    assert plots.limit_colors(limits, colors, "grey") == {5.0: "red", 25.0: "grey"}
+    assert plots.limit_colors(limits[2:], colors[2:], "grey") == {25.0: "grey"}
+
+
 def test_a_mean_far_over_the_limit_is_an_arrow_and_not_on_the_front(tmp_path):
     three: dict[str, Any] = {"seeds": (0, 1, 2)}
     write(tmp_path / "a", algo="cpo", returns=(1, 2, 3), costs=(18, 20, 22), **three)
