@@ -71,15 +71,6 @@ DSRL = {
     "walker2d_velocity": (18.66849899, 3418.223877),
 }
 
-# The paper's suites: SG6 by name, the others by level and robot.
-SG6 = ("car_goal1", "doggo_goal1", "point_button1", "point_goal1", "point_goal2", "point_push1")
-SG18 = tuple(CHARACTERISTIC)
-SG1 = tuple(name for name in SG18 if name.endswith("1"))
-SG2 = tuple(name for name in SG18 if name.endswith("2"))
-SG_POINT = tuple(name for name in SG18 if name.startswith("point"))
-SG_CAR = tuple(name for name in SG18 if name.startswith("car"))
-SG_DOGGO = tuple(name for name in SG18 if name.startswith("doggo"))
-
 
 def normalized_return(env: str, ret):
     return ret / CHARACTERISTIC[env].ret

@@ -27,7 +27,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy  # scipy.stats takes a second to import, and is imported at its first use
 
-DRAWS = 10_000
+DRAWS = 10_000  # bootstrap samples
 CONFIDENCE = 0.95
 DRAWN_AT_ONCE = 10_000_000  # numbers drawn at once
 
@@ -129,16 +129,14 @@ def bootstrapped(
     return np.array([middle - width, middle + width])
 
 
-def probability_of_improvement(
-    ours: Sequence[np.ndarray], theirs: Sequence[np.ndarray], draws: int = DRAWS
-) -> Estimate:
+def probability_of_improvement(ours: Sequence[np.ndarray], theirs: Sequence[np.ndarray]) -> Estimate:
     """P(a seed of `ours` > a seed of `theirs`), the mean over tasks; equal values count one half.
 
     Args:
         ours, theirs: float [S] for each task, in the same order of tasks.
     """
     both = partial(_share_above, tasks=len(ours))
-    return estimate(*ours, *theirs, statistic=both, draws=draws)
+    return estimate(*ours, *theirs, statistic=both)
 
 
 def _share_above(*samples: np.ndarray, axis: int, tasks: int) -> np.ndarray:
@@ -149,10 +147,10 @@ def _share_above(*samples: np.ndarray, axis: int, tasks: int) -> np.ndarray:
     return np.mean([share(*xy) for xy in zip(samples[:tasks], samples[tasks:], strict=True)], axis=0)
 
 
-def profile(samples: Sequence[np.ndarray], thresholds: np.ndarray, draws: int = 2000) -> Estimate:
+def profile(samples: Sequence[np.ndarray], thresholds: np.ndarray) -> Estimate:
     """The performance profile: the share of seeds above each threshold, the mean over tasks, [T]."""
 
     def share(*above: np.ndarray, axis: int) -> np.ndarray:
         return mean(*above, axis=axis)
 
-    return estimate(*(x[:, None] > thresholds for x in samples), statistic=share, draws=draws)
+    return estimate(*(x[:, None] > thresholds for x in samples), statistic=share, draws=2_000)

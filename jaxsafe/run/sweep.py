@@ -5,7 +5,7 @@ parts: of whole settings or, where the seeds of one setting are too many, of see
 
     SWEEP/sweep.yaml                   what was asked; how many members of a group run at once
     SWEEP/000-<env>-<algo>...[.part0]/ a run folder as of train.py, of a group or a part of one
-    SWEEP/summary.md, .csv, .png       a row a setting, rewritten after each run folder
+    SWEEP/summary.md, .csv, .png, .svg a row a setting, rewritten after each run folder
 """
 
 import itertools

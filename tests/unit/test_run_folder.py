@@ -157,8 +157,7 @@ def test_unconstrained_ppo_scores_one_and_a_safe_policy_violates_by_zero():
         assert scores.normalized_return(env, ppo.ret) == 1
         assert scores.normalized_violation(env, ppo.cost) == pytest.approx(1)
         assert str(scores.normalized_violation(env, 3.0)) == "0.0"
-    assert len(scores.SG18) == 18 and set(scores.SG6) < set(scores.SG18)
-    assert len(scores.SG1) == len(scores.SG2) == 9 and len(scores.SG_DOGGO) == 6
+    assert len(scores.CHARACTERISTIC) == 18
 
 
 def test_progress_reads_the_newest_manifest(tmp_path):
