@@ -85,7 +85,7 @@ class Group(NamedTuple):
 
     @property
     def evaluated(self) -> bool:
-        """Whether return and costs of every run are of its final evaluation, as training has none."""
+        """Whether return and costs of every run are of its final evaluation."""
         return all(run.evaluated for run in self.runs)
 
     @property

@@ -43,7 +43,7 @@ class SettingRun(NamedTuple):
     seeds: np.ndarray  # [S]
     values: dict[str, np.ndarray]  # [S] by name; NaN for a seed without complete episodes
     estimated: bool = False  # no episode has ended yet, so return and cost are estimates from all steps
-    evaluated: bool = False  # training has no episodes, so return and costs are the final evaluation's
+    evaluated: bool = False  # return and costs are the final evaluation's
 
     @property
     def setting(self) -> dict[str, Any]:
@@ -153,10 +153,13 @@ def read_one(folder: Path, extras: Extras = NO_EXTRAS) -> list[SettingRun]:
 
 
 def or_evaluated(run: SettingRun) -> SettingRun:
-    """The run; where training has no episodes, with the final evaluation's return and costs."""
+    """`with_evaluation` where training has no episodes, else the run."""
     known = "final return" in run.values and not np.isfinite(run.values["return"]).any()
-    if run.clock == "steps" or not known:
-        return run
+    return run if run.clock == "steps" or not known else with_evaluation(run)
+
+
+def with_evaluation(run: SettingRun) -> SettingRun:
+    """The run, with return and costs of its final evaluation in place of those of training."""
     shown = {"return", "cost", *map(cost_title, run.limits)}
     found = {name: run.values[f"final {name}"] for name in shown if f"final {name}" in run.values}
     values = run.values | found

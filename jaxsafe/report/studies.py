@@ -37,7 +37,7 @@ from jaxsafe.report import plots, scores, stats, study_files, tables, trade_off
 from jaxsafe.report.group import Group, group, tasks_of, telling
 from jaxsafe.report.looks import styles
 from jaxsafe.report.published import Published, beside, end_beside, read_ends, read_published
-from jaxsafe.report.read import SettingRun, defaults
+from jaxsafe.report.read import SettingRun, defaults, with_evaluation
 from jaxsafe.report.read import read as read_runs
 from jaxsafe.report.study_files import CURVES, POINTS, Origin
 from jaxsafe.run import files, run_folder
@@ -427,12 +427,8 @@ def save_small(figure: Figure, path: Path) -> None:
 def evaluated(runs: Sequence[SettingRun]) -> list[SettingRun]:
     """The runs with what their final policies made in fresh episodes in place of what training made;
     without those whose evaluation was not kept."""
-    names = ("return", "cost")
-    known = [run for run in runs if np.isfinite(run.values.get("final cost", np.nan)).all()]
-    return [
-        run._replace(values={**run.values, **{name: run.values[f"final {name}"] for name in names}})
-        for run in known
-    ]
+    known = (run for run in runs if np.isfinite(run.values.get("final cost", np.nan)).all())
+    return [with_evaluation(run) for run in known]
 
 
 def final(groups: Sequence[Group]) -> list[Group]:
