@@ -33,7 +33,7 @@ from jaxsafe.learn.row import Row
 from jaxsafe.learn.sequences import SequenceBatch, drawn_sequences, lambda_returns
 from jaxsafe.learn.steps import Trainable, adam, descend_each, follow
 from jaxsafe.learn.treatments import LagrangianConfig, Treatment, initial_price, lagrangian
-from jaxsafe.nn.beta import Beta, beta_mode, beta_policy, beta_sample, init_beta
+from jaxsafe.nn.beta import Beta, beta_policy, beta_sample, init_beta
 from jaxsafe.nn.critics import init_critics, q_values, smallest
 from jaxsafe.types import Algorithm, Count, Env, Metrics, PyTree
 
@@ -209,9 +209,10 @@ def editor_of(editor: PyTree, obs: jax.Array, proposal: jax.Array, cfg: Any) -> 
     return beta_policy(editor, jnp.concatenate([obs, proposal], -1), cfg)
 
 
-def edited(proposer: PyTree, editor: PyTree, obs: jax.Array, key: jax.Array, cfg: Any) -> Edited:
-    """Both policies' draws for `obs` [..., O]. Without an editor, `editor` is ()."""
-    proposal_key, change_key = jax.random.split(key)
+def edited(proposer: PyTree, editor: PyTree, obs: jax.Array, key: jax.Array | None, cfg: Any) -> Edited:
+    """Both policies' draws for `obs` [..., O], or their modes where `key` is None. Without an editor,
+    `editor` is ()."""
+    proposal_key, change_key = (None, None) if key is None else jax.random.split(key)
     proposal, log_prob = beta_sample(beta_policy(proposer, obs, cfg), proposal_key)
     if cfg.edit == "none":
         return Edited(proposal, proposal, log_prob, jnp.zeros_like(log_prob))
@@ -220,15 +221,8 @@ def edited(proposer: PyTree, editor: PyTree, obs: jax.Array, key: jax.Array, cfg
 
 
 def act(learned: Learned, obs: PyTree, key: jax.Array | None) -> jax.Array:
-    """A draw, or the edited mode of the proposals where `key` is None."""
     params, cfg = learned.params, learned.config
-    obs = features(params, obs)
-    if key is not None:
-        return edited(params["proposer"], params["editor"], obs, key, cfg).action
-    proposal = beta_mode(beta_policy(params["proposer"], obs, cfg))
-    if cfg.edit == "none":
-        return proposal
-    return edit(proposal, beta_mode(editor_of(params["editor"], obs, proposal, cfg)), cfg)
+    return edited(params["proposer"], params["editor"], features(params, obs), key, cfg).action
 
 
 # ---- the gradient step -------------------------------------------------------------------------

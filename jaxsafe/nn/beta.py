@@ -58,9 +58,12 @@ def beta_policy(net: PyTree, inputs: jax.Array, cfg: Any) -> Beta:
     return Beta(*jnp.split(concentrations, 2, axis=-1))
 
 
-def beta_sample(dist: Beta, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+def beta_sample(dist: Beta, key: jax.Array | None) -> tuple[jax.Array, jax.Array]:
     """a = 2 x - 1, x ~ `dist`, float [..., A], and log p(a), float [...]; differentiable in both
-    concentrations."""
+    concentrations. The mode where `key` is None."""
+    if key is None:
+        mode = beta_mode(dist)
+        return mode, beta_log_prob(dist, (mode + 1) / 2)
     up, down = gamma_draw(jax.lax.stop_gradient(jnp.stack(dist)), key)
     x = following(jnp.clip(up / (up + down), MARGIN, 1 - MARGIN), dist)
     return 2 * x - 1, beta_log_prob(dist, x)

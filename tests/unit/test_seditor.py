@@ -55,11 +55,13 @@ def test_a_policy_begins_as_beta_2_2_on_each_component():
 def test_log_probabilities_are_scipys_and_the_mode_is_where_they_are_highest():
     up, down = np.array([1.001, 2.0, 30.0]), np.array([4.0, 1.5, 40.0])
     x = np.random.default_rng(0).uniform(0.02, 0.98, (50, 3))
-    found = beta.beta_log_prob(beta.Beta(jnp.float32(up), jnp.float32(down)), jnp.float32(x))
+    dist = beta.Beta(jnp.float32(up), jnp.float32(down))
+    found = beta.beta_log_prob(dist, jnp.float32(x))
     expected = (scipy_beta.logpdf(x, up, down) - math.log(2)).sum(-1)
     np.testing.assert_allclose(found, expected, rtol=2e-4, atol=2e-4)
-    mode = beta.beta_mode(beta.Beta(jnp.float32(up), jnp.float32(down)))
+    mode, log_prob = beta.beta_sample(dist, None)
     np.testing.assert_allclose(mode, 2 * (up - 1) / (up + down - 2) - 1, atol=1e-5)
+    assert (log_prob >= found).all()
 
 
 SHAPES = [(1.0, 1.0), (1.001, 300.0), (2.0, 2.0), (30.0, 4.0), (500.0, 700.0), (5000.0, 1.0)]
