@@ -96,7 +96,11 @@ def summary(
             return Estimate(*(float(score(env_name, x, *args)) for x in of))
 
         rows["normalised return"] = scaled(scores.normalized_return, rows["return"])
-        rows["normalised violation"] = scaled(scores.normalized_violation, rows["cost"], cost_limit)
+        violation = scaled(scores.normalized_violation, rows["cost"], cost_limit)
+        if len(found["cost"]) > 1:  # it is not linear: seeds within the limit do not excuse the others
+            of_seeds = scores.normalized_violation(env_name, found["cost"].mean(1), cost_limit)
+            violation = stats.of_measure("normalised violation", of_seeds)
+        rows["normalised violation"] = violation
         if rate is not None:
             rows["normalised cost rate"] = scaled(
                 scores.normalized_cost_rate, rows["cost rate (training)"]

@@ -160,6 +160,13 @@ def test_unconstrained_ppo_scores_one_and_a_safe_policy_violates_by_zero():
     assert len(scores.CHARACTERISTIC) == 18
 
 
+def test_a_seed_within_the_limit_does_not_excuse_one_that_violates():
+    found = {"return": np.zeros((2, 2)), "cost": np.array([[0.0, 10.0], [40.0, 60.0]])}
+    rows = evaluation.summary("point_goal1", found, 25.0, {"seed": np.empty(0)})
+    room = scores.CHARACTERISTIC["point_goal1"].cost - 25
+    assert rows["normalised violation"].mean == pytest.approx((0 + 25 / room) / 2)  # of costs 5 and 50
+
+
 def test_progress_reads_the_newest_manifest(tmp_path):
     assert run_folder.newest_progress(tmp_path) is None
     for done in (Progress(3, 30, 6), Progress(4, 40, 8)):
