@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import cells
 import matplotlib.pyplot as plt
 import numpy as np
 
@@ -482,6 +483,7 @@ def pages() -> dict[Path, str]:
             "outside": outside(groups, final),
             "held": held(groups, final),
         },
+        RESULTS / "cells.md": {"cells": cells.table(PUBLISHED)},
         RESULTS / "causes" / "README.md": {"mean actions": mean_actions(groups, final)},
         RESULTS / "omnisafe" / "README.md": {
             "conventions": conventions(groups, group(theirs, ["algo.name"]))
