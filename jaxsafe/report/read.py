@@ -10,7 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import jaxsafe
+from jaxsafe.algos import ALGOS
 from jaxsafe.config import ConfigError, flat
+from jaxsafe.envs import ENVS
 from jaxsafe.learn.constraints import cost_title, limits_of
 from jaxsafe.report import scores, study_files
 from jaxsafe.report.evaluation import cost_rate
@@ -29,6 +31,7 @@ NOT_A_SETTING = {"seed", "num_seeds", "num_envs", "devices", *NOT_COMPARED}
 NOT_A_SETTING -= {"total_steps", "total_updates"}
 
 NEEDED = ("iteration", "steps", "seed", "train/return", "train/cost")  # columns
+KEPT: dict[tuple, tuple] = {}  # what `defaults` found, with the entries of both registries
 STAND_IN = {"train/return": "eval/return", "train/cost": "eval/cost"}  # where training has no episodes
 
 
@@ -207,12 +210,21 @@ def runs_of(folder: Path, study: study_files.Condensed) -> list[SettingRun]:
 
 
 def defaults(env: str, algo: str, preset: str = "fast", compat: str = "none") -> dict[str, Any]:
-    """Today's settings by their names in `flat`; none where this version lacks the names."""
+    """Today's settings by their names in `flat`; none where this version lacks the names.
+
+    A table of many runs asks for the same ones again and again. They are kept until the environment or
+    the algorithm is registered anew.
+    """
+    key, entries = (env, algo, preset, compat), (ENVS.get(env), ALGOS.get(algo))
+    if key in KEPT and all(a is b for a, b in zip(KEPT[key][0], entries, strict=True)):
+        return KEPT[key][1]
     named = {"env": {"name": env}, "algo": {"name": algo}, "preset": preset, "compat": compat}
     try:
-        return flat(settings_from_options(named).plain())
+        found = flat(settings_from_options(named).plain())
     except ConfigError:
-        return {}
+        found = {}
+    KEPT[key] = entries, found
+    return found
 
 
 def measured(

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from jaxsafe import envs
 from jaxsafe.commands import study as command
 from jaxsafe.config import ConfigError
 from jaxsafe.report import plots, studies, study_files
@@ -249,6 +250,13 @@ def test_a_setting_keeps_the_options_that_were_unusual_when_it_was_made(toy, tmp
     assert studies.said(today, told, set()) == {"algo.name": "ppo_lag"}
     odd = studies.once_unusual(toy)[run]
     assert studies.said(today, told, odd) == {"algo.name": "ppo_lag", "algo.dual_lr": 0.2}
+
+
+def test_the_defaults_of_today_are_those_of_what_is_registered_now():
+    assert defaults("short", "ppo") == {}
+    for steps in (7, 8):
+        envs.register("short", envs.ENVS["point_goal1"] | {"num_steps": steps})
+        assert defaults("short", "ppo")["env.num_steps"] == steps
 
 
 def test_a_figure_of_curves_has_few_tasks_and_settings():
