@@ -15,6 +15,7 @@ from compiling import FAST
 from jaxsafe import envs
 from jaxsafe.config import ConfigError
 from jaxsafe.envs.safety_gym.sight import drawn_model
+from jaxsafe.envs.safety_gym.task import in_parts
 from jaxsafe.envs.view.render import GAP, Renderer
 from jaxsafe.envs.vision.eye import make_eye
 from jaxsafe.envs.vision.poses import kinematics
@@ -109,7 +110,8 @@ def test_pictures_are_those_of_opengl(display, monkeypatch, name):
     if name.startswith("doggo"):  # a film marks the button to press
         monkeypatch.setattr("jaxsafe.envs.view.stage.Stage.mark", lambda *args: None)
     renderer = Renderer(env, *SIZE, env.config.vision_camera)
-    states = jax.device_get(compiled(jax.vmap(env.reset))(jax.random.split(jax.random.key(1), 20)))
+    reset, _ = in_parts(env, compiler_options=FAST)
+    states = jax.device_get(reset(jax.random.split(jax.random.key(1), 20)))
     for i in range(20):
         ours = states.obs["vision"][i].astype(int)
         theirs = renderer.frame(jax.tree.map(lambda x, i=i: x[i], states)).astype(int)
@@ -128,7 +130,7 @@ def test_pictures_are_those_of_opengl(display, monkeypatch, name):
 
 
 def test_the_picture_belongs_to_the_state_and_each_world_has_its_own():
-    env = seeing("point_goal1", vision_size=(24, 16), num_steps=3)
+    env = seeing("point_goal1", vision_size=(24, 16), num_steps=3, hazards_num=2, vases_num=0)
     picture = compiled(jax.vmap(env._picture))
 
     def still(obs: Any, key: jax.Array) -> tuple[jax.Array, jax.Array]:
