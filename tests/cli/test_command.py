@@ -222,7 +222,9 @@ def test_evaluate_prints_the_table(real, tmp_path):
         assert any(line.startswith(row) for line in out.splitlines())
 
 
-def test_killed_and_resumed_it_ends_bit_for_bit_as_if_uninterrupted(finished, tmp_path, monkeypatch):
+def test_killed_and_resumed_it_ends_bit_for_bit_as_if_uninterrupted(
+    finished, tmp_path, monkeypatch, capsys
+):
     args = (*SMALL, f"total_steps={END}", "run_dir=run", "checkpoint_iterations=1")
     run = tmp_path / "run"
     process = start("train", *args, cwd=tmp_path)
@@ -231,8 +233,9 @@ def test_killed_and_resumed_it_ends_bit_for_bit_as_if_uninterrupted(finished, tm
     process.communicate()
     reached = run_folder.newest_progress(run)
     assert reached is not None and 0 < reached[0] < 40, "killed too late to test anything"
-    status, out, err = call("train", *args, "resume=true", cwd=tmp_path)
-    assert status == 0 and "resuming at" in out, err
+    monkeypatch.chdir(tmp_path)
+    assert typed("train", *args, "resume=true") == 0
+    assert "resuming at" in capsys.readouterr().out
     assert_same_run(run, finished)
 
 
