@@ -20,7 +20,7 @@ for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, lambda *_: None)
 
 MAPS = Path("/proc/self/maps")
-MOST_MAPS = 40_000  # Linux lets a process have 65,530
+MOST_MAPS = 30_000  # Linux lets a process have 65,530
 OURS = [(registry, dict(registry)) for registry in (envs.ENVS, algos.ALGOS)]
 
 
@@ -51,7 +51,7 @@ def forgotten_programs(request: pytest.FixtureRequest) -> Iterator[None]:
     for registry, ours in OURS:
         registry.clear()
         registry.update(ours)
-    if request.path.parent.name != "envs":
+    if request.path.parent.name != "envs" or many_memory_maps():
         jax.clear_caches()
 
 
@@ -59,10 +59,12 @@ def forgotten_programs(request: pytest.FixtureRequest) -> Iterator[None]:
 def few_memory_maps(request: pytest.FixtureRequest) -> Iterator[None]:
     """Free the compiled programs before a file of many slow tests has had too many of them."""
     yield
-    if not request.node.get_closest_marker("slow") or not MAPS.exists():
-        return
-    if len(MAPS.read_bytes().splitlines()) > MOST_MAPS:
+    if request.node.get_closest_marker("slow") and many_memory_maps():
         jax.clear_caches()
+
+
+def many_memory_maps() -> bool:
+    return MAPS.exists() and len(MAPS.read_bytes().splitlines()) > MOST_MAPS
 
 
 @pytest.fixture(autouse=True)
