@@ -205,6 +205,12 @@ def priced_parallel(
     }
 
 
+# for two cores: few environments and small batches, so that Goal is learned from few steps. A run is
+# that short that the price has to rise three times as fast.
+CPU: dict[str, Any] = COLD | {
+    "n_step": 5, "num_envs": 64, "batch_size": 256, "replay_ratio": 4, "tau": 0.005, "lr": 3e-4,
+    "critic_lr": 3e-4, "dual_lr": 0.03,
+}  # fmt: skip
 # 16 gradient steps for each step of 1,024 environments: it learns from fewer steps, and takes more time
 FREQUENT: dict[str, Any] = {
     "num_envs": 1024, "batch_size": 1024, "tau": 0.01, "lr": 3e-4, "critic_lr": 3e-4, "lr_decay": False,
@@ -267,6 +273,7 @@ ROWS = {
             "omnisafe_navigation": NAVIGATION | LAG_NAVIGATION,
             **priced_parallel(SAC_PARALLEL, LAG_NAVIGATION, COLD),
             "navigation": COLD | FAR,
+            "cpu": CPU,
         },
         total_steps=5_000_000,
         omnisafe="SACLag",
