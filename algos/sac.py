@@ -205,8 +205,8 @@ def priced_parallel(
     }
 
 
-# for two cores: few environments and small batches, so that Goal is learned from few steps. A run is
-# that short that the price has to rise three times as fast.
+# for two cores: few environments and small batches, so that Goal is learned from few steps. Runs are
+# so short that the price has to rise three times as fast.
 CPU: dict[str, Any] = COLD | {
     "n_step": 5, "num_envs": 64, "batch_size": 256, "replay_ratio": 4, "tau": 0.005, "lr": 3e-4,
     "critic_lr": 3e-4, "dual_lr": 0.03,
