@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import optax
 
 from jaxsafe.algos import sac
-from jaxsafe.config import Bounds, Iterations, config
+from jaxsafe.config import Bounds, Iterations, Weight, config
 from jaxsafe.learn.actor_critic import (
     Actor,
     ActorCriticConfig,
@@ -29,6 +29,7 @@ from jaxsafe.nn.networks import coarse_mlp
 from jaxsafe.types import Algorithm, Env, PyTree
 
 Noise = Annotated[float, Bounds(0, 10)]  # a standard deviation; actions lie in [-1, 1]
+SATURATED = 0.999  # beyond this an action counts as saturated: tanh has 1/500 of its slope at 0
 
 
 @config
@@ -43,6 +44,9 @@ class DeterministicConfig(ActorCriticConfig):
     # Whether the noise falls linearly to 0 by the end of training, so that the price is learned for the
     # policy without noise, as it is used. OmniSafe keeps the noise.
     noise_decay: bool = False
+    # The weight of the mean square of what tanh makes actions of, in the policy's loss. Where tanh is
+    # flat the policy has no gradient, and stays as it is for good.
+    saturation_coef: Weight = 0.0
 
 
 @config
@@ -141,9 +145,12 @@ def deterministic_actor(
         next_actor: (params, targets, cfg) -> mu'.
     """
 
-    def mu(actor: PyTree, obs: jax.Array, cfg: Any) -> jax.Array:
+    def before_tanh(actor: PyTree, obs: jax.Array, cfg: Any) -> jax.Array:
         out: Any = coarse_mlp(cfg, action_size).apply(actor, obs)
-        return jnp.tanh(out)
+        return out
+
+    def mu(actor: PyTree, obs: jax.Array, cfg: Any) -> jax.Array:
+        return jnp.tanh(before_tanh(actor, obs, cfg))
 
     def noisy(action: jax.Array, noise: jax.Array) -> jax.Array:
         return jnp.clip(action + noise, -1.0, 1.0)
@@ -173,8 +180,14 @@ def deterministic_actor(
         return noisy(action, noise(key, action.shape, cfg)), jnp.zeros(obs.shape[0])
 
     def propose(params: dict[str, PyTree], obs: jax.Array, key: jax.Array, cfg: Any) -> Proposal:
-        zero = jnp.zeros(obs.shape[0])
-        return Proposal(mu(params["actor"], obs, cfg), bonus=zero, extra=zero, metrics={})
+        x = before_tanh(params["actor"], obs, cfg)
+        action = jnp.tanh(x)
+        return Proposal(
+            action,
+            bonus=jnp.zeros(obs.shape[0]),
+            extra=cfg.saturation_coef * jnp.mean(x**2, -1),
+            metrics={"train/saturated": jnp.mean(jnp.abs(action) > SATURATED, -1)},
+        )
 
     return Actor(
         critics=critics,

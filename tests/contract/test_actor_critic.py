@@ -10,6 +10,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from compiling import FAST
 from toys import START, Lever, Ticker, momentum, training
@@ -476,6 +477,38 @@ def test_a_sampled_action_has_the_noise_of_any_environment_and_none_leaves_its_b
         actor.act(params, obs, key, wild), actor.explore(params, obs, key, wild, jnp.float32(1))
     ):  # fmt: skip
         assert actions.max() == 1 and actions.min() == -1
+
+
+# ---- saturated policies ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", ["td3", "ddpg"])
+@pytest.mark.parametrize("coef, freed", [(0.0, False), (1e-3, True)])
+def test_a_policy_of_extreme_actions_is_freed_by_the_penalty_alone(method, coef, freed):
+    """tanh(20) is 1 in float32, where the gradient of any Q is 0. Q = -a^2 wants actions of 0."""
+    cfg = td3.TD3Config(hidden=(), saturation_coef=coef)
+    actor: Any = ACTORS[method](2)
+    obs, key = jnp.ones((5, 1)), jax.random.key(0)
+    params = jax.tree.map(jnp.zeros_like, actor.init(key, 1, 2, cfg))
+    params = jax.tree.map(lambda x: x + (20.0 if x.shape == (2,) else 0.0), params)  # the biases
+
+    def loss(params):
+        made = actor.propose(params, obs, key, cfg)
+        return made.extra.mean() + (made.action**2).sum(-1).mean(), made
+
+    adam = optax.adam(0.05)
+
+    def descend(carry, _):
+        params, state = carry
+        grads, made = jax.grad(loss, has_aux=True)(params)
+        updates, state = adam.update(grads, state)
+        return (optax.apply_updates(params, updates), state), made
+
+    made = jax.lax.scan(descend, (params, adam.init(params)), None, 800)[1]
+    np.testing.assert_allclose(made.extra[0], coef * 20**2, rtol=1e-6)
+    assert (made.metrics["train/saturated"][0] == 1).all()
+    assert (made.metrics["train/saturated"][-1] == (0 if freed else 1)).all()
+    np.testing.assert_allclose(made.action[-1], 0.0 if freed else 1.0, atol=1e-3)
 
 
 # ---- the clock of the price --------------------------------------------------------------------
