@@ -1,6 +1,7 @@
 """SEditor: a policy that seeks reward, and one that edits its actions to keep them safe."""
 
 import dataclasses
+from collections.abc import Callable
 from functools import partial
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -24,11 +25,12 @@ from jaxsafe.learn.acting import Learned
 from jaxsafe.learn.batch import device_count, pmean
 from jaxsafe.learn.bill import PriceClockConfig
 from jaxsafe.learn.constraints import constrained_costs, each, limit, metrics_by_constraint, signal
-from jaxsafe.learn.critics import init_cost_critics, values_of_each, with_reduced_cost
+from jaxsafe.learn.critics import Values, init_cost_critics, values_of_each, with_reduced_cost
 from jaxsafe.learn.learner import GradientStep, Learner
 from jaxsafe.learn.normalise import averaged, no_moments, standard
 from jaxsafe.learn.observations import EncoderConfig, features, init_features
 from jaxsafe.learn.off_policy import OffPolicyConfig, off_policy
+from jaxsafe.learn.replay import Record
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.sequences import SequenceBatch, drawn_sequences, lambda_returns
 from jaxsafe.learn.steps import Trainable, adam, descend_each, follow
@@ -214,7 +216,7 @@ def edited(proposer: PyTree, editor: PyTree, obs: jax.Array, key: jax.Array | No
     `editor` is ()."""
     proposal_key, change_key = (None, None) if key is None else jax.random.split(key)
     proposal, log_prob = beta_sample(beta_policy(proposer, obs, cfg), proposal_key)
-    if cfg.edit == "none":
+    if editor == ():
         return Edited(proposal, proposal, log_prob, jnp.zeros_like(log_prob))
     change, log_prob_change = beta_sample(editor_of(editor, obs, proposal, cfg), change_key)
     return Edited(proposal, edit(proposal, change, cfg), log_prob, log_prob_change)
@@ -223,6 +225,188 @@ def edited(proposer: PyTree, editor: PyTree, obs: jax.Array, key: jax.Array | No
 def act(learned: Learned, obs: PyTree, key: jax.Array | None) -> jax.Array:
     params, cfg = learned.params, learned.config
     return edited(params["proposer"], params["editor"], features(params, obs), key, cfg).action
+
+
+# ---- what each policy climbs -------------------------------------------------------------------
+
+
+class Scene(NamedTuple):
+    """What is fixed while policies climb: all networks, the price, observations [..., O], settings."""
+
+    params: dict[str, PyTree]
+    dual: Any
+    obs: jax.Array
+    cfg: Any
+
+
+def reward_value(params: dict[str, PyTree], obs: jax.Array, action: jax.Array, cfg: Any) -> jax.Array:
+    """Q_r, the smaller value, float [...]."""
+    return smallest(q_values(params["critic_r"], obs, action, cfg))
+
+
+def both_values(params: dict[str, PyTree], obs: jax.Array, action: jax.Array, cfg: Any) -> Values:
+    """Q_r, float [...], and Q_c, float [...] or [..., K]."""
+    q_r, q_c = with_reduced_cost(params, obs, action, constrained_costs(cfg), cfg)
+    return Values(smallest(q_r), q_c)
+
+
+def unpriced(scene: Scene, action: jax.Array) -> jax.Array:
+    """Q_r(s, a), float [...]."""
+    return reward_value(scene.params, scene.obs, action, scene.cfg)
+
+
+def priced(scene: Scene, action: jax.Array) -> jax.Array:
+    """(Q_r(s, a) - lam Q_c(s, a)) / (1 + lam), float [...]."""
+    q_r, q_c = both_values(scene.params, scene.obs, action, scene.cfg)
+    return soft_lagrangian.advantage(scene.dual, q_r, q_c)
+
+
+def proposer_gain(proposer: PyTree, scene: Scene, key: jax.Array) -> tuple[jax.Array, Edited]:
+    """Q_r(s, a) + alpha_1 H(pi), float [...], or with the price of `priced`; and the draws."""
+    params, _, obs, cfg = scene
+    found = edited(proposer, params["editor"], obs, key, cfg)
+    worth = policies_of(cfg).worth(scene, found.action)
+    return worth - jnp.exp(params["log_alpha"]) * found.log_prob, found
+
+
+def editor_gain(editor: PyTree, scene: Scene, key: jax.Array) -> tuple[jax.Array, Edited, jax.Array]:
+    """(-(Q_r(s, u) - Q_r(s, a))+ - lam Q_c(s, a)) / (1 + lam) + alpha_2 H(mu), float [...], with
+    `distance` in place of the first term; the draws; the reward that edits lose, float [...]."""
+    params, dual, obs, cfg = scene
+    found = edited(params["proposer"], editor, obs, key, cfg)
+    q_r, q_c = both_values(params, obs, found.action, cfg)
+    lost = jax.nn.relu(reward_value(params, obs, found.proposal, cfg) - q_r)
+    match cfg.distance:
+        case "hinge":
+            worth = -lost
+        case "action":
+            worth = -jnp.square(found.action - found.proposal).mean(-1)
+        case "reward":
+            worth = q_r
+    worth = soft_lagrangian.advantage(dual, worth, q_c)
+    return worth - jnp.exp(params["log_alpha_editor"]) * found.log_prob_change, found, lost
+
+
+# ---- losses ------------------------------------------------------------------------------------
+
+
+def excess_entropy(
+    batch: SequenceBatch, log_prob: jax.Array, size: int, min_prob: jax.Array | float
+) -> jax.Array:
+    """H - target, float [], for actions of this size. log alpha falls with it."""
+    target = size * jnp.log(2 * min_prob)
+    return -batch.mean(jax.lax.stop_gradient(log_prob) + target)
+
+
+def proposer_loss(
+    trained: dict[str, PyTree], scene: Scene, batch: SequenceBatch, key: jax.Array
+) -> tuple[jax.Array, Metrics]:
+    """log alpha_1 (H_1 - target_1) less what pi climbs. Both are among `trained`."""
+    gain, found = proposer_gain(trained["proposer"], scene, key)
+    size = found.action.shape[-1]
+    excess = excess_entropy(batch, found.log_prob, size, scene.cfg.min_prob)
+    return trained["log_alpha"] * excess - batch.mean(gain), {
+        "train/actor_loss": -batch.mean(gain),
+        "train/entropy": -batch.mean(found.log_prob),
+        "train/alpha": jnp.exp(scene.params["log_alpha"]),
+    }
+
+
+def editor_loss(
+    trained: dict[str, PyTree], scene: Scene, batch: SequenceBatch, key: jax.Array
+) -> tuple[jax.Array, Metrics]:
+    """log alpha_2 (H_2 - target_2) less what mu climbs. Both are among `trained`."""
+    gain, found, lost = editor_gain(trained["editor"], scene, key)
+    size = found.action.shape[-1]
+    excess = excess_entropy(batch, found.log_prob_change, size, scene.cfg.editor_min_prob)
+    return trained["log_alpha_editor"] * excess - batch.mean(gain), {
+        "train/editor_loss": -batch.mean(gain),
+        "train/entropy_editor": -batch.mean(found.log_prob_change),
+        "train/alpha_editor": jnp.exp(scene.params["log_alpha_editor"]),
+        "train/edit": batch.mean(jnp.abs(found.action - found.proposal).mean(-1)),
+        "train/edit_loss": batch.mean(lost),
+    }
+
+
+def critics_loss(
+    trained: dict[str, PyTree], batch: SequenceBatch, targets: Values, cfg: Any, axis_name: str | None
+) -> tuple[jax.Array, Metrics]:
+    """E[sum_i (Q_ri(s, a) - G_r)^2 + (Q_ci(s, a) - G_c)^2]. It alone trains the encoder.
+
+    targets: G_r and G_c of all rows but the last.
+    """
+    rows, names = batch.rows, constrained_costs(cfg)
+    counted = batch.weight * batch.follows
+    counted /= jnp.maximum(pmean(counted.sum(), axis_name), 1e-6)
+
+    def mean_step(x: jax.Array) -> jax.Array:
+        return (counted * x).sum()
+
+    # Compiled, this pass of the encoder and that for the policies are one.
+    obs = features(trained, rows.obs)[:-1]
+    q_r, q_c = values_of_each(trained, obs, rows.action[:-1], names, cfg)
+    loss_r = mean_step(((q_r - targets.reward) ** 2).sum(0))
+    loss_c = each(mean_step, names)(((q_c - targets.cost) ** 2).sum(0))
+    return loss_r + loss_c.sum(), {
+        "train/critic_loss": loss_r,
+        "train/critic_loss_c": loss_c,
+        "train/q": mean_step(q_r.mean(0)),
+        "train/q_c": each(mean_step, names)(q_c.mean(0)),
+    }
+
+
+def without_entropy(paid: Values, found: Edited, rows: Record, scene: Scene) -> Values:
+    return paid
+
+
+def with_entropy(paid: Values, found: Edited, rows: Record, scene: Scene) -> Values:
+    """`paid`, where alpha_1 H(pi) counts as reward and against cost, unless the episode has failed."""
+    params, _, _, cfg = scene
+    bonus = jnp.where(rows.terminated, 0.0, -jnp.exp(params["log_alpha"]) * found.log_prob)
+    over_costs = bonus.reshape(*bonus.shape, *(1,) * (paid.cost.ndim - bonus.ndim))
+    return Values(paid.reward + cfg.discount * bonus, paid.cost - cfg.cost_discount * over_costs)
+
+
+def targets_of(paid: Values, batch: SequenceBatch, scene: Scene, key: jax.Array) -> Values:
+    """G_r and G_c of all rows but the last, from what the rows paid."""
+    params, _, obs, cfg = scene
+    found = edited(params["proposer"], params["editor"], obs, key, cfg)
+    next_q = both_values(params["targets"], obs, found.action, cfg)
+    earned = policies_of(cfg).earned(paid, found, batch.rows, scene)
+
+    def returns(earned: jax.Array, value: jax.Array, discount: jax.Array) -> jax.Array:
+        ended = batch.rows.terminated
+        return lambda_returns(batch, earned, value, ended, discount=discount, decay=cfg.td_lambda)
+
+    costs_returns = each(partial(returns, discount=cfg.cost_discount), constrained_costs(cfg))
+    g_r = returns(earned.reward, next_q.reward, cfg.discount)
+    return Values(g_r, costs_returns(earned.cost, next_q.cost))
+
+
+# ---- with an editor, and without ---------------------------------------------------------------
+
+
+class Policies(NamedTuple):
+    """Which policies there are, and what depends on it.
+
+    losses: of each policy and its temperature, by the name of its network.
+    worth(scene, action [..., A]) -> float [...], what the proposer climbs beside its entropy.
+    earned(paid, found, rows, scene) -> Values, rewards and costs as they count in G_r and G_c. `found`
+        are draws for the observations of `rows`.
+    """
+
+    losses: dict[str, Callable[[PyTree, Scene, SequenceBatch, jax.Array], tuple[jax.Array, Metrics]]]
+    worth: Callable[[Scene, jax.Array], jax.Array]
+    earned: Callable[[Values, Edited, Record, Scene], Values]
+
+
+SEDITOR = Policies({"proposer": proposer_loss, "editor": editor_loss}, unpriced, without_entropy)
+SAC_LAGRANGIAN = Policies({"proposer": proposer_loss}, priced, with_entropy)
+TEMPERATURES = {"proposer": "log_alpha", "editor": "log_alpha_editor"}
+
+
+def policies_of(cfg: Any) -> Policies:
+    return SAC_LAGRANGIAN if cfg.edit == "none" else SEDITOR
 
 
 # ---- the gradient step -------------------------------------------------------------------------
@@ -243,64 +427,15 @@ def init_small_critics(key: jax.Array, critics: PyTree, cfg: Any) -> PyTree:
 def optimisers(cfg: Any, share: jax.Array | float) -> dict[str, optax.GradientTransformation]:
     policy, critic = (adam(lr * share, cfg, EPS) for lr in (cfg.lr, cfg.critic_lr))
     temperature = optax.adam(cfg.alpha_lr, eps=EPS)
-    rules = {"proposer": policy, "critic_r": critic, "critic_c": critic, "log_alpha": temperature}
+    rules = {"critic_r": critic, "critic_c": critic}
     if cfg.encoder == "cnn":
         rules |= {"encoder": critic}
-    if cfg.edit == "none":
-        return rules
-    return rules | {"editor": policy, "log_alpha_editor": temperature}
-
-
-def reward_value(params: dict[str, PyTree], obs: jax.Array, action: jax.Array, cfg: Any) -> jax.Array:
-    """Q_r, the smaller value, float [...]."""
-    return smallest(q_values(params["critic_r"], obs, action, cfg))
-
-
-def proposer_gain(
-    proposer: PyTree,
-    params: dict[str, PyTree],
-    dual: Any,
-    obs: jax.Array,
-    key: jax.Array,
-    cfg: Any,
-) -> tuple[jax.Array, jax.Array]:
-    """What the proposer climbs at `obs` [..., O], float [...], and the log probabilities."""
-    found = edited(proposer, params["editor"], obs, key, cfg)
-    if cfg.edit == "none":
-        q_r, q_c = with_reduced_cost(params, obs, found.action, constrained_costs(cfg), cfg)
-        worth = soft_lagrangian.advantage(dual, smallest(q_r), q_c)
-    else:
-        worth = reward_value(params, obs, found.action, cfg)
-    return worth - jnp.exp(params["log_alpha"]) * found.log_prob, found.log_prob
-
-
-def editor_gain(
-    editor: PyTree,
-    params: dict[str, PyTree],
-    dual: Any,
-    obs: jax.Array,
-    key: jax.Array,
-    cfg: Any,
-) -> tuple[jax.Array, Edited, jax.Array]:
-    """What the editor climbs at `obs` [..., O], float [...]; the draws; the reward that edits lose."""
-    found = edited(params["proposer"], editor, obs, key, cfg)
-    q_r, q_c = with_reduced_cost(params, obs, found.action, constrained_costs(cfg), cfg)
-    q_r = smallest(q_r)
-    lost = jax.nn.relu(reward_value(params, obs, found.proposal, cfg) - q_r)
-    match cfg.distance:
-        case "hinge":
-            worth = -lost
-        case "action":
-            worth = -jnp.square(found.action - found.proposal).mean(-1)
-        case "reward":
-            worth = q_r
-    worth = soft_lagrangian.advantage(dual, worth, q_c)
-    return worth - jnp.exp(params["log_alpha_editor"]) * found.log_prob_change, found, lost
+    for name in policies_of(cfg).losses:
+        rules |= {name: policy, TEMPERATURES[name]: temperature}
+    return rules
 
 
 def seditor_learner(env: Env) -> Learner:
-    size = env.action_size
-
     def init(key: jax.Array, obs_size: int, action_size: int, cfg: Any) -> Trainable:
         if cfg.batch_size % (cfg.n_step + 1):
             raise ConfigError(
@@ -335,92 +470,38 @@ def seditor_learner(env: Env) -> Learner:
     def step(
         nets: Trainable, batch: SequenceBatch, at: GradientStep, cfg: Any, axis_name: str | None
     ) -> tuple[Trainable, Metrics]:
-        params, targets = nets.params, nets.params["targets"]
-        rows, names = batch.rows, constrained_costs(cfg)
-        target_key, proposer_key, editor_key = jax.random.split(at.key, 3)
         # On d devices a sample weighs d times as much in the loss of its device. There its gradient is
         # d times as long, so the clip has to be, too.
         longest = cfg.concentration_clip * device_count(axis_name)
         cfg = dataclasses.replace(cfg, concentration_clip=longest)
-
-        def mean(x: jax.Array) -> jax.Array:
-            return (batch.weight * x.mean(0)).sum()  # this device's share
-
-        counted = batch.weight * batch.follows
-        counted /= jnp.maximum(pmean(counted.sum(), axis_name), 1e-6)
-
-        def mean_step(x: jax.Array) -> jax.Array:
-            return (counted * x).sum()
-
-        def heat(log_prob: jax.Array, min_prob: jax.Array | float) -> jax.Array:
-            """What a temperature's logarithm is pulled by: entropy beyond its target."""
-            return -mean(jax.lax.stop_gradient(log_prob) + size * jnp.log(2 * min_prob))
-
-        # rewards and costs
-        charged = signal(env, rows, names)
-        paid = jnp.concatenate([rows.reward[..., None], charged.reshape(*rows.reward.shape, -1)], -1)
-        moments = averaged(nets.opt_state["moments"], paid, batch.weight, axis_name)
-        paid = standard(moments, paid, cfg.centre)
-        reward, cost = paid[..., 0], paid[..., 1:].reshape(charged.shape)
-
-        # targets
-        seen = features(params, rows.obs)
-        found = edited(params["proposer"], params["editor"], seen, target_key, cfg)
-        next_q, next_c = with_reduced_cost(targets, seen, found.action, names, cfg)
-        if cfg.edit == "none":
-            bonus = -jnp.exp(params["log_alpha"]) * found.log_prob  # alpha H where the step led to
-            bonus = jnp.where(rows.terminated, 0.0, bonus)
-            reward += cfg.discount * bonus
-            cost -= cfg.cost_discount * bonus.reshape(*bonus.shape, *(1,) * (cost.ndim - bonus.ndim))
-
-        def returns(earned: jax.Array, value: jax.Array, discount: jax.Array) -> jax.Array:
-            return lambda_returns(
-                batch, earned, value, rows.terminated, discount=discount, decay=cfg.td_lambda
-            )
-
-        y_r = returns(reward, smallest(next_q), cfg.discount)
-        y_c = each(partial(returns, discount=cfg.cost_discount), names)(cost, next_c)
+        target_key, proposer_key, editor_key = jax.random.split(at.key, 3)
+        keys = {"proposer": proposer_key, "editor": editor_key}
+        scene = Scene(nets.params, at.dual, features(nets.params, batch.rows.obs), cfg)
+        paid, nets = paid_in(nets, batch, cfg, axis_name)
+        targets = targets_of(paid, batch, scene, target_key)
 
         def loss(trained: dict[str, PyTree]) -> tuple[jax.Array, Metrics]:
-            # The critics alone train the encoder. Compiled, this pass and that of `seen` are one.
-            obs = features(trained, rows.obs)[:-1]
-            q, q_c = values_of_each(trained, obs, rows.action[:-1], names, cfg)
-            loss_r = mean_step(((q - y_r) ** 2).sum(0))
-            loss_c = each(mean_step, names)(((q_c - y_c) ** 2).sum(0))
-
-            gain, log_prob = proposer_gain(
-                trained["proposer"], params, at.dual, seen, proposer_key, cfg
-            )
-            total = loss_r + loss_c.sum() - mean(gain)
-            total += trained["log_alpha"] * heat(log_prob, cfg.min_prob)
-            metrics = {
-                "train/critic_loss": loss_r,
-                "train/critic_loss_c": loss_c,
-                "train/q": mean_step(q.mean(0)),
-                "train/q_c": each(mean_step, names)(q_c.mean(0)),
-                "train/actor_loss": -mean(gain),
-                "train/entropy": -mean(log_prob),
-                "train/alpha": jnp.exp(params["log_alpha"]),
-            }
-            if cfg.edit != "none":
-                gain, drawn, lost = editor_gain(
-                    trained["editor"], params, at.dual, seen, editor_key, cfg
-                )
-                total -= mean(gain)
-                total += trained["log_alpha_editor"] * heat(drawn.log_prob_change, cfg.editor_min_prob)
-                metrics |= {
-                    "train/editor_loss": -mean(gain),
-                    "train/entropy_editor": -mean(drawn.log_prob_change),
-                    "train/alpha_editor": jnp.exp(params["log_alpha_editor"]),
-                    "train/edit": mean(jnp.abs(drawn.action - drawn.proposal).mean(-1)),
-                    "train/edit_loss": mean(lost),
-                }
+            total, metrics = critics_loss(trained, batch, targets, cfg, axis_name)
+            for name, policy_loss in policies_of(cfg).losses.items():
+                own, said = policy_loss(trained, scene, batch, keys[name])
+                total, metrics = total + own, metrics | said
             return total, jax.lax.stop_gradient(metrics)
 
         rules = optimisers(cfg, at.remaining if cfg.lr_decay else 1.0)
         nets, metrics = descend_each(loss, nets, rules, axis_name)
+        return follow(nets, cfg.tau), metrics_by_constraint(metrics, constrained_costs(cfg))
+
+    def paid_in(
+        nets: Trainable, batch: SequenceBatch, cfg: Any, axis_name: str | None
+    ) -> tuple[Values, Trainable]:
+        """Rewards and costs of the rows, normalised, and `nets` with the moments that they move."""
+        rows = batch.rows
+        charged = signal(env, rows, constrained_costs(cfg))
+        paid = jnp.concatenate([rows.reward[..., None], charged.reshape(*rows.reward.shape, -1)], -1)
+        moments = averaged(nets.opt_state["moments"], paid, batch.weight, axis_name)
+        paid = standard(moments, paid, cfg.centre)
         nets = nets._replace(opt_state=nets.opt_state | {"moments": moments})
-        return follow(nets, cfg.tau), metrics_by_constraint(metrics, names)
+        return Values(paid[..., 0], paid[..., 1:].reshape(charged.shape)), nets
 
     return Learner(init=init, act=act, step=step, replayed=drawn_sequences)
 

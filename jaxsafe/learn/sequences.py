@@ -27,6 +27,10 @@ class SequenceBatch(NamedTuple):
         and where a sequence goes on with the oldest row of the replay after the newest."""
         return ~(self.rows.last[:-1] | self.rows.first[1:])
 
+    def mean(self, x: jax.Array) -> jax.Array:
+        """The mean of `x` [T, B] over the rows: this device's share of it."""
+        return (self.weight * x.mean(0)).sum()
+
 
 def drawn_sequences(
     key: jax.Array, source: Source, cfg: Any, axis_name: str | None

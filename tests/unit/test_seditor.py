@@ -18,6 +18,7 @@ from scipy.stats import kstest
 from toys import START, Lever, Patch, momentum
 
 from jaxsafe.algos import ALGOS, seditor
+from jaxsafe.algos.seditor import Scene
 from jaxsafe.config import ConfigError
 from jaxsafe.learn.acting import Learned
 from jaxsafe.learn.critics import Values
@@ -164,7 +165,7 @@ def test_an_edit_is_charged_for_the_reward_that_it_loses(distance):
     params["critic_c"] = critic(1, [0.0], bias=3.0)
 
     def gain(editor):
-        return seditor.editor_gain(editor, params, Price(0.5), obs, jax.random.key(3), cfg)
+        return seditor.editor_gain(editor, Scene(params, Price(0.5), obs, cfg), jax.random.key(3))
 
     worth, drawn, lost = jax.jit(gain)(params["editor"])
     fall = drawn.proposal[:, 0] - drawn.action[:, 0]
@@ -186,7 +187,8 @@ def test_the_proposer_feels_its_own_action_and_what_the_editor_makes_of_it():
     def slope(proposer, editor):
         def gain(proposer):
             given = params | {"editor": editor}
-            return seditor.proposer_gain(proposer, given, None, obs, jax.random.key(1), cfg)[0].mean()
+            scene = Scene(given, None, obs, cfg)
+            return seditor.proposer_gain(proposer, scene, jax.random.key(1))[0].mean()
 
         return jax.grad(gain)(proposer)["params"]["Dense_0"]["bias"]
 
@@ -219,8 +221,9 @@ def test_the_editor_brings_unsafe_proposals_to_the_bound_as_the_price_grows(hill
     def train(lam):
         def loss(own, key):
             given = params | jax.lax.stop_gradient(own)
-            of_proposer, _ = seditor.proposer_gain(own["proposer"], given, None, obs, key, CFG)
-            of_editor, *_ = seditor.editor_gain(own["editor"], given, Price(lam), obs, key, CFG)
+            scene = Scene(given, Price(lam), obs, CFG)
+            of_proposer, _ = seditor.proposer_gain(own["proposer"], scene, key)
+            of_editor, *_ = seditor.editor_gain(own["editor"], scene, key)
             return -of_proposer.mean() - of_editor.mean()
 
         def step(carry, key):
@@ -257,7 +260,8 @@ def test_the_editor_leaves_safe_proposals_alone(hill):
         editor, state = carry
 
         def loss(editor):
-            return -seditor.editor_gain(editor, params, Price(5.0), obs, key, cfg)[0].mean()
+            scene = Scene(params, Price(5.0), obs, cfg)
+            return -seditor.editor_gain(editor, scene, key)[0].mean()
 
         change, state = rule.update(jax.grad(loss)(editor), state)
         return (optax.apply_updates(editor, change), state), None
@@ -431,12 +435,13 @@ def test_each_network_moves_along_its_own_objective_alone():
     def run(key):
         before = moved(learner.init(key, 2, 2, cfg))
         p = before.params
+        scene = Scene(p, dual, seen.obs, cfg)
 
         def proposer(net):
-            return mean(seditor.proposer_gain(net, p, dual, seen.obs, proposer_key, cfg)[0])
+            return mean(seditor.proposer_gain(net, scene, proposer_key)[0])
 
         def editor(net):
-            return mean(seditor.editor_gain(net, p, dual, seen.obs, editor_key, cfg)[0])
+            return mean(seditor.editor_gain(net, scene, editor_key)[0])
 
         slopes = {
             "proposer": jax.grad(proposer)(p["proposer"]),
