@@ -21,7 +21,7 @@ SIX = ("ppo", "ppo_lag", "cpo", "trpo_lag", "focops", "cppo_pid")
 GOALS = ("point_goal1", "car_goal1")
 ROBOTS = ("halfcheetah", "hopper", "ant")
 ALL_ROBOTS = (*ROBOTS, "walker2d", "swimmer", "humanoid")
-# of another task, limit, number of seeds or, where a cell names none, of steps
+# of another task, limit or number of seeds
 OTHERS = ("env.rules=", "algo.cost_limit=", "num_seeds=")
 
 
@@ -66,8 +66,7 @@ def runs_of(cell: Cell) -> list[Made]:
             for row in csv.DictReader(file):
                 given = row["run"].split()
                 head = [f"env={cell.env}", f"algo={cell.algo}", *filter(None, [steps(cell)])]
-                wrong = OTHERS if cell.steps else (*OTHERS, "total_steps=")
-                others = any(x.startswith(wrong) for x in given)
+                others = any(x.startswith(OTHERS) for x in given)
                 if not others and set(head) <= set(given) and row["final return"]:
                     options = " ".join(x for x in given if x not in head)
                     figures = float(row["final return"]), float(row["final cost"])
