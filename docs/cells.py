@@ -1,7 +1,7 @@
 """The cells of the off-policy and velocity studies beside OmniSafe's: docs/results/cells.md
 
 A cell is an algorithm on a task after a number of steps. It counts if ours, evaluated by mean actions,
-earns at least OmniSafe's mean less its spread and, with a limit, costs at most 25.
+earns at least OmniSafe's mean less its spread and, where it has a limit, costs at most that, 25.
 """
 
 import csv
@@ -11,11 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxsafe.report.group import has_limit
 from jaxsafe.report.published import Published
 
 RESULTS = Path(__file__).parent / "results"
-LIMIT = 25.0  # of an episode
-FREE = ("sac", "ppo")  # blind to cost
 FIVE = ("sac", "sac_lag", "sac_pid", "td3_lag", "ddpg_lag")
 SIX = ("ppo", "ppo_lag", "cpo", "trpo_lag", "focops", "cppo_pid")
 GOALS = ("point_goal1", "car_goal1")
@@ -79,8 +78,12 @@ def steps(cell: Cell) -> str:
 
 
 def counts(made: Made, cell: Cell, known: Published) -> bool:
-    enough = made.ret >= known.ret[0] - known.ret[1]
-    return enough and (cell.algo in FREE or made.cost <= LIMIT)
+    return within(made, cell, known) and made.ret >= known.ret[0] - known.ret[1]
+
+
+def within(made: Made, cell: Cell, known: Published) -> bool:
+    """Whether the cost is at most the published limit, or the algorithm has none."""
+    return not has_limit(cell.algo) or made.cost <= known.cost_limit
 
 
 def table(published: Mapping[tuple[str, str], Published]) -> str:
@@ -93,7 +96,7 @@ def table(published: Mapping[tuple[str, str], Published]) -> str:
     for cell in cells:
         known, made = published[cell.env, cell.algo], runs_of(cell)
         (shipped,) = (x for x in made if x.options == cell.shipped)
-        best = max(made, key=lambda x: (counts(x, cell, known), worth(x, cell)))
+        best = max(made, key=lambda x: (counts(x, cell, known), worth(x, cell, known)))
         good = counts(shipped, cell, known), counts(best, cell, known)
         shipped_in, best_in = shipped_in + good[0], best_in + good[1]
         if not good[0]:
@@ -113,9 +116,9 @@ def table(published: Mapping[tuple[str, str], Published]) -> str:
     return "\n".join([summary, "", *lines])
 
 
-def worth(made: Made, cell: Cell) -> float:
+def worth(made: Made, cell: Cell, known: Published) -> float:
     """The return, where the limit is held; else less the higher the cost is."""
-    return made.ret if cell.algo in FREE or made.cost <= LIMIT else -made.cost
+    return made.ret if within(made, cell, known) else -made.cost
 
 
 def figures(made: Made) -> str:

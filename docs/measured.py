@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxsafe.report import plots, scores, stats, studies, trade_off
 from jaxsafe.report.comparison_tables import SCORES, aggregates
-from jaxsafe.report.group import Group, group, ordered, suite
+from jaxsafe.report.group import Group, group, has_limit, ordered, suite
 from jaxsafe.report.looks import styles
 from jaxsafe.report.published import Published, beside, read_published
 from jaxsafe.report.read import SettingRun, read
@@ -33,11 +33,15 @@ EXTRA = ("crpo", "ipo", "pdo", "ppo_penalty")  # trained on two tasks alone, so 
 PUBLISHED = read_published(RESULTS / "published.csv")
 SWEEP = "jaxsafe, and dynamics"  # `solver` of the rows that are compared with each other
 SHOWN = ("cpo", "cppo_pid", "cup", "focops", "p3o", "pcpo", "ppo_lag", "rcpo", "trpo_lag", "trpo_pid")
-FREE = ("pg", "npg", "trpo", "ppo")  # blind to cost
 EARLY = ("ppo_early_terminated", "trpo_early_terminated")  # evaluated in cut episodes there
 TASKS = [
     f"{robot}_{task}{n}" for task in ("goal", "button") for n in "12" for robot in ("point", "car")
 ]
+
+
+def constrained(algo: str) -> bool:
+    """Whether an algorithm has a limit, and episodes that do not end at it."""
+    return has_limit(algo) and algo not in EARLY
 
 
 def beyond(value: float, spread: tuple[float, float]) -> float:
@@ -107,7 +111,7 @@ def best() -> str:
             theirs[env].append(Policy(known.ret[0], known.cost[0], algo))
 
     def most(policies: Sequence[Policy], cost: float) -> Policy:
-        return max(x for x in policies if x.cost <= cost and x.algo not in (*FREE, *EARLY))
+        return max(x for x in policies if x.cost <= cost and constrained(x.algo))
 
     lines = ["| | OmniSafe, at most 27.5 | ours, at most 25 | study |", "|---|---:|---:|---|"]
     met = []
@@ -130,7 +134,7 @@ def mean_actions(training: Sequence[Group], final: Sequence[Group]) -> str:
     lines = ["| | algorithms | return | cost |", "|---|---:|---:|---:|"]
     found: dict[str, list[tuple[float, float]]] = {}
     for g in final:
-        if g.name not in (*FREE, *EARLY):
+        if constrained(g.name):
             sampled = before[g.env, g.name]
             change = g.ret.mean - sampled.ret.mean, g.cost.mean - sampled.cost.mean
             found.setdefault(g.env, []).append(change)
@@ -151,10 +155,10 @@ def apart(groups: Sequence[Group], known: Mapping[tuple[str, str], Published]) -
 def held(training: Sequence[Group], final: Sequence[Group]) -> str:
     """In how many constrained cells the cost is at most 1.2 times the limit, ours and OmniSafe's:
     evaluated policies beside evaluated policies, training beside training."""
-    pairs = [(g, beside(g, PUBLISHED)) for g in final if g.name not in (*FREE, *EARLY)]
+    pairs = [(g, beside(g, PUBLISHED)) for g in final if constrained(g.name)]
     known = [(g.cost.mean, theirs.cost[0]) for g, theirs in pairs if theirs]
     curves = their_curves()
-    ends = [(g, curves.get((g.env, g.name), ("", ""))[1]) for g in training if g.name not in FREE]
+    ends = [(g, curves.get((g.env, g.name), ("", ""))[1]) for g in training if has_limit(g.name)]
     trained = [(g.cost.mean, float(cost)) for g, cost in ends if cost]
 
     def count(pairs: Sequence[tuple[float, float]]) -> str:

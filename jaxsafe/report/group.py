@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxsafe.algos import ALGOS
 from jaxsafe.config import ConfigError, nearest
 from jaxsafe.learn.constraints import cost_title
 from jaxsafe.report import stats
@@ -106,6 +107,12 @@ class Group(NamedTuple):
 @functools.cache
 def over_seeds(name: str, values: tuple[float, ...], statistic: Callable[..., np.ndarray]) -> Estimate:
     return stats.of_measure(name, np.array(values), statistic=statistic)
+
+
+def has_limit(algo: str | None) -> bool:
+    """Whether an algorithm keeps to a limit of cost. One that is not known here is taken to."""
+    row = ALGOS.get(algo or "")
+    return row is None or row.holds != "nothing"
 
 
 def clock(groups: Iterable[Group]) -> str:

@@ -9,9 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from jaxsafe.algos import ALGOS
 from jaxsafe.learn.constraints import cost_title
-from jaxsafe.report.group import Group
+from jaxsafe.report.group import Group, has_limit
 from jaxsafe.report.looks import MARKERS, styles
 from jaxsafe.report.plots import PANELS, frame, grid, legend, limit_colors, shows_interval
 from jaxsafe.report.published import Published
@@ -175,8 +174,7 @@ def without_limit(row: Group) -> str:
 
 def keeps_limit(p: Point) -> bool:
     """Whether the algorithm has a limit, and the mean is within."""
-    known = ALGOS.get(p.row.algo or "")
-    return (known is None or known.holds != "nothing") and p.cost.mean <= p.limit
+    return has_limit(p.row.algo) and p.cost.mean <= p.limit
 
 
 def cut(points: Sequence[Point]) -> float:
