@@ -224,7 +224,7 @@ class SweepResult(NamedTuple):
 
     folder: with the files of the summary, and a run folder for each program.
     rows: one a setting: `row.name`, `row.cost_limit`, `row.ret` and `row.cost` (mean, low, high over
-        seeds of the last 10 % of training, or of the final evaluation where training plays no
+        seeds of the last 10% of training, or of the final evaluation where training plays no
         episodes), `row.returns` and `row.costs`, float [S], and `row.held`,
         whether every limit is: 'yes', 'no', 'unclear' within the interval, or '-' if not known.
     runs: the run folders.

@@ -1,6 +1,6 @@
 """The tables of a comparison.
 
-Figures of a seed are those of the last 10 % of its training, but for the cost rate, which is of all of
+Figures of a seed are those of the last 10% of its training, but for the cost rate, which is of all of
 it. Where training plays no episodes, they are of its final evaluation. Tasks stand apart; across them
 only normalised scores, and comparisons within a task, are averaged.
 """

@@ -8,9 +8,9 @@ give on the same tasks.
 - Interquartile means have a t interval with the standard error of the stratified bootstrap, which
   resamples seeds within each task. It covers a little more than 95%.
 - Shares (profiles, probabilities of improvement) have the stratified bootstrap's percentiles, which
-  stay between 0 and 1. With five seeds on one task these cover about 85 %.
+  stay between 0 and 1. With five seeds on one task these cover about 85%.
 
-Percentiles alone would cover 80 to 89 % for means of 4 to 8 seeds; a test simulates both.
+Percentiles alone would cover 80 to 89% for means of 4 to 8 seeds; a test simulates both.
 
 Source: Student (1908), "The Probable Error of a Mean"; Welch (1947), "The Generalization of `Student's'
 Problem when Several Different Population Variances are Involved"; Agarwal et al. (2021), "Deep

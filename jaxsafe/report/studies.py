@@ -34,7 +34,7 @@ from PIL import Image
 
 from jaxsafe.config import ConfigError
 from jaxsafe.report import plots, scores, stats, study_files, tables, trade_off
-from jaxsafe.report.group import Group, group, tasks_of, telling
+from jaxsafe.report.group import LATE, Group, group, tasks_of, telling
 from jaxsafe.report.looks import styles
 from jaxsafe.report.published import Published, beside, end_beside, read_ends, read_published
 from jaxsafe.report.read import SettingRun, defaults, with_evaluation
@@ -376,8 +376,8 @@ def pictures_of(
     crowd = max(Counter(g.env for g in groups).values(), default=0)
     if len(looks) > 1 and crowd <= MOST:
         theirs = {(g.env, g.name): beside(g, known) for g in groups}
-        draw = functools.partial(trade_off.draw, groups, "last 10 % of training", theirs, looks)
-        caption = "Return against cost of last 10% of training, a point a setting"
+        draw = functools.partial(trade_off.draw, groups, LATE, theirs, looks)
+        caption = f"Return against cost of {LATE}, a point a setting"
         if any(theirs.values()):  # these are of evaluated policies, and so are ours then
             draw = functools.partial(trade_off.draw, final(groups), "evaluated policies", theirs, looks)
             caption = (
@@ -447,7 +447,7 @@ def matrices(groups: Sequence[Group], known: Mapping[tuple[str, str], Published]
         return matrix(groups, {})
     if not trained:
         return f"{words}\n\n{matrix(played, known)}"
-    return f"The last tenth of training:\n\n{matrix(groups, {})}\n\n{words}\n\n{matrix(played, known)}"
+    return f"The {LATE}:\n\n{matrix(groups, {})}\n\n{words}\n\n{matrix(played, known)}"
 
 
 def matrix(groups: Sequence[Group], known: Mapping[tuple[str, str], Published]) -> str:

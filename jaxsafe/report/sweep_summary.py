@@ -16,7 +16,7 @@ from jaxsafe.run.sweep_folder import read_folder
 
 
 def rows_of(folder: Path, extras: Extras = NO_EXTRAS) -> list[Group]:
-    """A row for each setting that has begun: of the last 10 % of training or, where training has no
+    """A row for each setting that has begun: of the last 10% of training or, where training has no
     episodes, of the final evaluation."""
     swept = read_folder(folder).swept
     runs = [or_evaluated(run) for path in files.runs_in(folder) for run in read_one(path, extras)]

@@ -333,7 +333,7 @@ def step_column(metrics: Mapping[str, np.ndarray]) -> str:
 
 
 def last_tenth(metrics: dict[str, np.ndarray], name: str) -> np.ndarray:
-    """The mean of a metric over the last 10 % of training so far, [S]; NaN for a seed without value."""
+    """The mean of a metric over the last 10% of training so far, [S]; NaN for a seed without value."""
     late = metrics["iteration"] > 0.9 * metrics["iteration"].max()
     late &= np.isfinite(metrics[name])
     values = (metrics[name][late & (metrics["seed"] == s)] for s in np.unique(metrics["seed"]))
