@@ -57,6 +57,8 @@ def results(
             rows.append([source, *theirs])
     what = "Return" if metric == "return" else "Cost"
     caption = f"{what} of an episode, {period(groups)}: mean and 95% interval over seeds."
+    if not all(stats.has_interval(g.costs) for g in groups):
+        caption += " Fewer than three seeds have no interval."
     if len(limits) == 1 and (words := next(iter(limits))) != "-":
         caption += f" Cost limit {words}."
     if metric == "return" and safe:
@@ -83,9 +85,9 @@ def details(groups: Sequence[Group]) -> list[Table]:
     ]  # fmt: skip
     caption = (
         "Each task. IQM: interquartile mean over seeds. Held: whether the mean cost is within the "
-        "limit; unclear where it is not but its interval is. Violation rate: the share of iterations, "
-        "in the last 10%, whose mean cost of an episode is over the limit. Cost rate: total cost over "
-        "total steps of training."
+        "limit; unclear where it is not but its interval is or, of two seeds, one is. Violation rate: "
+        "the share of iterations, in the last 10%, whose mean cost of an episode is over the limit. "
+        "Cost rate: total cost over total steps of training."
     )
     out = [Table(caption, header, rows, left=2)]
     scored = [g for g in groups if known_of(g, SCORES[0])]

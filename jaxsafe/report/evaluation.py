@@ -134,8 +134,8 @@ def of_data(data: PyTree, cost_limit: float) -> dict[str, Estimate]:
 def estimate_over_seeds(name: str, values: np.ndarray) -> Estimate:
     """Mean of the measure `name`, `values` [S, N], and its interval over seeds.
 
-    The means of seeds hold the spread of episodes, too. With one seed the interval covers the episodes
-    alone, not what another seed would give.
+    The means of seeds hold the spread of episodes, too. Two seeds have no interval. With one seed it
+    covers the episodes alone, not what another seed would give.
     """
     return stats.of_measure(name, values.mean(1) if len(values) > 1 else values[0])
 

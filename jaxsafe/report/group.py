@@ -91,16 +91,19 @@ class Group(NamedTuple):
 
     @property
     def held(self) -> str:
-        """Whether each limit is: 'unclear' where the mean is above it and its interval is not."""
+        """Whether each limit is: 'unclear' where the mean is above it and its interval is not, or, of
+        two seeds, which have none, one is not."""
 
-        def answer(cost: Estimate, limit: float) -> str:
+        def answer(name: str, limit: float) -> str:
+            cost, values = self.estimate(name), self.values(name)
             if np.isnan(cost.mean):
                 return "-"
             if cost.mean <= limit:
                 return "yes"
-            return "unclear" if cost.low <= limit else "no"
+            low = cost.low if stats.has_interval(values) else values.min()
+            return "unclear" if low <= limit else "no"
 
-        found = {answer(self.estimate(cost_title(name)), most) for name, most in self.limits.items()}
+        found = {answer(cost_title(name), most) for name, most in self.limits.items()}
         return next((word for word in ("no", "-", "unclear", "yes") if word in found), "-")
 
 

@@ -141,7 +141,7 @@ def draw_setting(
     estimated: bool = False,
 ) -> None:
     """The curves of one setting, `values` [S, T]. Estimates are dashed."""
-    alone, few, ls = len(values) == 1, not shows_interval(values), "--" if estimated else "-"
+    alone, few, ls = len(values) == 1, not stats.has_interval(values), "--" if estimated else "-"
     look = {"lw": 1.2 if few else 0.6, "alpha": 1 if few else 0.4, "color": color, "ls": ls}
     lines = axes.plot(steps, values.T, **look)
     label = ", ".join(filter(None, [setting, ESTIMATED * estimated]))
@@ -165,8 +165,8 @@ def band(
 def traces(
     axes: Axes, measure: str, steps: np.ndarray, values: np.ndarray, label: str, **style: Any
 ) -> None:
-    """A `band`; or a thin line a seed where so few have an interval that says little."""
-    if shows_interval(values):
+    """A `band`; or a thin line a seed where so few have no interval."""
+    if stats.has_interval(values):
         band(axes, measure, steps, values, label, **style)
         return
     first, *_ = axes.plot(steps, values.T, lw=0.9, **style)
@@ -356,11 +356,6 @@ def profiles(suite: Suite) -> Figure:
 
 
 # ---- what the figures share ------------------------------------------------------------------
-
-
-def shows_interval(values: np.ndarray) -> bool:
-    """Whether the interval of these seeds [S, ...] is drawn: that of fewer than three says little."""
-    return len(values) >= 3
 
 
 def grid(count: int, size: tuple[float, float]) -> tuple[Figure, list[Axes]]:

@@ -2,7 +2,7 @@
 
 A sample holds one task's values, one a seed: float [S] or, of T numbers at once, [S, T]. Several
 samples are several tasks, whose numbers of seeds may differ. An interval says what other seeds would
-give on the same tasks.
+give on the same tasks. Where a task has fewer than three seeds there is none (`has_interval`).
 
 - Means have Student's t interval, over several tasks with Welch's degrees of freedom.
 - Interquartile means have a t interval with the standard error of the stratified bootstrap, which
@@ -29,6 +29,7 @@ import scipy  # scipy.stats takes a second to import, and is imported at its fir
 
 DRAWS = 10_000  # bootstrap samples
 CONFIDENCE = 0.95
+LEAST = 3  # seeds of a task; Student's t of two is 12.7 standard errors, and says little
 DRAWN_AT_ONCE = 10_000_000  # numbers drawn at once
 
 
@@ -38,6 +39,11 @@ class Estimate(NamedTuple):
     mean: float  # or another statistic
     low: float
     high: float
+
+
+def has_interval(*samples: np.ndarray) -> bool:
+    """Whether each sample [S, ...] has seeds enough for an interval, in tables and figures alike."""
+    return min(map(len, samples)) >= LEAST
 
 
 def mean(*samples: np.ndarray, axis: int = 0) -> np.ndarray:
@@ -60,7 +66,7 @@ def estimate(
         statistic: `mean`, `iqm`, or a share `statistic(*samples, axis)` over the axis of seeds.
         draws: bootstrap samples.
     Returns:
-        Floats or float [T]: NaN where a value is; an interval of no width where a task has one seed.
+        Floats or float [T]: NaN where a value is; an interval of no width unless it `has_interval`.
     """
     columns = [np.asarray(x, float).reshape(len(x), -1) for x in samples]
     known = np.all([np.isfinite(x).all(0) for x in columns], axis=0)
@@ -69,7 +75,7 @@ def estimate(
     found = np.full((3, *known.shape), np.nan)
     if known.any():
         found[:, known] = middle = statistic(*columns, axis=0)
-        if min(map(len, columns)) > 1:
+        if has_interval(*columns):
             if statistic is mean:
                 found[1:, known] = middle + welch(columns) * np.array([[-1.0], [1.0]])
             else:

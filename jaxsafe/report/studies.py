@@ -546,11 +546,12 @@ def run_table(
 
 def final_policy(run: SettingRun, otherwise: str) -> str:
     """What the mean action made in fresh episodes, and where it is known the sampled one: means over
-    seeds and their intervals."""
+    seeds, with their intervals if they have some."""
 
     def made(by: str) -> str:
-        ret, cost = (stats.of_measure(k, run.values[f"final {by}{k}"]) for k in ("return", "cost"))
-        return "{:.2f} [{:.2f}, {:.2f}], cost {:.2f} [{:.2f}, {:.2f}]".format(*ret, *cost)
+        found = (stats.of_measure(k, run.values[f"final {by}{k}"]) for k in ("return", "cost"))
+        ret, cost = (tables.cell(e, ".2f") for e in found)
+        return f"{ret}, cost {cost}"
 
     if not {"final return", "final cost"} <= run.values.keys():
         return otherwise

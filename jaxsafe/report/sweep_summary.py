@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 
 from jaxsafe.learn.constraints import cost_title, limits_in_words
-from jaxsafe.report import plots, tables, trade_off
+from jaxsafe.report import plots, stats, tables, trade_off
 from jaxsafe.report.group import Group, clock, group, period
 from jaxsafe.report.read import or_evaluated, read_one
 from jaxsafe.report.tables import Table
@@ -30,7 +30,7 @@ def summarise(folder: Path, extras: Extras = NO_EXTRAS) -> str:
     files.write(folder / "summary.md", text)
     files.write(folder / "summary.csv", as_csv(rows))
     title = period(rows)
-    title += ", mean and 95% interval" * any(plots.shows_interval(row.costs) for row in rows)
+    title += ", mean and 95% interval" * any(stats.has_interval(row.costs) for row in rows)
     title += f"; {plots.ESTIMATED}" * any(row.estimated for row in rows)
     plots.save(trade_off.draw(rows, title), folder / "summary")
     return text

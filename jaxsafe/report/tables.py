@@ -26,7 +26,7 @@ class Table(NamedTuple):
 
 
 def cell(e: Estimate, form: str = ".4g") -> str:
-    """Mean and interval, '-' for what is not known. One seed alone has no interval."""
+    """Mean and interval, '-' for what is not known. Fewer than three seeds have no interval."""
     if np.isnan(e.mean):
         return "-"
     interval = "" if e.low == e.high else f" [{e.low:{form}}, {e.high:{form}}]"

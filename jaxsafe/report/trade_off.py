@@ -12,9 +12,9 @@ from matplotlib.ticker import MaxNLocator
 from jaxsafe.learn.constraints import cost_title
 from jaxsafe.report.group import Group, has_limit
 from jaxsafe.report.looks import MARKERS, styles
-from jaxsafe.report.plots import PANELS, frame, grid, legend, limit_colors, shows_interval
+from jaxsafe.report.plots import PANELS, frame, grid, legend, limit_colors
 from jaxsafe.report.published import Published
-from jaxsafe.report.stats import Estimate
+from jaxsafe.report.stats import Estimate, has_interval
 
 REACH = 4  # limits that the cost axis shows, where points lie farther out
 NUMBER = 0.04  # of a panel's width and height, which the number of a limit takes
@@ -44,7 +44,7 @@ def draw(
     """Return against cost of each row of a comparison: a panel an environment or, where named costs
     have limits of their own, each of these.
 
-    A point is the mean over seeds, with its 95% interval if it `shows_interval`. Each limit is a dashed
+    A point is the mean over seeds, with its 95% interval if it `has_interval`. Each limit is a dashed
     line: grey, or in the colour of the one setting it belongs to. Rows that differ in their limit alone
     are a line through their points, in the order of the limits. The number of each limit stands on its
     point, in one box where points lie on each other, and each limit is a tick on the axis of cost.
@@ -116,7 +116,7 @@ def draw_chain(axes: Axes, chain: Sequence[Point], most: float) -> None:
     for i, p in enumerate(chain):
         axes.plot(p.costs, p.row.returns, ".", color=color, ms=4, alpha=0.5)
         look = {"fmt": marker, "ms": 5, "lw": 1, "color": color, "label": "" if i else label}
-        if shows_interval(p.costs):
+        if has_interval(p.costs):
             look["xerr"] = [[p.cost.mean - p.cost.low], [p.cost.high - p.cost.mean]]
             look["yerr"] = [[p.ret.mean - p.ret.low], [p.ret.high - p.ret.mean]]
         axes.errorbar(p.cost.mean, p.ret.mean, **look)

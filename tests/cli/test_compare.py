@@ -153,10 +153,10 @@ def test_seeds_of_one_setting_are_pooled_and_other_settings_stand_apart(tmp_path
 
 def test_settings_of_an_algorithm_are_told_apart_by_what_differs(tmp_path):
     for limit in (100, 5, 20):
-        write(tmp_path / f"{limit}", cost_limit=float(limit), costs=(29.0, 31.0))
+        write(tmp_path / f"{limit}", cost_limit=float(limit), costs=(19.0, 31.0))
     groups = compared(tmp_path)
     assert [g.name for g in groups] == [f"ppo_lag, algo.cost_limit={x}" for x in (5, 20, 100)]
-    assert [g.held for g in groups] == ["no", "unclear", "yes"]
+    assert [g.held for g in groups] == ["no", "unclear", "yes"]  # of 5 no seed is within
     assert "**" not in str(
         comparison_tables.results(groups, "return", {}).rows
     )  # of other limits, none is best
@@ -204,7 +204,7 @@ def test_tasks_stand_apart_and_only_those_of_every_setting_are_compared(tmp_path
 
 
 def test_published_figures_stand_below_and_what_lies_beyond_their_spread_is_marked(tmp_path):
-    write(tmp_path / "1", "point_goal1", "cpo", (10.0, 20.0), (10.0, 20.0))
+    write(tmp_path / "1", "point_goal1", "cpo", *2 * [(10.0, 15.0, 20.0)], (0, 1, 2))
     write(tmp_path / "2", "point_goal1", "ppo_lag", (30.0, 30.0), (30.0, 31.0))
     write(tmp_path / "3", "car_push1", "cpo", (1.0, 2.0), (0.0, 0.0))
     path = tmp_path / "published.csv"
@@ -213,13 +213,14 @@ def test_published_figures_stand_below_and_what_lies_beyond_their_spread_is_mark
     )
     table = comparison_tables.results(compared(tmp_path), "return", read_published(path))
     assert table.header == ["", "car_push1", "point_goal1"]
+    assert "Fewer than three seeds have no interval." in table.caption
     assert table.rows == [
-        ["`cpo`", "**1.50 [-4.85, 7.85]**", "**15.00 [-48.53, 78.53]** ↑"],
+        ["`cpo`", "**1.50**", "**15.00 [2.58, 27.42]** ↑"],  # of two seeds and of three
         ["Peer", "-", "12.00 ± 2.90"],
         ["`ppo_lag`", "-", "30.00"],  # published with another limit; the cost is over ours
     ]
     cost = comparison_tables.results(compared(tmp_path), "cost", read_published(path))
-    assert cost.rows[0][2] == "15.00 [0.00, 78.53]" and cost.rows[1][2] == "30.00 ± 20.00"
+    assert cost.rows[0][2] == "15.00 [2.58, 27.42]" and cost.rows[1][2] == "30.00 ± 20.00"
 
 
 def test_published_figures_stand_beside_runs_of_the_same_rules_alone(tmp_path):
@@ -261,7 +262,7 @@ def test_the_pareto_front_leaves_out_what_costs_more_and_returns_less():
 
 
 def test_the_frame_of_a_trade_off_holds_every_seed_and_cuts_wide_intervals(tmp_path):
-    write(tmp_path / "a", "point_goal1", "cpo")
+    write(tmp_path / "a", "point_goal1", "cpo", (1.0, 2.0, 3.0), (20.0, 30.0, 40.0), (0, 1, 2))
     (group,) = compared(tmp_path / "a")
     axes = trade_off.draw([group], "").axes[0]
     for (low, high), values, wide in (
@@ -409,7 +410,8 @@ def test_the_end_of_a_published_curve_stands_beside_runs_of_its_length(tmp_path)
 def test_one_command_writes_every_table_and_figure_the_same_each_time(tmp_path, capsys):
     for env in ("point_goal1", "car_goal1"):
         for algo in ("cpo", "ppo_lag"):
-            write(tmp_path / "runs" / f"{env}-{algo}", env, algo)
+            three = (1.0, 2.0, 3.0), (20.0, 30.0, 40.0), (0, 1, 2)
+            write(tmp_path / "runs" / f"{env}-{algo}", env, algo, *three)
     out = tmp_path / "out"
     arguments = [*map(str, (tmp_path / "runs", "--published", RESULTS / "published.csv", "--out", out))]
     assert typed("plot", *arguments) == 0
@@ -425,9 +427,9 @@ def test_one_command_writes_every_table_and_figure_the_same_each_time(tmp_path, 
     rows = list(csv.DictReader(io.StringIO((out / "results.csv").read_text())))
     (one,) = [r for r in rows if r["task"] == "car_goal1" and r["algo.name"] == "cpo"
               and (r["metric"], r["statistic"]) == ("return", "mean")]  # fmt: skip
-    width = 12.7062047  # t of one degree of freedom, and a standard error of 1
+    width = 4.3026527 / 3**0.5  # t of two degrees of freedom, and a deviation of 1
     np.testing.assert_allclose(
-        [float(one[k]) for k in ("seeds", "value", "low", "high")], [2, 2, 2 - width, 2 + width]
+        [float(one[k]) for k in ("seeds", "value", "low", "high")], [3, 2, 2 - width, 2 + width]
     )
     assert "P(better than ppo_lag)" in {r["statistic"] for r in rows}
     assert typed("plot", *arguments, "--by", "algo.name") == 0

@@ -69,8 +69,8 @@ def test_means_and_interquartile_means_by_hand():
     few, many = np.array([2.0, 4.0]), np.array([0.0, 10.0, 20.0, 30.0, 40.0, 50.0])
     assert stats.estimate(few, many).mean == (3 + 25) / 2  # a task counts once, whatever its seeds
     assert stats.estimate(few, many, statistic=stats.iqm).mean == (4 + 10 + 20 + 30) / 4
-    low = 3.0 - 12.7062047  # t of one degree of freedom, and a standard error of 1
-    np.testing.assert_allclose(stats.estimate(few), (3.0, low, 6.0 - low))
+    low = 3.0 - 4.3026527 * 2 / 3**0.5  # t of two degrees of freedom, and a deviation of 2
+    np.testing.assert_allclose(stats.estimate(np.array([1.0, 3.0, 5.0])), (3.0, low, 6.0 - low))
 
 
 def test_the_spread_between_tasks_does_not_widen_the_interval():
@@ -86,26 +86,33 @@ def test_the_interval_of_the_mean_nears_that_of_the_normal_law():
     )
 
 
-def test_one_seed_has_no_interval_and_what_is_unknown_stays_unknown():
-    assert stats.estimate(np.array([7.0])) == (7.0, 7.0, 7.0)
-    assert stats.estimate(np.array([7.0]), np.array([1.0, 3.0])) == (4.5, 4.5, 4.5)
+def test_fewer_than_three_seeds_have_no_interval_and_what_is_unknown_stays_unknown():
+    one, two, three = np.array([7.0]), np.array([1.0, 3.0]), np.array([1.0, 2.0, 3.0])
+    assert stats.estimate(one) == (7.0, 7.0, 7.0)
+    assert stats.estimate(two) == stats.estimate(two, statistic=stats.iqm) == (2.0, 2.0, 2.0)
+    assert stats.estimate(one, three) == (4.5, 4.5, 4.5)
+    assert stats.estimate(two, three) == (2.0, 2.0, 2.0)
+    assert stats.has_interval(three) and not stats.has_interval(two, three)
     assert np.isnan(stats.estimate(np.array([7.0, np.nan]))).all()
     columns = stats.estimate(np.array([[1.0, np.nan, 3.0], [2.0, 5.0, 3.0]]))
     np.testing.assert_array_equal(np.isnan(columns), [[False, True, False]] * 3)
     np.testing.assert_allclose(np.array(columns)[:, 2], 3.0)
 
 
+WIDTH = 4.3026527 / 3**0.5  # half an interval's, of three seeds with a standard deviation of 1
+
+
 @pytest.mark.parametrize(
     "name, values, ends",
     [
-        ("violation rate", [0.0, 0.1], (0.0, 0.05 + 12.7062 * 0.05)),
-        ("final violation rate", [0.9, 1.0], (0.95 - 12.7062 * 0.05, 1.0)),
-        ("hazards over 10", [0.0, 1.0], (0.0, 1.0)),
-        ("cost", [1.0, 3.0], (0.0, 2 + 12.7062)),
-        ("cost rate", [0.0, 0.1], (0.0, 0.05 + 12.7062 * 0.05)),
-        ("cost", [-1.0, 3.0], (1 - 12.7062 * 2, 1 + 12.7062 * 2)),  # costs may be negative there
-        ("return", [1.0, 3.0], (2 - 12.7062, 2 + 12.7062)),
-        ("normalised return", [1.0, 3.0], (2 - 12.7062, 2 + 12.7062)),
+        ("violation rate", [0.0, 0.05, 0.1], (0.0, 0.05 + WIDTH * 0.05)),
+        ("final violation rate", [0.9, 0.95, 1.0], (0.95 - WIDTH * 0.05, 1.0)),
+        ("hazards over 10", [0.0, 0.5, 1.0], (0.0, 1.0)),
+        ("cost", [1.0, 2.0, 3.0], (0.0, 2 + WIDTH)),
+        ("cost rate", [0.0, 0.05, 0.1], (0.0, 0.05 + WIDTH * 0.05)),
+        ("cost", [-1.0, 1.0, 3.0], (1 - WIDTH * 2, 1 + WIDTH * 2)),  # costs may be negative there
+        ("return", [1.0, 2.0, 3.0], (2 - WIDTH, 2 + WIDTH)),
+        ("normalised return", [1.0, 2.0, 3.0], (2 - WIDTH, 2 + WIDTH)),
     ],
 )
 def test_an_interval_stops_where_its_measure_does(name, values, ends):
