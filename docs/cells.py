@@ -44,7 +44,7 @@ class Made(NamedTuple):
 
 def asked() -> list[Cell]:
     """The 71 cells, in the order of the table."""
-    off = ("off_policy",)
+    off = ("off_policy", "td3")
     goal = ("goal_off_policy",)
     on = ("velocity", "velocity_settings")
     at_256 = {x: "preset=parallel_navigation algo.n_step=3" for x in FIVE} | {"sac": "preset=parallel"}

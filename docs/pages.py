@@ -75,7 +75,7 @@ LOOPS = {  # the first that an algorithm's config is one of
     OffPolicyConfig: "off-policy",
     OfflineConfig: "offline",
 }
-STUDIES = ("goal", "button", "push", "omnisafe", "velocity", "off_policy")  # in docs/results
+STUDIES = ("goal", "button", "push", "omnisafe", "velocity", "off_policy", "td3")  # in docs/results
 OTHERS = ("planning", "shielding", "offline", "seditor")  # with limits, lengths or data of their own
 ABSENT = object()  # where there is no default
 ALGORITHMS = """# Algorithms
