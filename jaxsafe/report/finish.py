@@ -7,6 +7,7 @@ from jaxsafe.config import one_line
 from jaxsafe.learn.constraints import limits_by_name, limits_in_words
 from jaxsafe.report import evaluation, plots
 from jaxsafe.report.film import film
+from jaxsafe.report.tables import cell
 from jaxsafe.run import files, run_folder
 from jaxsafe.run.interrupts import Interrupts
 from jaxsafe.run.policies import RunPolicies, member_policies
@@ -41,12 +42,11 @@ def finish(session: Session, report: Reporter, stop: Interrupts) -> None:
         text = json.dumps({"episodes": train.eval_episodes, **tables.get("", tables)}, indent=1)
         files.write(folder / "evaluation.json", text)
         for s in found:
-            ret, cost, rate = s.rows["return"], s.rows["cost"], s.rows["violation rate"]
+            share = s.rows["violation rate"].mean
             report.line(
-                f"final policy{s.name and ', ' + s.name}: return {ret.mean:.4g} [{ret.low:.4g}, "
-                f"{ret.high:.4g}], cost {cost.mean:.4g} [{cost.low:.4g}, {cost.high:.4g}] "
-                f"(limit {limits_in_words(s.limits)}), "
-                f"{100 * rate.mean:.0f}% of {s.episodes} episodes over it"
+                f"final policy{s.name and ', ' + s.name}: return {cell(s.rows['return'])}, "
+                f"cost {cell(s.rows['cost'])} (limit {limits_in_words(s.limits)}), "
+                f"{100 * share:.0f}% of {s.episodes} episodes over it"
             )
         if risks:
             plots.calibration(risks, folder / "calibration.png", title)
