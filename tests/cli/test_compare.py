@@ -204,7 +204,8 @@ def test_tasks_stand_apart_and_only_those_of_every_setting_are_compared(tmp_path
 
 
 def test_published_figures_stand_below_and_what_lies_beyond_their_spread_is_marked(tmp_path):
-    write(tmp_path / "1", "point_goal1", "cpo", *2 * [(10.0, 15.0, 20.0)], (0, 1, 2))
+    three = (10.0, 15.0, 20.0)
+    write(tmp_path / "1", "point_goal1", "cpo", three, three, (0, 1, 2))
     write(tmp_path / "2", "point_goal1", "ppo_lag", (30.0, 30.0), (30.0, 31.0))
     write(tmp_path / "3", "car_push1", "cpo", (1.0, 2.0), (0.0, 0.0))
     path = tmp_path / "published.csv"
