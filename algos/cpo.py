@@ -46,7 +46,8 @@ class CPOConfig(LimitsConfig, trpo.TRPOConfig):
     Why a gain and a margin: a step lowers the cost by less than b'x promises. There are thousands of
     parameters, so most of the step fits the noise of its batch. That lowers the surrogate, but not the
     cost. On Goal and Button about 1% of the promised decrease is realised. With c = v the cost
-    therefore stays well above the limit, as it does in Ray, Achiam and Amodei (2019).
+    therefore stays well above the limit, as it does in Ray, Achiam and Amodei (2019). The gain holds
+    below the limit, too: a step may then promise to spend violation_gain times what is left.
 
     The margin grows while the limit is broken, and so asks for more and more. It is from the code of
     that paper, where it is off and has no bound. With the margin alone the cost swings about the limit
@@ -75,7 +76,8 @@ class CPOConfig(LimitsConfig, trpo.TRPOConfig):
     line_search_tries: Iterations = 20  # Steps that the line search tries at most, as in OmniSafe.
     # Whether the violation v is in cost per step, as b is. OmniSafe's is per episode.
     per_step: bool = True
-    violation_gain: Weight = 5.0  # A step is asked to take back this many times v.
+    # A step is asked to take back this many times v. Below the limit it may spend as many times -v.
+    violation_gain: Weight = 5.0
     # How fast the margin grows with v, as in safety-starter-agents, where it is off. 0: no margin.
     margin_lr: Weight = 0.05
     margin_max: Weight = 2.0  # Bound of the margin, as a multiple of the most that a step can promise.

@@ -11,7 +11,7 @@ from jaxsafe.config import Bounds, Cap, KLStop, config
 from jaxsafe.learn.constraints import constrained_costs, each
 from jaxsafe.learn.on_policy import Batch, Improved, Method, TrainState, on_policy_loop, presets
 from jaxsafe.learn.row import Row
-from jaxsafe.learn.steps import Context, adam_epochs
+from jaxsafe.learn.steps import Context, adam_epochs, mean_kl
 from jaxsafe.learn.surrogates import clipped, plain, with_entropy
 from jaxsafe.learn.treatments import LagrangianConfig, lagrangian
 from jaxsafe.nn.gaussian import kl
@@ -85,6 +85,10 @@ def make(env: Env, axis_name: str | None = None) -> Algorithm:
         actor, opt_state, second = adam_epochs.update(actor, opt_state, project, better, contexts[1])
         metrics |= {f"{name}_projection": x for name, x in second.items()}
         metrics["train/nonfinite"] += metrics.pop("train/nonfinite_projection")
+        # that of step 1 says whether it stopped, that of both is the policy's
+        metrics["train/kl_reward"] = metrics["train/kl"]
+        final = action_dist(actor, batch.obs, cfg)
+        metrics["train/kl"] = mean_kl(batch.old, final, context.axis_name)
         return Improved(actor, opt_state, dual, metrics | lagrangian.metrics(dual))
 
     method = Method(adam_epochs.check, adam_epochs.init, lagrangian.init, improve, constrained_costs)

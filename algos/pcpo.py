@@ -27,9 +27,9 @@ class PCPOConfig(cpo.CPOConfig):
 
     Source: Yang et al. (2020), "Projection-based Constrained Policy Optimization", arXiv:2010.03152,
     equation 9.
-    Differs from it, as CPO does: c has a margin, and a line search keeps the step within delta. The
-    paper has no line search, and OmniSafe has CPO's. OmniSafe also leaves H^-1 out of the first term
-    (`natural=False`).
+    Differs from it, as CPO does: c has a margin, and a line search keeps the step within delta and the
+    cost within max(-c, 0). The paper has no line search, and OmniSafe has CPO's. OmniSafe also leaves
+    H^-1 out of the first term (`natural=False`).
     """
 
     CONVENTIONS: ClassVar = (

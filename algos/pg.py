@@ -58,7 +58,9 @@ PUBLISHED: dict[str, Any] = {
 }
 LEVER: dict[str, Any] = {"lr": 1e-2, "target_kl": 0.1, "epochs": 8}  # for a problem of two levers
 OFTEN: dict[str, Any] = {"epochs": 40, "critic_epochs": 40}  # passes of most of OmniSafe's algorithms
-SCALED: dict[str, Any] = {"reward_normalize": True, "cost_normalize": True}
+SCALED: dict[str, Any] = {
+    "reward_normalize": True, "cost_normalize": True, "reward_centre": True, "cost_centre": True
+}  # fmt: skip
 
 ROWS = {
     "pg": Row(

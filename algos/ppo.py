@@ -94,6 +94,9 @@ class CPPOPIDConfig(PIDConfig, PPOConfig):
 
     Source: Stooke, Achiam and Abbeel (2020), "Responsive Safety in Reinforcement Learning by PID
     Lagrangian Methods", arXiv:2007.03964, algorithm 2.
+    Differs from it, as the authors' code and OmniSafe do: P and J_c are smoothed, and D looks back over
+    several iterations, where the algorithm has the last violation and one iteration. I begins at
+    `lam_init`, in the algorithm at 0.
     """
 
 

@@ -95,13 +95,15 @@ The on-policy algorithms share these options:
 |---|---|
 | `algo.estimator` | `gae`, `gae_rtg`, `plain`, `vtrace` |
 | `algo.reward_normalize`, `algo.cost_normalize` | whether the learner sees scaled rewards and costs |
+| `algo.reward_centre`, `algo.cost_centre` | whether the mean is taken from them, too |
 | `algo.entropy_coef`, `algo.entropy_decay` | a bonus for exploring, and whether it falls to 0 |
 | `algo.activation`, `algo.init` | `tanh`, `relu`; `orthogonal`, `torch` |
 | `algo.std` | `free`: a parameter; `state`: the network computes it |
 | `algo.trunk` | `separate`: a network each; `shared`: common hidden layers; `gru`: with a memory |
 
 With `shared` and `gru` policy and critics have one loss. Both are for the algorithms whose steps are
-Adam's, such as `ppo_lag` and `focops`. They go best with `reward_normalize` and `cost_normalize`.
+Adam's, such as `ppo_lag` and `focops`. They go best with `reward_normalize` and, where an algorithm
+takes it, `cost_normalize`, and where episodes cannot fail also with the two that take the mean.
 
 ## Letters
 

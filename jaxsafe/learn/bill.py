@@ -22,7 +22,8 @@ class PriceClockConfig:
 
     # Environment steps between two moves of the price. OmniSafe moves it at every gradient step.
     dual_every: Annotated[int, Bounds(1, 2**30)] = 20_000
-    # Environment steps before the price first moves. OmniSafe has 100 epochs, which are 200,000 steps.
+    # Environment steps before cost counts. The price first moves `dual_every` steps later. OmniSafe has
+    # 100 epochs, which are 200,000 steps.
     dual_starts: Annotated[int, Bounds(0, 2**31 - 1)] = 0
 
 

@@ -10,7 +10,7 @@ from jaxsafe.learn.acting import Learned
 from jaxsafe.learn.batch import centre, psum, standardise
 from jaxsafe.learn.constraints import Names, each
 from jaxsafe.learn.metrics import explained_variance
-from jaxsafe.learn.normalise import init_normaliser, merge, network_inputs, normalise
+from jaxsafe.learn.normalise import Normaliser, init_normaliser, merge, network_inputs, normalise
 from jaxsafe.learn.returns import ValuedSteps, advantages
 from jaxsafe.learn.rollout import Bad, Trajectory
 from jaxsafe.nn.gaussian import Gaussian, log_prob
@@ -65,8 +65,8 @@ def scaled(raw: Signals, cfg: Any, axis_name: str | None, weight: jax.Array | fl
     """Reward and cost as the config asks the learner to see them, and the statistics with this batch.
 
     Observations are normalised by what was known when the policy acted on them. Rewards and costs are
-    normalised with their own batch, as in OmniSafe, so that the critics' first targets have the scale
-    of all others.
+    scaled with their own batch, as in OmniSafe, so that the critics' first targets have the scale of
+    all others. What is not centred is divided by the root of its mean square.
 
     Args:
         raw: reward and cost in their own units, and the statistics before this batch.
@@ -77,7 +77,10 @@ def scaled(raw: Signals, cfg: Any, axis_name: str | None, weight: jax.Array | fl
     side_by_side = [raw.reward[..., None], raw.cost.reshape(*raw.reward.shape, -1)]
     together = jnp.concatenate(side_by_side, -1)
     normaliser = merge(raw.normaliser, together, axis_name, weight)
-    found = normalise(normaliser, together)
+    centred = jnp.array([cfg.reward_centre, *(together.shape[-1] - 1) * [cfg.cost_centre]])
+    mean = jnp.where(centred, normaliser.mean, 0.0)
+    var = jnp.where(centred, normaliser.var, normaliser.var + normaliser.mean**2)
+    found = normalise(Normaliser(normaliser.count, mean, var), together)
     return Signals(
         found[..., 0] if cfg.reward_normalize else raw.reward,
         found[..., 1:].reshape(raw.cost.shape) if cfg.cost_normalize else raw.cost,

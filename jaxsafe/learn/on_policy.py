@@ -65,7 +65,7 @@ from jaxsafe.learn.returns import (
     no_lost_time,
 )
 from jaxsafe.learn.rollout import RolloutState, Trajectory, check_steps, collect, init_rollout
-from jaxsafe.learn.steps import Context, Pair, PolicyStep, Trainable, fit_critic, stops_critics
+from jaxsafe.learn.steps import Context, Pair, PolicyStep, Trainable, critic_passes, fit_critic
 from jaxsafe.learn.surrogates import Surrogate, with_entropy
 from jaxsafe.learn.treatments import Treatment
 from jaxsafe.nn.gaussian import entropy, log_prob, sample
@@ -85,6 +85,12 @@ class OnPolicyConfig(EncoderConfig):
             "J_c is the mean cost of the last 100 episodes, those of 5 iterations (of the last 50 in "
             "release 0.5.0 and in the published figures)",
             "J_c is the mean cost of the last iteration",
+        ),
+        Convention(
+            {"reward_centre": True, "cost_centre": True},
+            "`reward_normalize` and `cost_normalize` take the mean from rewards and costs, so that to "
+            "fail early may pay",
+            "`reward_normalize` and `cost_normalize` only scale",
         ),
     )
 
@@ -112,10 +118,17 @@ class OnPolicyConfig(EncoderConfig):
     std: Literal["free", "state"] = "free"
     # Whether observations are scaled by their running mean and variance, as in OmniSafe.
     obs_normalize: bool = True
-    # Whether the learner sees rewards scaled by their running mean and variance.
+    # Whether the learner sees rewards divided by the root of their running mean square, and at most 5
+    # of it.
     reward_normalize: bool = False
     # Whether the learner sees costs scaled likewise. Limits and metrics keep the costs as they are.
     cost_normalize: bool = False
+    # Whether `reward_normalize` also takes the mean from rewards, as OmniSafe's does. That changes what
+    # is best where episodes can fail: one that fails no longer loses the rewards of the rest.
+    reward_centre: bool = False
+    cost_centre: bool = (
+        False  # Whether `cost_normalize` also takes the mean from costs. OmniSafe's does.
+    )
     # Weight of the policy's entropy, which is added to what the policy maximises.
     entropy_coef: Weight = 0.0
     entropy_decay: bool = False  # Whether entropy_coef falls on a line to 0 at `total_iterations`.
@@ -360,7 +373,8 @@ def on_policy_loop(env: Env, method: Method, axis_name: str | None) -> Algorithm
         rollout, traj = play(ts, rollout_key)
         weight = weights(traj.bad, axis_name).max()  # of a good step; bad ones earn and cost 0 here
         charged = signal(env, traj, names)
-        raw = Signals(augmentation.reward(traj, cfg), charged, ts.signal_normaliser)
+        reward = jnp.where(traj.bad.any, 0.0, augmentation.reward(traj, cfg))
+        raw = Signals(reward, charged, ts.signal_normaliser)
         signals = scaled(raw, cfg, axis_name, weight)
         augmented = dataclasses.replace(traj, next_obs=augmentation.last_obs(traj, cfg))
         seen = Experience(augmented, signals, ts.rollout.carry)
@@ -374,7 +388,7 @@ def on_policy_loop(env: Env, method: Method, axis_name: str | None) -> Algorithm
         improved = method.improve(ts, batch, context)
         fitted = FittedCritics({}, (), 0, {})
         if cfg.trunk == "separate":
-            passes = improved.metrics["train/passes"] if stops_critics(cfg) else cfg.critic_epochs
+            passes = critic_passes(improved.metrics, cfg)
             fitted = fit_critics(ts, batch, passes, critic_key, axis_name)
         raw_obs = vector_of(traj.obs)[..., : env.obs_size]
         normaliser = merge(ts.normaliser, raw_obs, axis_name) if cfg.obs_normalize else ()

@@ -205,7 +205,10 @@ def expected_length(
         L = T / (1 + x),   x = lost / taken, over about the last N complete episodes.
 
     - L is exactly T while nothing fails. Over synchronous whole episodes J_c is then their plain mean
-      cost, Safety Gym's; over parts of staggered episodes it is unbiased.
+      cost, Safety Gym's. Over parts of staggered episodes it is unbiased once all environments have
+      taken T steps. Until then late parts of episodes are missing.
+    - Only `terminated` shortens L. Where the environment itself cuts episodes (`State.truncated`), J_c
+      is the cost of T steps, as if they had gone on.
     - The first batch counts in full. If failures are equally likely at every step, the first L is
       within a quarter of the true one, or up to half above it where `stagger` pretends to ages. A mean
       over the episodes that have ended would start with short ones alone.

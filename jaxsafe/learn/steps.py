@@ -375,6 +375,11 @@ def fit_critic(
     return end.critic, batch_mean(error, axis_name), (skipped * counted[:, None]).sum()
 
 
-def stops_critics(cfg: Any) -> bool:
-    """Whether the critics stop with a policy that Adam moves; other policies have no passes."""
-    return isinstance(cfg, AdamConfig) and cfg.critics_stop
+def critic_passes(metrics: Metrics, cfg: Any) -> jax.Array | int:
+    """Passes of the critics over a batch: as many as the policy's where the KL stopped those and the
+    critics stop with it, else `cfg.critic_epochs`. `metrics` are those of the policy's step."""
+    stopping = isinstance(cfg, AdamConfig) and cfg.critics_stop
+    if not stopping:
+        return cfg.critic_epochs
+    made = metrics["train/passes"]
+    return jnp.where(made < cfg.epochs, made, cfg.critic_epochs)

@@ -193,7 +193,8 @@ def runs_of(folder: Path, study: study_files.Condensed) -> list[SettingRun]:
     for run, options in settings.items():
         of_run = [row for row in rows if row["run"] == run]
         env, algo = options["env.name"], options["algo.name"]
-        config = defaults(env, algo) | options
+        presets = options.get("preset", "fast"), options.get("compat", "none")
+        config = defaults(env, algo, *presets) | options
         config["run_dir"] = str(folder / study_files.name_of(run))
         named = {k: v for k, v in config.items() if k.startswith("algo.cost_limits.") and v is not None}
         limits = {k.removeprefix("algo.cost_limits."): float(v) for k, v in named.items()}

@@ -8,7 +8,10 @@ from learners import begin, compiled
 from toys import Ticker
 
 from jaxsafe.learn.estimates import Signals, scaled
+from jaxsafe.learn.normalise import normalise
 from jaxsafe.learn.returns import Window
+from jaxsafe.nn.gaussian import kl
+from jaxsafe.nn.networks import action_dist
 
 FIVE_STEPS = {"stagger": False, "horizon": 5}
 
@@ -17,7 +20,8 @@ def test_what_the_learner_sees_is_normalised_by_all_batches_up_to_this_one():
     reward = jnp.array([[[1.0, 3.0]], [[5.0, 11.0]]])  # two batches of [T, N] = [1, 2]
     cost = jnp.array([[[0.0, 1.0]], [[1.0, 0.0]]])
     ts = begin("pdo", reward_normalize=True, cost_normalize=True)
-    cfg, start = ts.config, ts.signal_normaliser
+    start = ts.signal_normaliser
+    cfg = dataclasses.replace(ts.config, reward_centre=True, cost_centre=True)
     a, _, normaliser = scaled(Signals(reward[0], cost[0], start), cfg, None)
     np.testing.assert_allclose(a, [[-1, 1]], rtol=1e-6)  # mean 2, standard deviation 1
     a, b, normaliser = scaled(Signals(reward[1], cost[1], normaliser), cfg, None)
@@ -26,6 +30,12 @@ def test_what_the_learner_sees_is_normalised_by_all_batches_up_to_this_one():
     np.testing.assert_allclose(b, [[1, -1]], rtol=1e-6)
     np.testing.assert_allclose(normaliser.mean, [5, 0.5])
     np.testing.assert_allclose(normaliser.var, [14, 0.25], rtol=1e-6)
+    # (1 + 9 + 25 + 121) / 4 = 39 is the mean square of rewards, which keep their signs
+    cfg = dataclasses.replace(cfg, reward_centre=False)
+    _, _, normaliser = scaled(Signals(reward[0], cost[0], start), cfg, None)
+    a, b, _ = scaled(Signals(reward[1], cost[1], normaliser), cfg, None)
+    np.testing.assert_allclose(a, [[5 / 39**0.5, 11 / 39**0.5]], rtol=1e-6)
+    np.testing.assert_allclose(b, [[1, -1]], rtol=1e-6)
     for reward_too, cost_too in ((True, False), (False, True)):
         cfg = dataclasses.replace(ts.config, reward_normalize=reward_too, cost_normalize=cost_too)
         a, b, _ = scaled(Signals(reward[0], cost[0], start), cfg, None)
@@ -43,7 +53,18 @@ def test_the_constraint_and_the_metrics_see_rewards_and_costs_as_they_are():
         assert m["train/cost_rate"] == 2 and m["train/return_estimate"] == 5
         np.testing.assert_allclose(ts.dual.lam, 0.001 + 0.1, rtol=1e-4)  # a violation of 1, Adam's step
     plain, scaled = (m["train/value_loss_c"] for _, m in runs)
-    assert scaled < plain / 2  # the critic's targets are near 0, not near 2 / (1 - discount)
+    assert scaled < plain / 2  # the critic's targets are near 1 / (1 - discount), not twice that
+
+
+def test_cups_divergence_is_that_of_both_its_steps():
+    env, options = Ticker(episode_length=5), {"lam_init": 2.0, "lr": 1e-2, "epochs": 2}
+    before = begin("cup", env, **FIVE_STEPS | options)
+    after, m = compiled("cup", env).update(before)
+    first = before.rollout.state.obs
+    obs = normalise(before.normaliser, jnp.stack([first.at[:, 1].set(t) for t in range(5)]))
+    old, new = (action_dist(ts.params["actor"], obs, before.config) for ts in (before, after))
+    np.testing.assert_allclose(m["train/kl"], kl(old, new).mean(), rtol=1e-4)
+    assert abs(m["train/kl_reward"] - m["train/kl"]) > 0.01 * m["train/kl"]
 
 
 def test_the_constraint_sees_the_mean_cost_of_the_window():

@@ -127,7 +127,7 @@ def test_a_policy_on_a_shared_trunk_learns_what_the_limit_allows():
     cfg = ALGOS["ipo"].config(
         num_envs=32, horizon=20, minibatches=2, hidden=(16,), trunk="shared", cost_limit=2.5,
         lr=3e-3, target_kl=0.1, epochs=8, barrier=0.1, price_max=4.0,
-        reward_normalize=True, cost_normalize=True,
+        reward_normalize=True, cost_normalize=True, reward_centre=True, cost_centre=True,
     )  # fmt: skip
     train = jax.jit(jax.vmap(training(algo, cfg, 100)), compiler_options=FAST)
     _, metrics = train(jax.random.split(jax.random.key(0), 2))

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compiling import FAST
-from toys import START, Lever, Ticker, updated
+from toys import START, Lever, Sometimes, Ticker, updated
 
 from jaxsafe.algos import ALGOS
 from jaxsafe.learn import augment
@@ -152,6 +152,16 @@ def test_a_limit_of_zero_stays_finite():
     ts, m = build("ppo_saute", Lever())[1](start("ppo_saute", Lever(), cost_limit=0.0))
     assert m["train/nonfinite"] == 0 and (ts.rollout.state.obs[:, -1] < 0).all()
     assert all(jnp.isfinite(x).all() for x in jax.tree.leaves(ts.params))
+
+
+def test_a_bad_world_earns_nothing_where_rewards_are_scaled():
+    env = Sometimes(episode_length=6)
+    options: dict[str, Any] = {"num_envs": 32, "cost_limit": 1.0, "unsafe_reward": -3.0}
+    ts, m = build("ppo_saute", env)[1](start("ppo_saute", env, reward_normalize=True, **options))
+    assert m["train/bad_worlds"] > 0 and m["train/nonfinite"] == 0
+    # every good step breaks the limit, and only those count
+    np.testing.assert_allclose(ts.signal_normaliser.mean[0], -3.0, rtol=1e-5)
+    np.testing.assert_allclose(ts.signal_normaliser.var[0], 0.0, atol=1e-4)
 
 
 # The schedule of a budget ----------------------------------------------------------------------------

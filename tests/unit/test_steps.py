@@ -9,9 +9,10 @@ import pytest
 from compiling import FAST
 from toys import context
 
+from jaxsafe.algos.cpo import CPOConfig
 from jaxsafe.algos.ppo import PPOConfig
 from jaxsafe.learn.estimates import Batch
-from jaxsafe.learn.steps import Trainable, adam, adam_epochs, fit_critic, one_pass
+from jaxsafe.learn.steps import Trainable, adam, adam_epochs, critic_passes, fit_critic, one_pass
 from jaxsafe.learn.surrogates import clipped, plain, with_entropy
 from jaxsafe.nn.gaussian import log_prob, sample
 from jaxsafe.nn.networks import action_dist, init_params, value
@@ -170,6 +171,14 @@ def test_passes_of_a_critic_beyond_those_that_count_change_nothing():
         )
         for a, b in zip(*map(jax.tree.leaves, (fit(jnp.int32(passes), cfg), few)), strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-6)
+
+
+def test_critics_stop_with_the_policy_only_where_the_kl_stopped_it():
+    cfg = PPOConfig(**SMALL, epochs=10, critic_epochs=20, critics_stop=True)
+    assert [int(critic_passes({"train/passes": jnp.int32(n)}, cfg)) for n in (1, 9, 10)] == [1, 9, 20]
+    alone = dataclasses.replace(cfg, critics_stop=False)
+    assert critic_passes({"train/passes": jnp.int32(1)}, alone) == 20
+    assert critic_passes({}, CPOConfig(critic_epochs=20)) == 20  # its steps have no passes
 
 
 @pytest.mark.parametrize(
