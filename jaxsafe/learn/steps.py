@@ -378,8 +378,8 @@ def fit_critic(
 def critic_passes(metrics: Metrics, cfg: Any) -> jax.Array | int:
     """Passes of the critics over a batch: as many as the policy's where the KL stopped those and the
     critics stop with it, else `cfg.critic_epochs`. `metrics` are those of the policy's step."""
-    stopping = isinstance(cfg, AdamConfig) and cfg.critics_stop
-    if not stopping:
-        return cfg.critic_epochs
-    made = metrics["train/passes"]
-    return jnp.where(made < cfg.epochs, made, cfg.critic_epochs)
+    passes = cfg.critic_epochs
+    if isinstance(cfg, AdamConfig) and cfg.critics_stop:
+        made = metrics["train/passes"]
+        passes = jnp.where(made < cfg.epochs, made, passes)
+    return passes

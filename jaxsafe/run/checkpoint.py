@@ -9,6 +9,7 @@ Random keys are stored as their key data, empty leaves not at all. The replay of
 algorithm may be left out, as it can be large; a run that is resumed without it fills it anew.
 """
 
+import contextlib
 import hashlib
 import json
 import math
@@ -39,6 +40,10 @@ OVERHEAD = 64 * files.MB  # bytes by which the files may exceed their arrays
 
 class CheckpointError(ConfigError):
     """A checkpoint that cannot be used. The message is one line for the user."""
+
+
+class NoRoom(CheckpointError):
+    """A checkpoint that this machine has too little memory for now."""
 
 
 class NotSaved(RuntimeError):
@@ -118,7 +123,7 @@ def keeps_replay(like: PyTree, wanted: bool | None) -> bool:
 
 
 def save(folder: Path, ts: PyTree, at: Progress, since: int = 0, replay: bool = True) -> Path:
-    """Write `ts` as the newest checkpoint under `folder` and drop all but the last `KEEP`.
+    """Write `ts` as a checkpoint under `folder`; it and the newest others stay, `KEEP` in all.
 
     Args:
         folder: holds the numbered checkpoints.
@@ -159,7 +164,8 @@ def save(folder: Path, ts: PyTree, at: Progress, since: int = 0, replay: bool = 
         last = checkpoints(folder)
         kept = f"the last good one is {last[0]}" if last else "there is no earlier one"
         raise NotSaved(f"cannot write checkpoint {target}: {reason(error)}; {kept}") from error
-    for old in checkpoints(folder)[KEEP:]:
+    others = [path for path in checkpoints(folder) if path != target]
+    for old in others[KEEP - 1 :]:
         shutil.rmtree(old, ignore_errors=True)
     return target
 
@@ -233,6 +239,8 @@ def load(
             manifest = read_manifest(path)
             verify(path, manifest)
             arrays = read_leaves(path, manifest)
+        except NoRoom as error:  # an older one would need as much
+            raise NoRoom(f"{path}: {error}") from error
         except Exception as error:  # Orbax and TensorStore raise many kinds
             problems.append(f"{path} is corrupt ({reason(error)})")
             continue
@@ -283,7 +291,7 @@ def verify(path: Path, manifest: Manifest) -> None:
         raise CheckpointError(f"{'unknown' if odd in present else 'missing'} file {odd}")
     size, room = size_of(manifest.leaves), host_memory()
     if size > room:
-        raise CheckpointError(f"its arrays need {size:.1e} bytes, this machine has {room:.1e}")
+        raise NoRoom(f"its arrays need {size:.1e} bytes, this machine has {room:.1e} free")
     if (found := sum((path / name).lstat().st_size for name in present)) > 2 * size + OVERHEAD:
         raise CheckpointError(f"its files have {found:,} bytes, its arrays {size:,}")
     for name, expected in manifest.files.items():
@@ -292,11 +300,15 @@ def verify(path: Path, manifest: Manifest) -> None:
 
 
 def host_memory() -> float:
-    """Bytes of memory that this machine has free, or infinity where it does not say."""
-    try:
-        return float(os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    except (ValueError, OSError):
-        return math.inf
+    """Bytes of memory that a program can still have on this machine, or infinity where unknown."""
+    limits = [math.inf]
+    with contextlib.suppress(OSError, ValueError):
+        rows = dict(line.split(":", 1) for line in Path("/proc/meminfo").read_text().splitlines())
+        limits.append(float(rows["MemAvailable"].split()[0]) * 1024)
+    for path in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
+        with contextlib.suppress(OSError, ValueError):
+            limits.append(float(Path(path).read_text()))
+    return min(limits)
 
 
 def check_stored(state: Path, leaves: Mapping[str, tuple[str, tuple[int, ...]]], orbax: Any) -> None:

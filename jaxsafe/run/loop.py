@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from jaxsafe.learn.constraints import limits_by_name
-from jaxsafe.run import checkpoint, clock, distributed, divergence, files, memory, programs
+from jaxsafe.run import checkpoint, clock, distributed, divergence, files, memory, programs, run_folder
 from jaxsafe.run.divergence import Diverged
 from jaxsafe.run.evaluate import COLUMNS
 from jaxsafe.run.interrupts import Interrupts
@@ -87,6 +87,7 @@ def train(
         start = resumed(program, store, report) if resuming else fresh(program, hooks)
         if start.iteration >= iterations:
             report.line("nothing left to train")
+            Saver(folder, program, train_cfg, start).save_lost_policies(start.ts, start.iteration)
             return Outcome(start.ts, start.iteration, False)
         names = sorted(jax.eval_shape(program.update, start.ts, program.shared())[1])
         names += COLUMNS if hooks.evaluate else ()
@@ -198,11 +199,20 @@ class Saver:
             log.sync()
         if log and not log.watch.over:
             checkpoint.save(self.store, state, at, self.since, self.keeps_replay)
-            policies = of_members(self.program, self.program.learned(state))
-            checkpoint.save(self.policies, policies, at)
+            self.save_policies(state, at)
         self.saved_at = time.perf_counter()
         if self.saves_replay:
             self.pause = pause_after(self.saved_at - begun, self.every)
+
+    def save_policies(self, state: PyTree, at: checkpoint.Progress) -> None:
+        checkpoint.save(self.policies, of_members(self.program, self.program.learned(state)), at)
+
+    def save_lost_policies(self, ts: PyTree, iteration: int) -> None:
+        """The policies of the last checkpoint, if the process was killed before it wrote them."""
+        state, at = distributed.whole(ts), clock.after(iteration, self.program.clocks)
+        saved = run_folder.newest_progress(self.policies.parent, self.policies.name)
+        if distributed.leads() and (saved is None or saved.iteration < at.iteration):
+            self.save_policies(state, at)
 
 
 def pause_after(took: float, every: float) -> float:

@@ -1,7 +1,5 @@
 """Whether a run fits the memory: lower bounds before anything compiles, and then the program itself."""
 
-import contextlib
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -127,11 +125,4 @@ def device_memory() -> tuple[float, str]:
     stats = jax.local_devices()[0].memory_stats() if jax.default_backend() != "cpu" else None
     if stats and "bytes_limit" in stats:
         return float(stats["bytes_limit"]), "the device"
-    limits = [float("inf")]
-    with contextlib.suppress(OSError, ValueError):
-        rows = dict(line.split(":", 1) for line in Path("/proc/meminfo").read_text().splitlines())
-        limits.append(float(rows["MemAvailable"].split()[0]) * 1024)
-    for path in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
-        with contextlib.suppress(OSError, ValueError):
-            limits.append(float(Path(path).read_text()))
-    return min(limits), "this machine"
+    return checkpoint.host_memory(), "this machine"

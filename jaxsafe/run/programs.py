@@ -92,7 +92,8 @@ def build(
     split = len(run) == 1 and devices > 1  # the environments of a lone member, over the devices
     if len(run) % devices and not split:
         raise ConfigError(
-            f"{len(run)} seeds do not split over devices={devices}: "
+            f"{len(run)} {'seeds' if len(configs) == 1 else 'members'} do not split over "
+            f"devices={devices}: "
             f"expected a multiple of {devices}, or 1"
         )
     algo: Algorithm = make(env, AXIS if split else None)

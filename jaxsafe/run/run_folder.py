@@ -340,9 +340,9 @@ def last_tenth(metrics: dict[str, np.ndarray], name: str) -> np.ndarray:
     return np.array([v.mean() if len(v) else np.nan for v in values])
 
 
-def newest_progress(folder: Path) -> Progress | None:
-    """How far the newest checkpoint is; None without one."""
-    for path in checkpoint.checkpoints(files.inside(folder, "checkpoints")):
+def newest_progress(folder: Path, part: str = "checkpoints") -> Progress | None:
+    """How far the newest checkpoint is, or with `part` "policy" the newest policy; None without one."""
+    for path in checkpoint.checkpoints(files.inside(folder, part)):
         try:
             return checkpoint.read_manifest(path).at
         except ConfigError:

@@ -83,7 +83,7 @@ def choose_folder(settings: Settings, job: int | None, say: Callable[[str], None
     if files.there(folder / "config.yaml") and train.resume:
         check_same_run(settings, folder)
         check_goes_on(folder, say)
-    elif checkpoint.checkpoints(files.inside(folder, "checkpoints")):
+    elif any(checkpoint.checkpoints(files.inside(folder, x)) for x in ("checkpoints", "policy")):
         raise ConfigError(
             f"{folder} already holds a run: continue it with resume=true, or choose another run_dir"
         )

@@ -9,6 +9,7 @@ parts: of whole settings or, where the seeds of one setting are too many, of see
 """
 
 import itertools
+import math
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -71,6 +72,7 @@ def train(sweep: Sweep, resume_command: str, report: Reporter, after: After) -> 
             if finished(piece, folder):
                 report.line(f"finished already: {folder}")
                 continue
+            session.check_goes_on(folder, lambda line: None)
             run = run_of(piece, folder, compiled, resume_command)
             try:
                 status = session.run(run, report, after.finish)
@@ -106,13 +108,15 @@ def run_folders(sweep: Sweep, name: str) -> list[Path]:
 def begun(sweep: Sweep, name: str) -> bool:
     """Whether anything of a group was saved."""
     folders = run_folders(sweep, name)
-    return any(checkpoint.checkpoints(files.inside(f, "checkpoints")) for f in folders)
+    parts = itertools.product(folders, ("checkpoints", "policy"))
+    return any(checkpoint.checkpoints(files.inside(folder, part)) for folder, part in parts)
 
 
 def begin(sweep: Sweep, name: str, resume_command: str, report: Reporter) -> tuple[int, Program]:
     """How many members of a group will run at once, and the program of its first part."""
     for leftover in run_folders(sweep, name):  # stopped before a first checkpoint
-        shutil.rmtree(leftover)
+        with files.held(leftover):
+            shutil.rmtree(leftover)
     with Interrupts(report.line, report.hosted) as stop:
         stop.nothing_to_save = f"stopped before the first update; {resume_command}"
         if not sweep.max_parallel:
@@ -121,7 +125,8 @@ def begin(sweep: Sweep, name: str, resume_command: str, report: Reporter) -> tup
 
 
 def finished(settings: Settings, folder: Path) -> bool:
-    done, train = run_folder.newest_progress(folder), settings.train
+    done = run_folder.newest_progress(folder) or run_folder.newest_progress(folder, "policy")
+    train = settings.train
     evaluated = files.there(folder / "evaluation.json") or not train.eval_episodes
     return done is not None and clock.ended(train, done) and evaluated
 
@@ -134,41 +139,58 @@ def members_of(settings: Settings) -> int:
 
 
 def parts(settings: Settings, parallel: int) -> list[Settings]:
-    """`settings` in parts of at most `parallel` members, whose sizes differ by one at most."""
+    """`settings` in parts of at most `parallel` members, of about one size: whole settings, or seeds of
+    one. Several members that run at once are as many on each device."""
     train, configs = settings.train, settings.configs
-    if train.num_seeds <= parallel:
-        return [
-            settings._replace(configs=configs[piece])
-            for piece in slices(len(configs), parallel // train.num_seeds)
-        ]
+    parallel = on_devices(parallel, train.devices)
+    each = train.devices if parallel > 1 else 1
+    step = each // math.gcd(each, train.num_seeds)  # settings whose seeds split over the devices
+    fits = step * train.num_seeds <= parallel
+    whole = len(configs) // step * step if fits else 0
+    together = slices(whole, parallel // train.num_seeds, step) if whole else []
+    even = train.num_seeds // each * each
+    apart = slices(even, parallel, each) if even else []
+    apart += [slice(seed, seed + 1) for seed in range(even, train.num_seeds)]
     seeds = [
         replace(train, seed=train.seed + piece.start, num_seeds=piece.stop - piece.start)
-        for piece in slices(train.num_seeds, parallel)
+        for piece in apart
     ]
-    return [settings._replace(configs=(c,), train=t) for c in configs for t in seeds]
+    return [
+        *(settings._replace(configs=configs[piece]) for piece in together),
+        *(settings._replace(configs=(c,), train=t) for c in configs[whole:] for t in seeds),
+    ]
 
 
-def slices(count: int, most: int) -> list[slice]:
-    """Of 0 .. count, as few as hold at most `most` each, whose sizes differ by one at most."""
-    number = -(-count // most)
-    ends = [count * i // number for i in range(number + 1)]
+def on_devices(members: int, devices: int) -> int:
+    """At most so many members that split over the devices: a multiple of them, or a lone one, whose
+    environments split."""
+    return members // devices * devices or 1
+
+
+def slices(count: int, most: int, step: int = 1) -> list[slice]:
+    """Of 0 .. count, as few as hold at most `most` each, whose sizes differ by one `step` at most.
+    `count` and all sizes are multiples of `step`."""
+    steps = count // step
+    number = -(-steps // (most // step))
+    ends = [step * (steps * i // number) for i in range(number + 1)]
     return [slice(a, b) for a, b in itertools.pairwise(ends)]
 
 
 def members_at_once(settings: Settings, most: int | None) -> tuple[int, Program]:
     """How many members run at once, `most` or what the memory holds; and the first part's program."""
-    count = members_of(settings)
+    count, devices = members_of(settings), settings.train.devices
     if most:
-        return min(count, most), first_program(settings, min(count, most))
+        most = on_devices(min(count, most), devices)
+        return most, first_program(settings, most)
     while True:
         try:
             program = first_program(settings, count)
         except memory.TooLarge:
             if count == 1:
                 raise
-            count = -(-count // 2)
+            count = on_devices(-(-count // 2), devices)
             continue
-        held = count if count == 1 else memory.capacity(program)
+        held = count if count == 1 else on_devices(memory.capacity(program), devices)
         fits = held >= len(program.members)  # which are fewer than `count` where settings are whole
         return (count if fits else held), program
 

@@ -302,6 +302,18 @@ def test_a_folder_with_a_run_is_not_overwritten_nor_resumed_with_other_settings(
     other = settings.settings_from_config(run_folder.read_config(run) | {"resume": str(run), "seed": 5})
     with pytest.raises(ConfigError, match=r"seed=5 but .* was trained with 0"):
         session.choose_folder(other, None, print)
+    shutil.rmtree(run / "checkpoints")  # what is left of a run is not overwritten either
+    with pytest.raises(ConfigError, match="already holds a run"):
+        session.choose_folder(settled(f"run_dir={run}"), None, print)
+
+
+def test_a_policy_that_a_kill_left_unwritten_is_written_when_resumed(finished, tmp_path, capsys):
+    run = shutil.copytree(finished, tmp_path / "run")
+    newest, *_ = checkpoint.checkpoints(run / "policy")
+    shutil.rmtree(newest)
+    assert typed("train", f"resume={run}", TOY) == 0
+    assert "nothing left to train" in capsys.readouterr().out
+    assert run_folder.newest_progress(run, "policy") == run_folder.newest_progress(run)
 
 
 def test_a_run_has_one_process_at_a_time(finished, tmp_path, capsys):

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from jaxsafe.report.evaluation import evaluate
 from jaxsafe.report.finish import finish
 from jaxsafe.report.group import EVALUATED, LATE
 from jaxsafe.report.sweep_summary import rows_of, summarise
-from jaxsafe.run import arguments, checkpoint, loop, memory, programs, run_folder, session, sweep
+from jaxsafe.run import arguments, checkpoint, files, loop, memory, programs, run_folder, session, sweep
 from jaxsafe.run.arguments import compose
 from jaxsafe.run.dataset import write_dataset
 from jaxsafe.run.evaluate import run_episodes
@@ -180,6 +181,49 @@ def test_parts_are_whole_settings_or_seeds_of_one_and_of_equal_size():
     assert shapes(5) == [([limit], seed, 4) for limit in (1, 2, 3, 4) for seed in (0, 4)]
     assert len(shapes(1)) == 32
     assert sweep.slices(7, 3) == [slice(0, 2), slice(2, 4), slice(4, 7)]
+
+
+@pytest.mark.parametrize(
+    "limits, seeds, parallel, sizes",
+    [
+        (6, 1, 4, [2, 4]),
+        (6, 1, 3, [2, 2, 2]),
+        (4, 3, 7, [6, 6]),
+        (2, 3, 5, [2, 1, 2, 1]),  # a lone member's environments split
+        (5, 1, 8, [4, 1]),
+        (2, 2, 1, [1, 1, 1, 1]),
+    ],
+)
+def test_parts_split_over_the_devices(limits, seeds, parallel, sizes):
+    values = ",".join(map(str, range(1, limits + 1)))
+    asked = planned(f"algo.cost_limit={values}", f"num_seeds={seeds}", "devices=2")
+    (settings,) = asked.groups.values()
+    pieces = sweep.parts(settings, parallel)
+    assert [sweep.members_of(piece) for piece in pieces] == sizes
+    trained = [
+        (c.cost_limit, s)
+        for p in pieces
+        for c in p.configs
+        for s in range(p.train.seed, p.train.seed + p.train.num_seeds)
+    ]
+    assert sorted(trained) == [(1 + limit, seed) for limit in range(limits) for seed in range(seeds)]
+    assert [sweep.on_devices(n, 4) for n in (1, 3, 4, 7, 8)] == [1, 1, 4, 4, 8]
+
+
+def test_a_sweep_deletes_nothing_that_was_trained_or_is_being_trained(finished, tmp_path):
+    folder = tmp_path / "sweep"
+    shutil.copytree(finished, folder)
+    (group,) = folder.glob("0*")
+    shutil.rmtree(group / "checkpoints")
+    (group / "notes.txt").touch()
+    train(folder, *GRID)  # is finished all the same
+    with pytest.raises(ConfigError, match="no checkpoint to go on from, only a policy"):
+        train(folder, *GRID, "total_steps=1e4")
+    assert (group / "notes.txt").exists()
+    shutil.rmtree(group / "policy")
+    with files.held(group), pytest.raises(ConfigError, match="another process is training"):
+        train(folder, *GRID)
+    assert (group / "notes.txt").exists()
 
 
 @pytest.mark.parametrize("name", sorted(algos.ALGOS))

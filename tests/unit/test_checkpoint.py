@@ -5,7 +5,15 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from jaxsafe.run import checkpoint
-from jaxsafe.run.checkpoint import CheckpointError, NotSaved, Progress, checkpoints, restore, save
+from jaxsafe.run.checkpoint import (
+    CheckpointError,
+    NoRoom,
+    NotSaved,
+    Progress,
+    checkpoints,
+    restore,
+    save,
+)
 from jaxsafe.run.loop import pause_after
 
 
@@ -87,6 +95,20 @@ def test_a_corrupt_newest_checkpoint_is_passed_over_with_one_line(tmp_path, dama
     assert manifest.at == at(1)
     assert_same(restored, state(1.0))
     assert len(lines) == 1 and "00000002 is corrupt" in lines[0] and "\n" not in lines[0]
+
+
+def test_too_little_memory_is_no_corruption(tmp_path, monkeypatch):
+    save(tmp_path, state(1.0), at(1))
+    save(tmp_path, state(2.0), at(2))
+    monkeypatch.setattr(checkpoint, "host_memory", lambda: 8.0)
+    with pytest.raises(NoRoom, match=r"00000002: its arrays need .* bytes, this machine has 8"):
+        restore(tmp_path, jax.eval_shape(state))
+
+
+def test_what_is_saved_stays_among_higher_numbers(tmp_path):
+    for iteration in (6, 7, 1):
+        save(tmp_path, state(), at(iteration))
+    assert [path.name for path in checkpoints(tmp_path)] == ["00000007", "00000001"]
 
 
 def test_no_sound_checkpoint_is_one_clear_error(tmp_path):
