@@ -53,10 +53,10 @@ def evaluate(
         found |= {name: x[i * seeds : (i + 1) * seeds] for name, x in examined.measures.items()}
         counts = examined.calibration
         of_risk = {} if counts is None else calibrated(counts[i * seeds : (i + 1) * seeds].sum(0))
-        rows = summary(settings.env_name, found, float(member.config.cost_limit), metrics)
+        rows = summary(settings.env_name, found, limits.get(""), metrics)
         if settings.train.dataset is not None:
-            rows |= dsrl_scores(settings.env_name, rows, float(member.config.cost_limit))
-            rows |= of_data(data, float(member.config.cost_limit))
+            rows |= dsrl_scores(settings.env_name, rows, limits.get(""))
+            rows |= of_data(data, limits.get(""))
         by_seed = {name: values.mean(1).tolist() for name, values in found.items()}
         size = of_setting.ret.size
         by_setting.append(Scores(member.setting, limits, size, rows, by_seed, of_risk))
@@ -82,10 +82,14 @@ def calibrated(counts: np.ndarray) -> dict[str, list[float]]:
 def summary(
     env_name: str,
     found: Mapping[str, np.ndarray],
-    cost_limit: float,
+    cost_limit: float | None,
     metrics: dict[str, np.ndarray],
 ) -> dict[str, Estimate]:
-    """The rows of the table: `measures`, then the cost rate of training and normalised scores."""
+    """The rows of the table: `measures`, then the cost rate of training and normalised scores.
+
+    `cost_limit` is None where named costs have limits in its place. Then there is no normalised
+    violation.
+    """
     rows = {name: estimate_over_seeds(name, values) for name, values in found.items()}
     rate = cost_rate(metrics)
     if rate is not None:
@@ -96,11 +100,12 @@ def summary(
             return Estimate(*(float(score(env_name, x, *args)) for x in of))
 
         rows["normalised return"] = scaled(scores.normalized_return, rows["return"])
-        violation = scaled(scores.normalized_violation, rows["cost"], cost_limit)
-        if len(found["cost"]) > 1:  # it is not linear: seeds within the limit do not excuse the others
-            of_seeds = scores.normalized_violation(env_name, found["cost"].mean(1), cost_limit)
-            violation = stats.of_measure("normalised violation", of_seeds)
-        rows["normalised violation"] = violation
+        if cost_limit is not None:
+            violation = scaled(scores.normalized_violation, rows["cost"], cost_limit)
+            if len(found["cost"]) > 1:  # not linear: seeds within the limit do not excuse the others
+                of_seeds = scores.normalized_violation(env_name, found["cost"].mean(1), cost_limit)
+                violation = stats.of_measure("normalised violation", of_seeds)
+            rows["normalised violation"] = violation
         if rate is not None:
             rows["normalised cost rate"] = scaled(
                 scores.normalized_cost_rate, rows["cost rate (training)"]
@@ -108,17 +113,25 @@ def summary(
     return rows
 
 
-def dsrl_scores(env_name: str, rows: dict[str, Estimate], cost_limit: float) -> dict[str, Estimate]:
+def dsrl_scores(
+    env_name: str, rows: dict[str, Estimate], cost_limit: float | None
+) -> dict[str, Estimate]:
     """DSRL's normalised scores. Its return needs the task's reference, its cost only the limit."""
-    found = {"DSRL cost": Estimate(*(float(scores.dsrl_cost(x, cost_limit)) for x in rows["cost"]))}
+    found = {}
     if env_name in scores.DSRL:
         ret = Estimate(*(float(scores.dsrl_return(env_name, x)) for x in rows["return"]))
-        found = {"DSRL return": ret, **found}
+        found["DSRL return"] = ret
+    if cost_limit is not None:
+        found["DSRL cost"] = Estimate(*(float(scores.dsrl_cost(x, cost_limit)) for x in rows["cost"]))
     return found
 
 
-def of_data(data: PyTree, cost_limit: float) -> dict[str, Estimate]:
-    """Of the whole episodes of a data set: mean return and cost, and the best return of a safe one."""
+def of_data(data: PyTree, cost_limit: float | None) -> dict[str, Estimate]:
+    """Of the whole episodes of a data set: mean return and cost, and the best return of a safe one.
+
+    The costs of its episodes are not told apart, so no episode is known to be safe without a
+    `cost_limit`.
+    """
     if not data or not data.episodes:
         return {}
     _, _, ret, cost, whole = (np.asarray(x) for x in data.episodes)
@@ -126,7 +139,7 @@ def of_data(data: PyTree, cost_limit: float) -> dict[str, Estimate]:
     if not len(ret):
         return {}
     found = {"data return": ret.mean(), "data cost": cost.mean()}
-    if (safe := cost <= cost_limit).any():
+    if cost_limit is not None and (safe := cost <= cost_limit).any():
         found["data best safe return"] = ret[safe].max()
     return {name: Estimate(float(x), float(x), float(x)) for name, x in found.items()}
 

@@ -15,6 +15,7 @@ import numpy as np
 import jaxsafe
 from jaxsafe.config import Bounds, ConfigError, flat, one_line
 from jaxsafe.learn.acting import Player, Playing
+from jaxsafe.learn.constraints import cost_title, limits_of
 from jaxsafe.learn.observations import observation_like, vector_of, with_vector
 from jaxsafe.learn.offline import DataSet, data_set
 from jaxsafe.run import checkpoint, dataset, files, run_folder
@@ -268,7 +269,11 @@ def about(run: RunPolicies) -> dict[str, Any]:
     return {
         "run": run.folder.name,
         "algo": settings.algo_name,
-        "cost_limit": float(settings.algo.cost_limit),
+        # in force, of each setting
+        "limits": [
+            {cost_title(name): most for name, most in limits_of(cfg).items()}
+            for cfg in settings.configs
+        ],
         "seeds": settings.train.num_seeds,
         "first_seed": settings.train.seed,
         "trained_by": run_folder.trained_by(run.folder),

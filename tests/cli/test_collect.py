@@ -1,5 +1,6 @@
 """Data sets that are collected from runs, and those of other libraries."""
 
+import dataclasses
 import json
 import os
 import resource
@@ -16,6 +17,7 @@ import jaxsafe
 from jaxsafe.config import ConfigError
 from jaxsafe.run import collect, dataset
 from jaxsafe.run.dataset import other_task, read_about, read_dataset, write_dataset
+from jaxsafe.run.policies import open_run
 
 
 @pytest.fixture(scope="module")
@@ -82,6 +84,14 @@ def test_python_collects_what_the_command_does(run, tmp_path):
     ):
         with pytest.raises(ConfigError, match=message):
             jaxsafe.collect(shares, path)
+
+
+def test_a_recipe_has_the_limits_in_force_of_each_setting(run):
+    opened = open_run(run, (TOY,))
+    (cfg,) = opened.settings.configs
+    configs = cfg, dataclasses.replace(cfg, cost_limits={"wall": 10.0})
+    several = opened._replace(settings=opened.settings._replace(configs=configs))
+    assert collect.about(several)["limits"] == [{"cost": 25.0}, {"cost wall": 10.0}]
 
 
 def test_the_same_command_collects_the_same_and_mean_actions_are_not_sampled_ones(run, tmp_path):

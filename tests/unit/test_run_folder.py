@@ -3,6 +3,7 @@ import json
 import lzma
 import math
 import sys
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -165,6 +166,20 @@ def test_a_seed_within_the_limit_does_not_excuse_one_that_violates():
     rows = evaluation.summary("point_goal1", found, 25.0, {"seed": np.empty(0)})
     room = scores.CHARACTERISTIC["point_goal1"].cost - 25
     assert rows["normalised violation"].mean == pytest.approx((0 + 25 / room) / 2)  # of costs 5 and 50
+
+
+def test_only_the_limit_in_force_gives_scores():
+    found = {"return": np.zeros((1, 2)), "cost": np.array([[40.0, 60.0]])}
+    episodes = np.zeros(2), np.zeros(2), np.ones(2), np.array([5.0, 30.0]), np.array([True, True])
+    data = SimpleNamespace(episodes=episodes)
+
+    def of(limit: float | None) -> set[str]:
+        rows = evaluation.summary("point_goal1", found, limit, {"seed": np.empty(0)})
+        rows |= evaluation.dsrl_scores("point_goal1", rows, limit) | evaluation.of_data(data, limit)
+        return {*rows}
+
+    assert of(25.0) - of(None) == {"normalised violation", "DSRL cost", "data best safe return"}
+    assert {"normalised return", "data return", "data cost"} <= of(None) < of(25.0)
 
 
 def test_progress_reads_the_newest_manifest(tmp_path):
