@@ -226,7 +226,8 @@ class SweepResult(NamedTuple):
     rows: one a setting: `row.name`, `row.cost_limit`, `row.ret` and `row.cost` (mean, low, high over
         seeds of the last 10% of training, or of the final evaluation where training plays no
         episodes), `row.returns` and `row.costs`, float [S], and `row.held`, whether every limit is:
-        'yes', 'no', 'unclear' within the interval or, of two seeds, by one, or '-' if not known.
+        'yes', 'no', 'unclear' within the interval or, of two seeds, by one, 'diverged' if a seed did,
+        or '-' if not known.
     runs: the run folders.
     """
 

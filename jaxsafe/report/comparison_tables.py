@@ -17,6 +17,7 @@ from jaxsafe.report.group import Group, Suite, clock, differing, period, suite, 
 from jaxsafe.report.published import Published, beside
 from jaxsafe.report.stats import Estimate
 from jaxsafe.report.tables import Table
+from jaxsafe.run.divergence import seeds_in_words
 
 FINAL = (
     "final return", "final cost", "final violation rate", "final discounted return",
@@ -85,9 +86,9 @@ def details(groups: Sequence[Group]) -> list[Table]:
     ]  # fmt: skip
     caption = (
         "Each task. IQM: interquartile mean over seeds. Held: whether the mean cost is within the "
-        "limit; unclear where it is not but its interval is or, of two seeds, one is. Violation rate: "
-        "the share of iterations, in the last 10%, whose mean cost of an episode is over the limit. "
-        "Cost rate: total cost over total steps of training."
+        "limit; unclear where it is not but its interval is or, of two seeds, one is; diverged where a "
+        "seed stopped learning. Violation rate: the share of iterations, in the last 10%, whose mean "
+        "cost of an episode is over the limit. Cost rate: total cost over total steps of training."
     )
     out = [Table(caption, header, rows, left=2)]
     scored = [g for g in groups if known_of(g, SCORES[0])]
@@ -187,6 +188,9 @@ def notes(groups: Sequence[Group]) -> list[str]:
         if not run.ended:
             done, end, unit = run.progress
             lines.append(f"unfinished: {run.config['run_dir']}, at {done:,} of {end:,} {unit}")
+        if run.diverged:
+            which = seeds_in_words(run.diverged)
+            lines.append(f"diverged, so no limit counts as held: {run.config['run_dir']}, {which}")
         if run.estimated:
             lines.append(f"estimates, as no episode ended yet: {run.config['run_dir']}")
     envs = tasks_of(groups)

@@ -11,6 +11,7 @@ from jaxsafe.learn.constraints import limits_of
 from jaxsafe.report import scores, stats
 from jaxsafe.report.stats import Estimate
 from jaxsafe.run import memory, run_folder
+from jaxsafe.run.divergence import read_lost, seeds_in_words
 from jaxsafe.run.evaluate import Episodes, keys_of_episodes, make_evaluation, measures
 from jaxsafe.run.policies import RunPolicies
 from jaxsafe.run.programs import members
@@ -26,9 +27,11 @@ class Scores(NamedTuple):
     rows: dict[str, Estimate]
     seeds: dict[str, list[float]]  # the mean over the episodes of each
     calibration: dict[str, list[float]]  # of a shield's risk, empty without one: see `calibrated`
+    diverged: tuple[int, ...] = ()  # the seeds that did in training
 
     def __str__(self) -> str:
-        return table(self.rows)
+        lost = f"\ndiverged in training: {seeds_in_words(self.diverged)}" if self.diverged else ""
+        return table(self.rows) + lost
 
 
 def evaluate(
@@ -45,7 +48,7 @@ def evaluate(
     examined = settings.row.examine(run.algo, run.learned, keys, sampled)
     tables = list(run_folder.by_setting(run_folder.read_metrics(run.folder)).values())
     cost_names = run.algo.task(jax.tree.map(lambda x: x[0], run.learned)).cost_names
-    seeds, by_setting = settings.train.num_seeds, []
+    seeds, by_setting, lost = settings.train.num_seeds, [], read_lost(run.folder)
     for i, member in enumerate(members(settings.configs, settings.train)[::seeds]):
         of_setting = Episodes(*(x[i * seeds : (i + 1) * seeds] for x in episodes))
         limits, metrics = limits_of(member.config), tables[i] if i < len(tables) else {}
@@ -59,7 +62,8 @@ def evaluate(
             rows |= of_data(data, limits.get(""))
         by_seed = {name: values.mean(1).tolist() for name, values in found.items()}
         size = of_setting.ret.size
-        by_setting.append(Scores(member.setting, limits, size, rows, by_seed, of_risk))
+        diverged = tuple(x.seed for x in lost if x.setting == member.setting)
+        by_setting.append(Scores(member.setting, limits, size, rows, by_seed, of_risk, diverged))
     return by_setting
 
 

@@ -9,6 +9,7 @@ from jaxsafe.report import evaluation, plots
 from jaxsafe.report.film import film
 from jaxsafe.report.tables import cell
 from jaxsafe.run import files, run_folder
+from jaxsafe.run.divergence import seeds_in_words
 from jaxsafe.run.interrupts import Interrupts
 from jaxsafe.run.policies import RunPolicies, member_policies
 from jaxsafe.run.progress import Reporter
@@ -47,6 +48,7 @@ def finish(session: Session, report: Reporter, stop: Interrupts) -> None:
                 f"final policy{s.name and ', ' + s.name}: return {cell(s.rows['return'])}, "
                 f"cost {cell(s.rows['cost'])} (limit {limits_in_words(s.limits)}), "
                 f"{100 * share:.0f}% of {s.episodes} episodes over it"
+                + (f"; diverged in training: {seeds_in_words(s.diverged)}" if s.diverged else "")
             )
         if risks:
             plots.calibration(risks, folder / "calibration.png", title)

@@ -90,9 +90,16 @@ class Group(NamedTuple):
         return all(run.evaluated for run in self.runs)
 
     @property
+    def diverged(self) -> list[int]:
+        """The seeds that did, in any run."""
+        return sorted({seed for run in self.runs for seed in run.diverged})
+
+    @property
     def held(self) -> str:
         """Whether each limit is: 'unclear' where the mean is above it and its interval is not, or, of
-        two seeds, which have none, one is not."""
+        two seeds, which have none, one is not; 'diverged' where a seed did, whatever it cost."""
+        if self.diverged:
+            return "diverged"
 
         def answer(name: str, limit: float) -> str:
             cost, values = self.estimate(name), self.values(name)

@@ -17,6 +17,7 @@ from jaxsafe.learn.constraints import cost_title, limits_of
 from jaxsafe.report import scores, study_files
 from jaxsafe.report.evaluation import cost_rate
 from jaxsafe.run import files, run_folder
+from jaxsafe.run.divergence import read_lost
 from jaxsafe.run.programs import members
 from jaxsafe.run.settings import (
     NO_EXTRAS,
@@ -47,6 +48,7 @@ class SettingRun(NamedTuple):
     values: dict[str, np.ndarray]  # [S] by name; NaN for a seed without complete episodes
     estimated: bool = False  # no episode has ended yet, so return and cost are estimates from all steps
     evaluated: bool = False  # return and costs are the final evaluation's
+    diverged: tuple[int, ...] = ()  # the seeds that did
 
     @property
     def setting(self) -> dict[str, Any]:
@@ -140,6 +142,7 @@ def read_one(folder: Path, extras: Extras = NO_EXTRAS) -> list[SettingRun]:
     runs = []
     parts = run_folder.by_setting(metrics).values()
     names = [m.setting for m in members(saved.configs, saved.train)[:: saved.train.num_seeds]]
+    lost = read_lost(folder)
     for cfg, name, table in zip(saved.configs, names, parts, strict=False):
         limits = limits_of(cfg)
         fields = flat(saved._replace(configs=(cfg,)).plain()) | {"run_dir": str(folder)}
@@ -150,8 +153,8 @@ def read_one(folder: Path, extras: Extras = NO_EXTRAS) -> list[SettingRun]:
                     f"{folder}: evaluation.json is of {len(final)} seeds, metrics.csv of {len(seeds)}"
                 )
             values[f"final {what}"] = final
-        guessed = not_ended(table)
-        runs.append(SettingRun(folder, saved.env_name, fields, limits, table, seeds, values, guessed))
+        run = SettingRun(folder, saved.env_name, fields, limits, table, seeds, values, not_ended(table))
+        runs.append(run._replace(diverged=tuple(x.seed for x in lost if x.setting == name)))
     return runs
 
 
@@ -206,7 +209,9 @@ def runs_of(folder: Path, study: study_files.Condensed) -> list[SettingRun]:
         clock = "updates" if config.get("dataset") else "steps"  # learning from a data set takes none
         table = study_files.table(of_run, [curves[run, row["seed"]] for row in of_run], clock)
         seeds = np.array([float(row["seed"]) for row in of_run])
-        runs.append(SettingRun(folder, env, config, limits, table, seeds, values))
+        diverged = tuple(int(row["seed"]) for row in of_run if row["state"] == "diverged")
+        run = SettingRun(folder, env, config, limits, table, seeds, values)
+        runs.append(run._replace(diverged=diverged))
     return runs
 
 

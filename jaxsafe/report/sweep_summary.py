@@ -11,6 +11,7 @@ from jaxsafe.report.group import Group, clock, group, period
 from jaxsafe.report.read import or_evaluated, read_one
 from jaxsafe.report.tables import Table
 from jaxsafe.run import files
+from jaxsafe.run.divergence import seeds_in_words
 from jaxsafe.run.settings import NO_EXTRAS, Extras
 from jaxsafe.run.sweep_folder import read_folder
 
@@ -68,6 +69,8 @@ def markdown(rows: list[Group]) -> str:
     begun = [r.name for r in rows if r.estimated]
     final = [r.name for r in rows if r.evaluated]
     notes = ""
+    if lost := [f"{r.name} ({seeds_in_words(r.diverged)})" for r in rows if r.diverged]:
+        notes += f"\nDiverged, so no limit counts as held: {'; '.join(lost)}.\n"
     if begun:
         notes += f"\nNo episode ended yet: return and cost of {'; '.join(begun)} are estimates.\n"
     if final:

@@ -1,22 +1,38 @@
-"""Whether the members of a run still learn, and what stopped being finite first where one does not."""
+"""Whether the members of a run still learn, and what stopped being finite first where one does not.
 
-from collections.abc import Callable, Mapping, Sequence
+diverged.json of a run folder has the members that were given up, a `Lost` each. There is none as long
+as all learn.
+"""
+
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsafe.run import checkpoint
+from jaxsafe.run import checkpoint, files
 from jaxsafe.run.programs import Member
 from jaxsafe.types import PyTree
 
 PATIENCE = 10  # iterations without any learning, after which a member is given up
+FILE = "diverged.json"
 KINDS = {"obs": "observation", "reward": "reward", "cost": "cost"}  # train/bad_obs, ...
 
 
 class Diverged(RuntimeError):
     """No member of a run learns any more. The message is one line for the user."""
+
+
+class Lost(NamedTuple):
+    """A member that is given up."""
+
+    iteration: int  # at which
+    seed: int
+    setting: str  # '' where there is but one
+    why: str  # one line for the user
 
 
 class Health(NamedTuple):
@@ -51,18 +67,29 @@ class Watch:
     Args:
         members: of the run.
         about: what to add on a member that is given up: its unusual settings.
+        lost: those that were given up before the run was resumed.
     """
 
-    def __init__(self, members: Sequence[Member], about: Callable[[Member], str]):
+    def __init__(
+        self,
+        members: Sequence[Member],
+        about: Callable[[Member], str],
+        lost: Iterable[Lost] = (),
+    ):
         self.members, self.about = members, about
         self.idle = np.zeros(len(members), int)  # iterations since a member last learned
         self.mark: np.ndarray | None = None
-        self.lost: dict[int, str] = {}  # why, by member
+        known = {(x.seed, x.setting): x for x in lost}
+        named = {i: known.get((m.seed, m.setting)) for i, m in enumerate(members)}
+        self.lost: dict[int, Lost] = {i: x for i, x in named.items() if x}  # by member
 
-    def __call__(self, shown: str, values: Mapping[str, np.ndarray], now: Health) -> list[str]:
+    def __call__(
+        self, iteration: int, shown: str, values: Mapping[str, np.ndarray], now: Health
+    ) -> list[str]:
         """What is new, a line for each member that is given up.
 
         Args:
+            iteration: the number of this one.
             shown: how far training is, in words.
             values: the metrics of the iteration, [M] by name.
             now: after it.
@@ -80,8 +107,8 @@ class Watch:
                 continue
             what = f"{first} is not finite" if first else self.nothing_learned(i, values)
             who = ", ".join([f"seed {member.seed}", *([member.setting] if member.setting else [])])
-            self.lost[i] = f"{f'{who} ' * (count > 1)}diverged at {shown}: {what}; {self.about(member)}"
-            lines.append(self.lost[i])
+            lines.append(f"{f'{who} ' * (count > 1)}diverged at {shown}: {what}; {self.about(member)}")
+            self.lost[i] = Lost(iteration, member.seed, member.setting, lines[-1])
         return lines
 
     def nothing_learned(self, i: int, values: Mapping[str, np.ndarray]) -> str:
@@ -100,4 +127,42 @@ class Watch:
         if not self.over:
             return ""
         first, *others = self.lost.values()
-        return f"{first}{f'; so did {len(others)} more' if others else ''}"
+        return f"{first.why}{f'; so did {len(others)} more' if others else ''}"
+
+
+def write_lost(folder: Path, lost: Iterable[Lost]) -> None:
+    files.write(folder / FILE, json.dumps([x._asdict() for x in lost], indent=1))
+
+
+def read_lost(folder: Path) -> list[Lost]:
+    """The members of a run folder that were given up.
+
+    Raises:
+        ConfigError: the file cannot be read.
+    """
+    path = folder / FILE
+    if not files.there(path):
+        return []
+    found = files.read_json(path)
+    with files.reading(path):
+        return [
+            Lost(int(x["iteration"]), int(x["seed"]), str(x["setting"]), str(x["why"])) for x in found
+        ]
+
+
+def lost_by(folder: Path, iteration: int) -> list[Lost]:
+    """`read_lost` up to an iteration, from which the run goes on. Later ones leave the file, as rows of
+    metrics.csv do."""
+    if not files.there(folder / FILE):
+        return []
+    kept = [x for x in read_lost(folder) if x.iteration <= iteration]
+    if kept:
+        write_lost(folder, kept)
+    else:
+        (folder / FILE).unlink()
+    return kept
+
+
+def seeds_in_words(seeds: Sequence[int]) -> str:
+    """'seed 1', or 'seeds 1, 2'."""
+    return f"seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds))}"

@@ -35,6 +35,7 @@ LIMITS = {  # bytes that a file may have, packed or not
     "versions.json": 16 * MB,
     "manifest.json": 16 * MB,
     "evaluation.json": 64 * MB,
+    "diverged.json": 64 * MB,
     "README.md": 16 * MB,
     "final.csv": 64 * MB,
     "curves.npz": 512 * MB,

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxsafe.learn.metrics import BAD
 from jaxsafe.run import clock, files, run_folder
-from jaxsafe.run.divergence import KINDS, Health, Watch
+from jaxsafe.run.divergence import KINDS, Health, Watch, write_lost
 from jaxsafe.run.loggers import Callback
 from jaxsafe.run.programs import Member, Program
 from jaxsafe.run.progress import Reporter
@@ -49,16 +49,16 @@ class Log:
     """
 
     def __init__(self, outputs: Outputs, program: Program, names: list[str], iteration: int):
-        folder, self.report, self.watch, self.callbacks = outputs
+        self.folder, self.report, self.watch, self.callbacks = outputs
         members, self.clocks = program.members, program.clocks
         self.warned_of_bad = self.warned_of_overflow = False
         self.seeds, self.unit = [m.seed for m in members], clock.unit(program.clocks)
         self.swept = {name: np.array([m.swept[name] for m in members]) for name in members[0].swept}
-        self.csv = run_folder.Metrics(folder, [*self.swept, *names], iteration)
+        self.csv = run_folder.Metrics(self.folder, [*self.swept, *names], iteration)
         self.begun = time.perf_counter() - self.csv.seconds
         self.boards = [
             run_folder.Board(
-                files.make_folder(folder, *board_of(m)),
+                files.make_folder(self.folder, *board_of(m)),
                 self.unit.at(iteration),
             )
             for m in members
@@ -106,7 +106,10 @@ class Log:
         writing, self.writing = self.writing, None
         at, values, health = writing.result()
         shown = self.unit.at(at.iteration)
-        for line in self.watch(f"{shown:,} {self.unit.name}", values, health):
+        lines = self.watch(at.iteration, f"{shown:,} {self.unit.name}", values, health)
+        if lines:
+            write_lost(self.folder, self.watch.lost.values())
+        for line in lines:
             if not self.watch.over:  # else the run ends, and says it
                 self.report.line(f"warning: {line}; the others go on")
         if not self.warned_of_bad and (values.get(BAD[0], np.zeros(())) > 0).any():

@@ -66,7 +66,8 @@ def train(
     Args:
         program: from `build`.
         train_cfg: those it was built with.
-        folder: the run folder; gets metrics.csv, tensorboard/, checkpoints/ and policy/.
+        folder: the run folder; gets metrics.csv, tensorboard/, checkpoints/ and policy/, and
+            diverged.json if a member diverges.
         report: where progress goes.
         hooks: what the session adds.
     Returns:
@@ -96,9 +97,10 @@ def train(
         report.line(f"compiled in {time.perf_counter() - begun:.1f} s")
         stop.nothing_to_save = ""
 
-        watch = divergence.Watch(program.members, hooks.about)
-        outputs = Outputs(folder, report, watch, hooks.callbacks)
         leads = distributed.leads()
+        lost = divergence.lost_by(folder, start.iteration) if leads else []
+        watch = divergence.Watch(program.members, hooks.about, lost)
+        outputs = Outputs(folder, report, watch, hooks.callbacks)
         with (
             Log(outputs, program, names, start.iteration) if leads else contextlib.nullcontext() as log
         ):

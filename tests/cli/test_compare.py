@@ -20,6 +20,7 @@ from jaxsafe.report import (
     read,
     scores,
     stats,
+    sweep_summary,
     tables,
     trade_off,
 )
@@ -28,6 +29,7 @@ from jaxsafe.report.published import Published, beside, end_beside, read_ends, r
 from jaxsafe.report.stats import Estimate
 from jaxsafe.run import run_folder
 from jaxsafe.run.checkpoint import Progress
+from jaxsafe.run.divergence import Lost, write_lost
 
 RESULTS = Path(__file__).parent.parent.parent / "docs" / "results"
 HEADER = "task,algo,source,return,return_std,cost,cost_std,cost_limit\n"
@@ -149,6 +151,20 @@ def test_seeds_of_one_setting_are_pooled_and_other_settings_stand_apart(tmp_path
     assert (cpo.name, ppo_lag.name) == ("cpo", "ppo_lag")
     np.testing.assert_array_equal(np.sort(ppo_lag.returns), [1, 3, 5])
     assert (ppo_lag.cost, ppo_lag.held) == (stats.estimate(np.array([20.0, 40, 30])), "unclear")
+
+
+def test_a_group_with_a_seed_that_diverged_holds_no_limit_and_the_tables_say_so(tmp_path):
+    for name, seeds in (("a", (0, 1)), ("b", (2, 3))):
+        write(tmp_path / name, seeds=seeds, costs=(1.0, 2.0))
+    assert compared(tmp_path)[0].held == "yes"
+    write_lost(tmp_path / "b", [Lost(12, 3, "", "a is not finite"), Lost(12, 3, "algo.clip=1", "")])
+    groups = compared(tmp_path)
+    assert [g.held for g in groups] == ["diverged"]
+    said = f"diverged, so no limit counts as held: {tmp_path / 'b'}, seed 3"
+    assert comparison_tables.notes(groups) == [said]
+    assert "**" not in str(comparison_tables.results(groups, "return", {}).rows)
+    text = sweep_summary.markdown(groups)
+    assert "| diverged |" in text and "no limit counts as held: ppo_lag (seed 3)" in text
 
 
 def test_settings_of_an_algorithm_are_told_apart_by_what_differs(tmp_path):

@@ -18,9 +18,10 @@ from toys import Ticker, reflex
 
 from jaxsafe.learn import steps
 from jaxsafe.report import plots
+from jaxsafe.report.group import group
 from jaxsafe.report.read import read
 from jaxsafe.run import checkpoint, evaluate, run_folder
-from jaxsafe.run.divergence import PATIENCE, Health, Watch, health
+from jaxsafe.run.divergence import PATIENCE, Health, Lost, Watch, health, lost_by, read_lost, write_lost
 from jaxsafe.run.programs import Member
 
 
@@ -43,6 +44,10 @@ def test_a_run_whose_parameters_are_not_finite_stops_and_names_the_setting(
         not checkpoint.checkpoints(Path("run/checkpoints")) and not Path("run/evaluation.json").exists()
     )
     assert len(rows(Path("run"))) - 1 <= 2  # it is noticed an iteration late at most
+    (lost,) = read_lost(Path("run"))
+    assert (lost.iteration, lost.seed, lost.setting) == (1, 0, "") and lost.why in line
+    (found,) = group(read([Path("run")]), ["algo.name"])
+    assert found.held == "diverged" and found.diverged == [0]
 
 
 def test_a_run_in_which_nothing_is_learned_stops_and_says_why(tmp_path, monkeypatch, capsys):
@@ -73,12 +78,22 @@ def test_of_several_members_the_others_go_on():
     watch = Watch([member(0), member(1)], lambda m: f"about {m.seed}")
     values = {"train/nonfinite": np.zeros(2)}
     params = {"a": jnp.array([[1.0], [jnp.nan]]), "config": jnp.array([[jnp.inf], [0.0]])}
-    assert watch("5 steps", values, health(params)) == [
+    assert watch(5, "5 steps", values, health(params)) == [
         "seed 1 diverged at 5 steps: a is not finite; about 1"
     ]
-    assert watch("6 steps", values, health(params)) == [] and not watch.over
+    assert watch(6, "6 steps", values, health(params)) == [] and not watch.over
+    again = Watch([member(0), member(1)], str, watch.lost.values())  # resumed: it is said already
+    assert again(6, "6 steps", values, health(params)) == [] and again.lost == watch.lost
     params["a"] = params["a"] * jnp.nan
-    assert len(watch("7 steps", values, health(params))) == 1 and watch.over
+    assert len(watch(7, "7 steps", values, health(params))) == 1 and watch.over
+
+
+def test_members_lost_after_a_checkpoint_are_forgotten_on_resumption(tmp_path):
+    early, late = Lost(3, 0, "", "early"), Lost(9, 1, "", "late")
+    assert lost_by(tmp_path, 5) == []
+    write_lost(tmp_path, [early, late])
+    assert lost_by(tmp_path, 5) == [early] == read_lost(tmp_path)
+    assert lost_by(tmp_path, 0) == [] and not [*tmp_path.iterdir()]
 
 
 def test_a_member_that_skips_some_updates_or_moves_is_not_given_up():
@@ -89,10 +104,10 @@ def test_a_member_that_skips_some_updates_or_moves_is_not_given_up():
         return Health({}, jnp.array([mark], jnp.uint32))
 
     for i in range(3 * PATIENCE):  # it moves in spite of what is skipped
-        assert watch("", bad, at(i)) == []
+        assert watch(0, "", bad, at(i)) == []
     for _ in range(3 * PATIENCE):  # nothing is skipped: a step that is rejected, a learning rate of 0
-        assert watch("", good, at(0)) == []
-    lines = [watch("", bad, at(0)) for _ in range(PATIENCE)]
+        assert watch(0, "", good, at(0)) == []
+    lines = [watch(0, "", bad, at(0)) for _ in range(PATIENCE)]
     assert [len(x) for x in lines] == [0] * (PATIENCE - 1) + [1]
     assert "the gradient of the loss is not finite" in lines[-1][0]
 

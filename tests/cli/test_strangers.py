@@ -241,6 +241,8 @@ REFUSED: dict[str, tuple[Plant, str, str]] = {  # ... by what
     "tables as evaluation": (
         holds("evaluation.json", '{"seeds": {"return": [[1, 2]]}}'), "one a seed", "plot",
     ),
+    "a link as the list of lost seeds": (to_outside("diverged.json"), "is a link", "plot"),
+    "numbers as the list of lost seeds": (holds("diverged.json", "[1]"), "cannot be read", "plot"),
     "a large number as evaluation": (
         holds("evaluation.json", '{"seeds": {"return": [1' + "0" * 400 + "]}}"),
         "cannot be read", "plot",

@@ -300,6 +300,7 @@ def test_rows_say_what_a_run_was_made_with_and_how_it_ended(toy, tmp_path):
         studies.add(toy, toy.runs[i], run, studies.origin_of(tmp_path / str(i)))
     rows = study_files.read(toy.folder).rows
     assert [row["state"] for row in rows] == ["done", "diverged", "unfinished", "unfinished"]
+    assert [run.diverged for run in read_one(toy.folder)] == [(1,), ()]
     assert [row["settings"] for row in rows] == ["", "", "algo.dual_lr=0.2", "algo.dual_lr=0.2"]
     first = rows[0]
     assert (first["device"], first["engine"], first["seed"], first["steps"]) == (
