@@ -24,7 +24,7 @@ from omegaconf import OmegaConf
 from jaxsafe import algos, envs
 from jaxsafe.config import ConfigError
 from jaxsafe.run import distributed
-from jaxsafe.run.arguments import check_grid, check_kind, import_named_code, names_in, parse
+from jaxsafe.run.arguments import check_grid, check_kind, choices, import_named_code, names_in, parse
 from jaxsafe.run.flags import fail
 from jaxsafe.run.plain import to_plain
 from jaxsafe.run.settings import (
@@ -32,6 +32,7 @@ from jaxsafe.run.settings import (
     DEFAULT,
     algo_options,
     check_agreement,
+    check_length,
     check_option,
     defaults_of,
     find_env,
@@ -39,6 +40,7 @@ from jaxsafe.run.settings import (
 )
 
 ONE_VALUE = ("preset", "compat", "resume")  # they choose the defaults of all other options
+LENGTHS = ("total_steps", "total_updates", "dataset")  # they say when a run ends
 Job = Callable[[dict[str, Any], int | None], None]
 Groups = dict[str, dict[str, dict[str, Any]]]  # 'env' and 'algo': name -> options
 
@@ -168,6 +170,9 @@ def check_arguments(argv: list[str]) -> Request:
     check_agreement({name: o.value() for name, o in given.items() if not o.is_sweep_override()})
     base = {k: v for k, v in known[0].items() if k not in DEFAULT}
     base |= {k: v for k, v in top.items() if v is not True}  # resume=true names no folder
+    lengths = {name: given[name] for name in LENGTHS if name in given}
+    firsts = {k: choices(o)[0] if o.is_sweep_override() else o.value() for k, o in lengths.items()}
+    check_length(firsts, base)
     texts = as_hydra_reads(typed.overrides, chosen)
     return Request(typed, texts, base, groups_of(typed, chosen, base))
 

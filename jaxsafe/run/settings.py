@@ -231,6 +231,7 @@ def settings_from_options(given: dict[str, Any], extras: Extras = NO_EXTRAS) -> 
     for name in (given := flat({**top, **groups})):
         check_option(name, base)
     check_agreement(given)
+    check_length(given, base)
     return settings_from_config(merged(base, {**top, **groups}), extras)
 
 
@@ -456,6 +457,19 @@ def check_agreement(given: Mapping[str, Any]) -> None:
     if len(values) > 1 and values[0] != values[1]:
         raise ConfigError(
             f"num_envs={shown(values[0])} and algo.num_envs={shown(values[1])}: they are one number"
+        )
+
+
+def check_length(given: Mapping[str, Any], base: Mapping[str, Any]) -> None:
+    """Refuse `total_steps` where gradient steps end the run. `base` has what is not given."""
+    options = {**base, **given}
+    updates = options["total_updates"]
+    if updates is None and options["dataset"] is not None:
+        updates = OFFLINE_UPDATES
+    if "total_steps" in given and updates is not None:
+        raise ConfigError(
+            f"total_steps={shown(given['total_steps'])}: this run ends at "
+            f"total_updates={shown(updates)}; give that instead"
         )
 
 

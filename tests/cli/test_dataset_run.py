@@ -21,6 +21,7 @@ from jaxsafe.run import checkpoint, dataset, progress, run_folder, session
 from jaxsafe.run.arguments import compose
 from jaxsafe.run.dataset import read_dataset, write_dataset
 from jaxsafe.run.policies import open_run
+from jaxsafe.run.settings import settings_from_config
 
 BC = (TOY, "algo=bc", "algo.updates=10", "algo.hidden=[8]", "eval_episodes=2", "video=false")
 
@@ -178,6 +179,10 @@ def test_python_trains_on_a_path(data, tmp_path, capsys):
 def test_a_data_set_has_100_000_updates_unless_told_otherwise(data):
     assert compose([*BC, f"dataset={data}"]).train.total_updates == 100_000
     assert compose([*BC]).train.total_updates is None
+    with pytest.raises(ConfigError, match="total_steps=5000: this run ends at total_updates=100000"):
+        compose([*BC, f"dataset={data}", "total_steps=5000"])
+    config = compose([*BC, f"dataset={data}"]).plain()  # which has total_steps, too
+    assert settings_from_config(config).train.total_updates == 100_000
 
 
 def test_processes_whose_files_differ_are_refused(data, tmp_path, monkeypatch):
@@ -200,6 +205,14 @@ def test_processes_whose_files_differ_are_refused(data, tmp_path, monkeypatch):
         (["algo=bc", "dataset=nowhere.npz"], "dataset=nowhere.npz: there is no such file"),
         (["algo=ppo_lag", "dataset=DATA"], "this algorithm learns from no data set"),
         (["algo=bc", "dataset=DATA", "num_envs=4"], "num_envs=4: bc trains without environments"),
+        (
+            ["algo=bc", "dataset=DATA", "total_steps=5000"],
+            "total_steps=5000: this run ends at total_updates=100000; give that instead",
+        ),
+        (
+            ["algo=ppo_lag", "total_updates=10", "total_steps=5e3"],
+            "ends at total_updates=10; give that",
+        ),
         (["algo=bc", "dataset=DATA", "env=toys:Ticker"], "observations have 4 numbers, those of the"),
         (
             ["algo=bc", "dataset=DATA", "algo.updates=0"],
