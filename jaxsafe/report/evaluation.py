@@ -42,7 +42,7 @@ def evaluate(
     Of a run on a data set there are DSRL's scores too and, with `data`, the data's own episodes.
     """
     settings = run.settings
-    keys = keys_of_episodes(seed, num, settings.train.num_seeds, len(settings.configs))
+    keys = keys_of_episodes(seed, num, settings.train.seeds, len(settings.configs))
     memory.check_episodes(run.env, num, len(keys))
     episodes = make_evaluation(run.algo, keys, sampled)(run.learned)
     examined = settings.row.examine(run.algo, run.learned, keys, sampled)

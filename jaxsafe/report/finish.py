@@ -10,6 +10,7 @@ from jaxsafe.report.film import film
 from jaxsafe.report.tables import cell
 from jaxsafe.run import files, run_folder
 from jaxsafe.run.divergence import seeds_in_words
+from jaxsafe.run.evaluate import TRAINING
 from jaxsafe.run.interrupts import Interrupts
 from jaxsafe.run.policies import RunPolicies, member_policies
 from jaxsafe.run.progress import Reporter
@@ -35,7 +36,7 @@ def finish(session: Session, report: Reporter, stop: Interrupts) -> None:
         plots.curves(metrics, folder / "curves.png", title, limit, limits)
 
     def scores() -> None:
-        found = evaluation.evaluate(run(), train.eval_episodes, train.seed, session.program.data)
+        found = evaluation.evaluate(run(), train.eval_episodes, TRAINING, session.program.data)
         risks = {s.name: s.calibration for s in found if s.calibration}
         tables = {s.name: evaluation.as_json(s.rows) | {"seeds": s.seeds} for s in found}
         for name, risk in risks.items():

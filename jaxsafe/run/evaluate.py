@@ -10,6 +10,8 @@ import numpy as np
 from jaxsafe.learn.acting import Player, Playing
 from jaxsafe.types import Algorithm, PyTree
 
+# the seed of the episodes that training plays, on the way and at its end: the same of every run
+TRAINING = 0
 # columns of metrics.csv where training is evaluated, of mean and of sampled actions
 COLUMNS = ("eval/return", "eval/cost", "eval/return_sampled", "eval/cost_sampled")
 
@@ -60,15 +62,24 @@ def episode(
     return jax.tree.map(lambda x: x.sum(0), sums)
 
 
-def keys_of_episodes(seed: int, num_episodes: int, num_seeds: int, settings: int = 1) -> jax.Array:
-    """Keys [S, N] of N episodes of each of S policies: `settings` times `num_seeds`.
+def keys_of_episodes(
+    seed: int, num_episodes: int, seeds: Sequence[int], settings: int = 1
+) -> jax.Array:
+    """Keys [S, N] of N episodes of each of S policies: every one of `seeds` in every setting.
 
     Seeds meet episodes of their own, so that an interval over seeds is one over layouts, too. Settings
-    meet the same ones, and so do other algorithms, so that they differ by their policies alone.
+    meet the same ones, and so do other algorithms, so that they differ by their policies alone. A seed
+    meets the same ones whichever seeds are trained beside it.
+
+    Args:
+        seed: of the episodes.
+        num_episodes: N.
+        seeds: of the policies of one setting, as they were trained.
+        settings: how many.
     """
     key = jax.random.fold_in(jax.random.key(seed), 0x6576616C)
-    seeds = jnp.arange(settings * num_seeds) % num_seeds
-    return jax.vmap(lambda i: jax.random.split(jax.random.fold_in(key, i), num_episodes))(seeds)
+    each = jax.vmap(lambda i: jax.random.split(jax.random.fold_in(key, i), num_episodes))
+    return each(jnp.array([*seeds] * settings))
 
 
 def make_evaluation(
@@ -96,7 +107,7 @@ def run_episodes(
 
     Actions are the mean ones, or `sampled`.
     """
-    keys = keys_of_episodes(seed, num_episodes, len(jax.tree.leaves(learned)[0]))
+    keys = keys_of_episodes(seed, num_episodes, range(len(jax.tree.leaves(learned)[0])))
     return make_evaluation(algo, keys, sampled)(learned)
 
 

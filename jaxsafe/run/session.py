@@ -17,7 +17,7 @@ from jaxsafe.envs.wrap import innermost
 from jaxsafe.nvidia import warp_problem
 from jaxsafe.run import checkpoint, clock, dataset, distributed, files, loop, run_folder
 from jaxsafe.run.devices import check_devices, device_name, use_compilation_cache
-from jaxsafe.run.evaluate import keys_of_episodes, make_training_evaluation
+from jaxsafe.run.evaluate import TRAINING, keys_of_episodes, make_training_evaluation
 from jaxsafe.run.interrupts import Interrupts
 from jaxsafe.run.loggers import Callback, check_logger, wandb_callback
 from jaxsafe.run.memory import check_memory, check_state_memory
@@ -257,7 +257,7 @@ def hooks_of(session: Session, report: Reporter) -> loop.Hooks:
     if train.eval_every:
         algo = settings.row.make(session.env, None)
         many = len(settings.configs)
-        keys = keys_of_episodes(train.seed, train.eval_episodes, train.num_seeds, many)
+        keys = keys_of_episodes(TRAINING, train.eval_episodes, train.seeds, many)
         hooks = hooks._replace(evaluate=make_training_evaluation(algo, keys))
     begun = run_folder.newest_progress(session.folder) is not None
     if train.init_from is not None and not distributed.from_process_0(np.array(begun)):

@@ -111,6 +111,11 @@ class TrainConfig:
         if self.seed + self.num_seeds > 2**31:
             raise ConfigError(f"seed={self.seed}: expected less than {2**31 - self.num_seeds + 1}")
 
+    @property
+    def seeds(self) -> range:
+        """Every seed of a setting."""
+        return range(self.seed, self.seed + self.num_seeds)
+
 
 class EnvEntry(NamedTuple):
     """What the name of an environment stands for."""
