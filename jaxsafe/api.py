@@ -307,8 +307,9 @@ def sweep(env: Any = None, algo: Any = None, **options: Any) -> SweepResult:
         jaxsafe.sweep("point_goal1", "ppo_lag", cost_limit=[5, 10, 25, 50], num_seeds=8)
         jaxsafe.sweep("point_goal1", ["cpo", "ppo_lag"], hidden=[(64, 64), (128, 128)])
 
-    Floats of the algorithm and seeds train side by side, as members of one compiled program; any other
-    option is a program for each of its values. The same call again goes on where it was stopped.
+    Floats of the algorithm and the `num_seeds` seeds of each setting train side by side, as members of
+    one compiled program. Any other option, `seed` among them, is a program for each of its values. The
+    same call again goes on where it was stopped.
 
     Args:
         env: as of `train`, or a list of names.
@@ -392,7 +393,8 @@ def evaluate(
     Args:
         run: a run, or its folder.
         episodes: of each seed.
-        seed: of the episodes; every policy meets the same.
+        seed: of the episodes. Each seed of the run meets episodes of its own, the same ones in every
+            setting and run.
         setting: which one, of a run that trained several side by side.
         sampled: whether actions are sampled, as in training, or the mean ones.
 

@@ -331,6 +331,8 @@ def test_a_sweep_takes_lists_for_values_and_tuples_for_lists():
         (name, hidden) for name in ("ppo_lag", "Priced") for hidden in ((8, 8), (4, 4))
     ]
     assert [c.cost_limit for c in next(iter(found.groups.values())).configs] == [5.0, 10.0]
+    (group,) = planned("point_goal1", cost_limit=[5, 10], num_seeds=3).groups.values()
+    assert (len(group.configs), group.train.num_seeds) == (2, 3)  # one program of six members
     found = planned("point_goal1", seed=range(2), max_parallel=np.int64(4), num_envs=4)
     assert [g.train.seed for g in found.groups.values()] == [0, 1] and found.max_parallel == 4
     found = planned("point_goal2", cost_limits={"hazards": [5, 10], "vases_contact": 25})
