@@ -1,4 +1,4 @@
-"""Environments small enough to know the answers of, and updates and gradient steps of algorithms."""
+"""Environments small enough to know the answers of, and how algorithms update and play in them."""
 
 import dataclasses
 from collections.abc import Callable
@@ -14,6 +14,7 @@ from jax.flatten_util import ravel_pytree
 from jaxsafe.learn.acting import Player
 from jaxsafe.learn.certificate import interval_barrier
 from jaxsafe.learn.steps import Context, Trainable
+from jaxsafe.run.evaluate import Episodes, keys_of_episodes, make_evaluation
 from jaxsafe.types import Algorithm, Env, Metrics, Policy, PyTree, Shared, State
 
 START = Shared(np.int32(0))
@@ -32,6 +33,18 @@ def training(algo: Algorithm, cfg: Any, updates: int) -> Callable:
         return jax.lax.scan(lambda ts, i: algo.update(ts, Shared(i)), start, jnp.arange(updates))
 
     return train
+
+
+def run_episodes(
+    algo: Algorithm, learned: PyTree, num_episodes: int, seed: int, sampled: bool = False
+) -> Episodes:
+    """`num_episodes` fresh episodes for each of the S policies in `learned` (leading axis), which are
+    the seeds of one setting.
+
+    Actions are the mean ones, or `sampled`.
+    """
+    keys = keys_of_episodes(seed, num_episodes, range(len(jax.tree.leaves(learned)[0])))
+    return make_evaluation(algo, keys, sampled)(learned)
 
 
 def momentum(nets: Trainable, name: str) -> PyTree:

@@ -99,18 +99,6 @@ def make_evaluation(
     return lambda learned: jax.tree.map(np.asarray, play(learned, keys))
 
 
-def run_episodes(
-    algo: Algorithm, learned: PyTree, num_episodes: int, seed: int, sampled: bool = False
-) -> Episodes:
-    """`num_episodes` fresh episodes for each of the S policies in `learned` (leading axis), which are
-    the seeds of one setting.
-
-    Actions are the mean ones, or `sampled`.
-    """
-    keys = keys_of_episodes(seed, num_episodes, range(len(jax.tree.leaves(learned)[0])))
-    return make_evaluation(algo, keys, sampled)(learned)
-
-
 def make_training_evaluation(
     algo: Algorithm, keys: jax.Array
 ) -> Callable[[PyTree], dict[str, np.ndarray]]:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import rich.console
-from toys import Corridor
+from toys import Corridor, run_episodes
 
 import jaxsafe
 from jaxsafe import algos, api
@@ -26,7 +26,6 @@ from jaxsafe.learn.treatments import penalty
 from jaxsafe.report.evaluation import evaluate
 from jaxsafe.run import checkpoint, programs, progress, run_folder
 from jaxsafe.run.arguments import compose
-from jaxsafe.run.evaluate import run_episodes
 from jaxsafe.run.plain import to_plain
 from jaxsafe.run.settings import Settings, nested, settings_from_options
 from jaxsafe.run.sweep_plan import Sweep, plan

@@ -5,10 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from shell import SMALL, STEPS, call, typed
+from toys import run_episodes
 
 from jaxsafe.report import plots, read, studies
 from jaxsafe.run import checkpoint, run_folder
-from jaxsafe.run.evaluate import COLUMNS, run_episodes
+from jaxsafe.run.evaluate import COLUMNS
 from jaxsafe.run.policies import open_run
 
 END = 10 * STEPS

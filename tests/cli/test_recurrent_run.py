@@ -6,10 +6,10 @@ import jax
 import numpy as np
 import pytest
 from shell import SMALL, STEPS, assert_same_run, typed
+from toys import run_episodes
 
 from jaxsafe.envs.view import render
 from jaxsafe.run import checkpoint
-from jaxsafe.run.evaluate import run_episodes
 from jaxsafe.run.policies import open_run
 
 GRU = (*SMALL, "algo.trunk=gru", "num_seeds=2")

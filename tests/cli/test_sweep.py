@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 import shell
-from toys import START, Corridor
+from toys import START, Corridor, run_episodes
 
 from jaxsafe import algos
 from jaxsafe.config import ConfigError, float_fields
@@ -24,7 +24,6 @@ from jaxsafe.report.sweep_summary import rows_of, summarise
 from jaxsafe.run import arguments, checkpoint, files, loop, memory, programs, run_folder, session, sweep
 from jaxsafe.run.arguments import compose
 from jaxsafe.run.dataset import write_dataset
-from jaxsafe.run.evaluate import run_episodes
 from jaxsafe.run.policies import open_run
 from jaxsafe.run.programs import build, members
 from jaxsafe.run.progress import Reporter

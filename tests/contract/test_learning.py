@@ -13,10 +13,9 @@ import numpy as np
 import pytest
 from compiling import BUSY
 from learners import on_policy_names, options_of
-from toys import Lever, training
+from toys import Lever, run_episodes, training
 
 from jaxsafe.algos import ALGOS
-from jaxsafe.run import evaluate
 
 QUICK = ("cpo", "p3o", "trpo_saute")
 LIMIT, BEST = 2.5, 14.375  # cost of an episode, and the best return within it
@@ -76,7 +75,7 @@ def test_an_adaptive_price_holds_the_limit_on_average(name):
 def test_a_budget_or_an_early_end_holds_the_limit_in_every_episode(name):
     """Up to 1 in 50: the policy is a smooth function, and is paid to come near the limit."""
     algo, ts, metrics = train(name)
-    whole = evaluate.run_episodes(algo, jax.vmap(algo.learned)(ts), 200, seed=0)
+    whole = run_episodes(algo, jax.vmap(algo.learned)(ts), 200, seed=0)
     assert (whole.length == 10).all()
     assert (whole.cost > LIMIT).mean() < 0.02
     assert (whole.ret.mean(1) > 0.9 * BEST).all()

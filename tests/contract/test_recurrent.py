@@ -7,14 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compiling import FAST
-from toys import START, Recall, Ticker, training, updated
+from toys import START, Recall, Ticker, run_episodes, training, updated
 
 from jaxsafe.algos import ALGOS
 from jaxsafe.config import ConfigError
 from jaxsafe.learn.acting import Player, reset_carry
 from jaxsafe.nn.networks import apply_to_rollout, net_of, recurrent_step
 from jaxsafe.nn.recurrent import Sequences, unroll
-from jaxsafe.run import evaluate
 
 SIZES: dict[str, Any] = {"num_envs": 64, "horizon": 12, "minibatches": 2, "hidden": (8, 16)}
 FIRST_ORDER: dict[str, Any] = {"lr": 3e-3, "target_kl": 0.1, "epochs": 5, "discount": 0.9}
@@ -35,7 +34,7 @@ def trained():
 
 def test_what_was_shown_at_the_first_step_is_remembered_to_the_last(trained):
     algo, ts = trained
-    whole = evaluate.run_episodes(algo, jax.vmap(algo.learned)(ts), 50, seed=0)
+    whole = run_episodes(algo, jax.vmap(algo.learned)(ts), 50, seed=0)
     assert (whole.ret.mean(1) > 4).all()  # 6 at best, and 1 without memory
 
 

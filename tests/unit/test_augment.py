@@ -7,14 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compiling import FAST
-from toys import START, Lever, Sometimes, Ticker, updated
+from toys import START, Lever, Sometimes, Ticker, run_episodes, updated
 
 from jaxsafe.algos import ALGOS
 from jaxsafe.learn import augment
 from jaxsafe.learn.augment import Budget, control_budget, full_budget, init_schedule
 from jaxsafe.learn.normalise import Normaliser, network_inputs, normalise
 from jaxsafe.learn.rollout import collect, init_rollout, memoryless
-from jaxsafe.run import checkpoint, compat, evaluate
+from jaxsafe.run import checkpoint, compat
 from jaxsafe.types import Policy
 
 TINY: dict[str, Any] = {
@@ -262,7 +262,7 @@ def test_evaluation_shows_what_is_left_of_the_scheduled_budget():
     algo = ALGOS["ppo_simmer_pid"].make(Lever())._replace(policy=Policy(lambda learned: (), spend))
     cfg = ALGOS["ppo_simmer_pid"].config(**TINY, cost_limit=1e6, budget_init=0.2)
     ts = jax.tree.map(lambda x: x[None], algo.init(jax.random.key(0), cfg, START))
-    cost = evaluate.run_episodes(algo, ts, 50, seed=0).cost  # 10 steps of 0.4 or 0.6
+    cost = run_episodes(algo, ts, 50, seed=0).cost  # 10 steps of 0.4 or 0.6
     assert cost.min() > 3.99 and cost.max() < 6.01 and cost.std() > 0.1
 
 
@@ -320,7 +320,7 @@ def test_training_episodes_end_early_and_others_do_not():
     ts, m = update(start("ppo_early_terminated", env, cost_limit=5.0))
     assert (m["train/episode_length"], m["train/cost"], m["train/return"]) == (3, 6, 3)
     assert algo.task(ts) is env
-    whole = evaluate.run_episodes(algo, jax.tree.map(lambda x: x[None], ts), 2, seed=0)
+    whole = run_episodes(algo, jax.tree.map(lambda x: x[None], ts), 2, seed=0)
     np.testing.assert_array_equal(whole.length, 5)
     np.testing.assert_array_equal(whole.cost, 10)
 

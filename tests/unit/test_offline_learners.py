@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from compiling import FAST
 from scipy.optimize import linprog
-from toys import Corridor, Lever, momentum
+from toys import Corridor, Lever, momentum, run_episodes
 
 from jaxsafe.algos import ALGOS, bc, bcq, coptidice, crr
 from jaxsafe.config import ConfigError
@@ -27,7 +27,6 @@ from jaxsafe.learn.offline import (
 )
 from jaxsafe.learn.steps import Trainable
 from jaxsafe.learn.treatments import Multiplier, lagrangian, no_treatment
-from jaxsafe.run import evaluate
 from jaxsafe.types import Shared, State
 
 LINEAR: dict[str, Any] = {"hidden": (), "obs_normalize": False, "max_grad_norm": 1e9, "discount": 0.9}
@@ -667,7 +666,7 @@ def trained(name, env, data, limit, iterations=10, **options):
     for i in range(iterations):
         ts, _ = update(ts, shared._replace(iteration=np.int32(i)))
     learned, sampled = jax.vmap(algo.learned)(ts), name.startswith("bcq")
-    whole = evaluate.run_episodes(algo, learned, 1000, 0, sampled)
+    whole = run_episodes(algo, learned, 1000, 0, sampled)
     return jax.tree.map(lambda x: x.mean(1), whole)
 
 
