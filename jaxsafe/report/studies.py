@@ -132,14 +132,15 @@ def add(study: Study, run: str, trained: SettingRun, origin: Origin, failure: st
 
     `failure` is 'failed' or 'diverged' where the command said so.
     """
-    rows, curves, settings = study_files.read(study.folder)
-    made = rows_of(study, run, trained, origin, failure)
+    made, drawn = rows_of(study, run, trained, origin, failure), points(trained)
     worth = {text: i for i, text in enumerate(study.runs)}
-    rows = [*(row for row in rows if row["run"] != run), *made]
-    rows.sort(key=lambda row: worth.get(row["run"], len(worth)))
-    curves |= {(run, row["seed"]): x for row, x in zip(made, points(trained), strict=True)}
-    settings[run] = {k: v for k, v in trained.config.items() if k not in ("run_dir", "resume")}
-    study_files.write(study.folder, study_files.Condensed(rows, curves, settings))
+    with files.in_turn(study.folder):  # a second command may add its own
+        rows, curves, settings = study_files.read(study.folder)
+        rows = [*(row for row in rows if row["run"] != run), *made]
+        rows.sort(key=lambda row: worth.get(row["run"], len(worth)))
+        curves |= {(run, row["seed"]): x for row, x in zip(made, drawn, strict=True)}
+        settings[run] = {k: v for k, v in trained.config.items() if k not in ("run_dir", "resume")}
+        study_files.write(study.folder, study_files.Condensed(rows, curves, settings))
 
 
 def rows_of(
@@ -277,13 +278,14 @@ class Picture(NamedTuple):
 
 def write_page(study: Study) -> None:
     """Write README.md, and draw its figures into images/ beside the study."""
-    text, pictures = page(study)
-    images = files.make_folder(study.folder.parent, "images")
-    for old in images.glob(f"{study.folder.name}-*.png"):
-        old.unlink()
-    for picture in pictures:
-        save_small(picture.draw(), picture.path)
-    files.write(study.folder / "README.md", text)
+    with files.in_turn(study.folder):
+        text, pictures = page(study)
+        images = files.make_folder(study.folder.parent, "images")
+        for old in images.glob(f"{study.folder.name}-*.png"):
+            old.unlink()
+        for picture in pictures:
+            save_small(picture.draw(), picture.path)
+        files.write(study.folder / "README.md", text)
 
 
 def page(study: Study) -> tuple[str, list[Picture]]:

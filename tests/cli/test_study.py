@@ -1,5 +1,6 @@
 """Studies: what their files hold, and the command that makes and continues them."""
 
+import contextlib
 import json
 import os
 import shlex
@@ -7,7 +8,9 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -312,6 +315,29 @@ def test_rows_say_what_a_run_was_made_with_and_how_it_ended(toy, tmp_path):
     last = json.loads((tmp_path / "0" / "versions.json").read_text())[-1]["commit"]
     assert last is None or (last.startswith(first["commit"]) and len(first["commit"]) == 7)
     assert first["dirty"] == ("" if last is None else "yes" if last.endswith("-dirty") else "no")
+
+
+def test_rows_that_two_commands_add_at_once_are_all_kept(toy, tmp_path, monkeypatch):
+    both, read_files = threading.Barrier(2), study_files.read
+
+    def read_beside_the_other(folder: Path) -> study_files.Condensed:
+        found = read_files(folder)
+        with contextlib.suppress(threading.BrokenBarrierError):
+            both.wait(0.3)  # until the other has read too, if it may
+        return found
+
+    runs = []
+    for i, run in enumerate(toy.runs):
+        trained(tmp_path / str(i), toy.command(run))
+        runs += read_one(tmp_path / str(i))
+    monkeypatch.setattr(study_files, "read", read_beside_the_other)
+    with ThreadPoolExecutor(2) as pool:
+        several = [
+            pool.submit(studies.add, toy, run, found, study_files.Origin())
+            for run, found in zip(toy.runs, runs, strict=True)
+        ]
+    assert [each.result() for each in several] == [None, None]
+    assert [row["algo"] for row in read_files(toy.folder).rows] == ["cpo"] * 2 + ["ppo_lag"] * 2
 
 
 def test_a_study_whose_files_do_not_belong_together_is_refused(toy, tmp_path):
