@@ -69,9 +69,13 @@ def open_run(folder: Path, code: Sequence[str] = (), extras: Extras = NO_EXTRAS)
             They are imported. 'env.robot_base=path', where it was trained with the user's robot.
         extras: the caller's environment and algorithm, where the run was trained with objects.
     Raises:
-        ConfigError: no run folder, one without a checkpoint, or one of another environment.
+        ConfigError: no run folder, one without a checkpoint, one of another environment, or a word of
+            `code` that is something else.
     """
     saved = run_folder.read_config(folder)
+    for text in code:
+        if "=" not in text:
+            raise ConfigError(f"{text}: expected one run folder, and beside it {' or '.join(CODE)}")
     given = dict(text.split("=", 1) for text in code)
     for kind, name in given.items():
         if kind not in (*DEFAULT, ROBOT):

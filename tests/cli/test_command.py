@@ -372,6 +372,15 @@ def test_evaluate_render_and_watch_refuse_a_bad_folder_in_one_line(tmp_path, cap
         )
 
 
+def test_evaluate_takes_one_run(tmp_path, capsys):
+    run = tmp_path / "run"
+    run.mkdir()
+    run_folder.write_config(run, {"env": {"name": "point_goal1"}, "algo": {"name": "cpo"}})
+    assert typed("evaluate", str(run), "runs/b") == 2
+    said = capsys.readouterr().err
+    assert said.startswith("error: runs/b: expected one run folder, and") and said.count("\n") == 1
+
+
 def test_a_full_disk_ends_training_in_one_line(tmp_path):
     """A limit on file size stands in for the disk: checkpoints and Matplotlib's list of fonts fit,
     metrics soon do not."""
