@@ -32,6 +32,7 @@ from jaxsafe.report import studies, study_files
 from jaxsafe.report.read import read_one
 from jaxsafe.report.studies import Study
 from jaxsafe.run import files, run_folder
+from jaxsafe.run.arguments import argument
 from jaxsafe.run.flags import fail, number
 from jaxsafe.run.settings import load
 
@@ -50,7 +51,7 @@ class Place(NamedTuple):
 
 def in_folder(options: list[str], folder: Path) -> list[str]:
     """The arguments of scripts/train.py that begin the run in `folder`, or continue it."""
-    return [*options, f"run_dir={folder}", "resume=true"]
+    return [*options, argument("run_dir", folder), "resume=true"]
 
 
 def train(options: list[str], place: Place) -> int:

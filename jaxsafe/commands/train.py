@@ -11,6 +11,7 @@ from jaxsafe.commands.guard import guarded
 from jaxsafe.commands.jaxsafe import called
 from jaxsafe.report.finish import finish
 from jaxsafe.run import distributed, help, session
+from jaxsafe.run.arguments import argument
 from jaxsafe.run.hydra_jobs import each_job
 from jaxsafe.run.progress import Reporter
 from jaxsafe.run.session import Session
@@ -58,5 +59,5 @@ def train(config: dict[str, Any], number: int | None) -> int:
 
 def resume_command(settings: Settings, folder: Path) -> str:
     """The command that continues a run. It names the user's code and files, or they are not read."""
-    words = [f"resume={folder}", *(f"{name}={value}" for name, value in yours(settings).items())]
-    return f"{called('train')} {shlex.join(words)}"
+    given = {"resume": folder, **yours(settings)}
+    return f"{called('train')} {shlex.join(argument(name, value) for name, value in given.items())}"

@@ -5,6 +5,8 @@ Hydra's own errors are long.
 """
 
 import math
+import re
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -57,6 +59,18 @@ def parse(text: str) -> Override:
         return OverridesParser.create().parse_override(text)
     except HydraException as error:
         raise ConfigError(f"cannot read {text!r}: {' '.join(str(error).split())}") from error
+
+
+def argument(name: str, value: str | Path) -> str:
+    """'name=value', with quotes around a value that Hydra would read as something else."""
+    text = str(value)
+    try:
+        if parse(f"{name}={text}").value() == text:
+            return f"{name}={text}"
+    except ConfigError:
+        pass
+    text = re.sub(r"(\\*)('|\Z)", lambda found: 2 * found[1] + found[2].replace("'", "\\'"), text)
+    return f"{name}='{text}'"
 
 
 def import_named_code(override: Override) -> None:

@@ -2,15 +2,18 @@
 
 import importlib
 import os
+import shlex
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from shell import SCRIPTS
 
 from jaxsafe import __version__
 from jaxsafe.commands import jaxsafe
+from jaxsafe.commands.study import in_folder
 from jaxsafe.commands.train import resume_command
 from jaxsafe.run.settings import settings_from_options
 
@@ -79,6 +82,29 @@ def test_what_continues_a_run_is_typed_as_it_was_begun(monkeypatch):
     ):
         monkeypatch.setattr(sys, "argv", argv)
         assert resume_command(settings, Path("runs/a")) == f"{says} resume=runs/a"
+
+
+@pytest.mark.parametrize(
+    "folder",
+    [
+        "000-a-ppo.horizon=128",
+        "~a (1)#2",
+        "dir with space",
+        "\u00fcn\u00ef",
+        "it's",
+        "a=\\'b\\",
+        "10",
+        "a,b",
+    ],
+)
+def test_hydra_reads_the_folder_of_a_command_that_continues_a_run(folder):
+    settings = settings_from_options({"dataset": f"data/{folder}"})
+    words = shlex.split(resume_command(settings, Path(folder)))[2:]
+    parser = OverridesParser.create()
+    found = {o.key_or_group: o.value() for o in parser.parse_overrides(words)}
+    assert found == {"resume": folder, "dataset": f"data/{folder}"}
+    (_, run_dir, _) = in_folder(["algo=cpo"], Path(folder))
+    assert parser.parse_override(run_dir).value() == folder
 
 
 def test_python_m_jaxsafe_is_the_command(tmp_path):
