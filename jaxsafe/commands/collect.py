@@ -47,13 +47,13 @@ def command() -> int:
         help="run folders, each with its share of the transitions",
     )
     words = parser.parse_args().words
-    given = dict(word.split("=", 1) for word in words if "=" in word)
+    given = dict(word.split("=", 1) for word in words if is_option(word))
     code = [f"{k}={v}" for k, v in given.items() if k not in OPTIONS]
     for name in given:
         if name not in (*OPTIONS, *(text.partition("=")[0] for text in CODE)):
             raise ConfigError(f"unknown option {name}{nearest(name, OPTIONS)}")
     size, out, sampled, seed = settings(OPTIONS | given)
-    recipe = shares([word for word in words if "=" not in word])
+    recipe = shares([word for word in words if not is_option(word)])
     use_compilation_cache()
     with Interrupts(functools.partial(print, flush=True)) as stop:
         stop.nothing_to_save = "stopped; nothing is written"
@@ -68,6 +68,12 @@ def command() -> int:
         f"in {time.perf_counter() - begun:.1f} s"
     )
     return 0
+
+
+def is_option(word: str) -> bool:
+    """Whether a word is 'size=1e6' or the like, and not a folder as 'runs/000-ppo.horizon=128'."""
+    name, equals, _ = word.partition("=")
+    return bool(equals) and all(part.isidentifier() for part in name.split("."))
 
 
 def settings(given: dict[str, Any]) -> tuple[int, Path, bool, int]:

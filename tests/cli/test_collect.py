@@ -115,6 +115,8 @@ def test_the_same_command_collects_the_same_and_mean_actions_are_not_sampled_one
         (("RUN", "actions=meen"), "did you mean 'mean'?"),
         (("RUN", "sizes=3"), "unknown option sizes; did you mean 'size'?"),
         (("nowhere",), "nowhere is not a run folder"),
+        (("000-a-ppo.horizon=128:1",), "000-a-ppo.horizon=128 is not a run folder"),
+        (("runs/ppo.horizon=128",), "runs/ppo.horizon=128 is not a run folder"),
     ],
 )
 def test_what_cannot_be_collected_is_one_line(run, tmp_path, capsys, args, message):
