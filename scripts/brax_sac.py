@@ -3,43 +3,72 @@
     python scripts/brax_sac.py halfcheetah                       # 3e6 steps
     python scripts/brax_sac.py ant preset=parallel total_steps=1e6 num_seeds=4
 
-The preset of `sac` is `frequent`. Options are those of scripts/train.py, without lists. The run folder,
-its curves and its evaluation are those of every run. Backends differ in their physics: figures are
-comparable within one alone. Speed beside Brax's own SAC, with as many environments and gradient steps:
+The preset of `sac` is `frequent`. Options are those of scripts/train.py, one value each, without env
+and env.*. The run folder, its curves and its evaluation are those of every run. Backends differ in
+their physics: figures are comparable within one alone. Speed beside Brax's own SAC, with as many
+environments and gradient steps:
 
     python scripts/benchmark.py scripts.brax_sac:task --algo sac --peer brax-sac
 """
 
 import argparse
+import sys
 
 import brax.envs
 
 import jaxsafe
+from jaxsafe.commands.guard import guarded
+from jaxsafe.config import ConfigError, flat
 from jaxsafe.interop.brax import FromBrax, from_brax
 from jaxsafe.run.arguments import read_values
+from jaxsafe.run.flags import fail
+
+BACKENDS = ("generalized", "spring", "positional", "mjx")
 
 
 def task(name: str = "halfcheetah", backend: str = "generalized") -> FromBrax:
     """A task of Brax, without cost."""
-    env = from_brax(brax.envs.get_environment(name, backend=backend), costs=())
+    try:
+        made = brax.envs.get_environment(name, backend=backend)
+    except KeyError as error:
+        raise ConfigError(f"Brax has no task {name}") from error
+    env = from_brax(made, costs=())
     env.engine = f"brax {backend}"
     return env
 
 
-def main() -> None:
+def command() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("task", nargs="?", default="halfcheetah", help="of brax.envs (halfcheetah)")
-    parser.add_argument("options", nargs="*", metavar="key=value")
-    parser.add_argument("--backend", default="generalized", help="of Brax (generalized)")
-    args = parser.parse_args()
-    options = {"total_steps": 3_000_000, "video": False, **read_values(args.options).options}
-    algo = options.pop("algo", "sac")
+    parser.error = fail  # type: ignore[method-assign]
+    parser.add_argument(
+        "words", nargs="*", metavar="TASK, key=value", help="of brax.envs (halfcheetah)"
+    )
+    parser.add_argument(
+        "--backend", default="generalized", choices=BACKENDS, help="of Brax (generalized)"
+    )
+    args = parser.parse_intermixed_args()
+    names = [word for word in args.words if "=" not in word] or ["halfcheetah"]
+    if len(names) > 1:
+        raise ConfigError(f"{' '.join(names)}: expected one task")
+    given = read_values([word for word in args.words if "=" in word])
+    for name in given.several:
+        raise ConfigError(f"{name}: expected one value")
+    options = {"total_steps": 3_000_000, "video": False, **flat(given.options)}
+    if "env.name" in options:
+        raise ConfigError(f"env={options['env.name']}: name a task of Brax instead, as halfcheetah")
+    algo = options.pop("algo.name", "sac")
     if algo == "sac":
         options.setdefault("preset", "frequent")
-    jaxsafe.train(task(args.task, args.backend), algo, **options)
+    jaxsafe.train(task(names[0], args.backend), algo, **options)
+    return 0
+
+
+def main() -> int:
+    """Exit status: as of scripts/train.py."""
+    return guarded(command)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

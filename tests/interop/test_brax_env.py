@@ -1,5 +1,7 @@
 """Our environments in Brax's and Playground's interface, and theirs in ours."""
 
+import importlib
+import sys
 from typing import Any
 
 import brax.envs
@@ -12,8 +14,10 @@ from brax.envs.fast import ObservationMode
 from brax.envs.wrappers import training
 from brax.training.agents.ppo import train as ppo
 from compiling import FAST
+from shell import SCRIPTS
 from toys import START, Corridor, Patch, Ticker
 
+import jaxsafe
 from jaxsafe import algos, envs
 from jaxsafe.config import ConfigError
 from jaxsafe.envs.check import check_env
@@ -246,3 +250,43 @@ def test_ours_step_in_playground_s_wrappers():
     for done in (0, 0, 1, 0):
         state = jax.jit(env.step)(state, jnp.ones((2, 2)))
         np.testing.assert_array_equal(state.done, done)
+
+
+# ---- scripts/brax_sac.py -----------------------------------------------------------------------
+
+
+def brax_sac_with(monkeypatch, *words: str) -> tuple[int, list[Any]]:
+    """The exit status, and what would be trained: task, algorithm, options."""
+    asked: list[Any] = []
+    monkeypatch.syspath_prepend(SCRIPTS)
+    brax_sac = importlib.import_module("brax_sac")
+    monkeypatch.setattr(brax_sac, "task", lambda *which: which)
+    monkeypatch.setattr(jaxsafe, "train", lambda task, algo, **given: asked.extend((task, algo, given)))
+    monkeypatch.setattr(sys, "argv", ["brax_sac.py", *words])
+    return brax_sac.main(), asked
+
+
+def test_sac_on_a_task_of_brax_takes_the_options_of_training(monkeypatch):
+    words = ("ant", "algo=sac", "algo.lr=1e-4", "algo.hidden=[8,8]", "num_seeds=4")
+    status, (task, algo, given) = brax_sac_with(monkeypatch, *words, "--backend", "spring")
+    assert (status, task, algo) == (0, ("ant", "spring"), "sac")
+    assert given == {
+        "total_steps": 3_000_000, "video": False, "preset": "frequent", "algo.lr": 1e-4,
+        "algo.hidden": [8, 8], "num_seeds": 4,
+    }  # fmt: skip
+    _, (task, algo, given) = brax_sac_with(monkeypatch, "algo=td3")
+    assert (task, algo) == (("halfcheetah", "generalized"), "td3") and "preset" not in given
+
+
+@pytest.mark.parametrize(
+    "words, message",
+    [
+        ("ant num_seeds=1,2", "num_seeds: expected one value"),
+        ("ant env=point_goal1", "env=point_goal1: name a task of Brax instead"),
+        ("ant hopper", "ant hopper: expected one task"),
+    ],
+)
+def test_what_sac_on_brax_cannot_train_is_one_line(words, message, monkeypatch, capsys):
+    status, asked = brax_sac_with(monkeypatch, *words.split())
+    said = capsys.readouterr().err
+    assert (status, asked) == (2, []) and message in said and said.count("\n") == 1
