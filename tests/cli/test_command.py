@@ -372,6 +372,13 @@ def test_evaluate_render_and_watch_refuse_a_bad_folder_in_one_line(tmp_path, cap
         )
 
 
+def test_no_folder_is_made_for_a_film_of_a_run_that_there_is_not(tmp_path, capsys):
+    for more in ((), ("--out", str(tmp_path / "films" / "a.mp4"))):
+        assert typed("render", str(tmp_path / "nowhere"), *more) == 2
+        assert "nowhere is not a run folder" in capsys.readouterr().err
+    assert not [*tmp_path.iterdir()]
+
+
 def test_evaluate_takes_one_run(tmp_path, capsys):
     run = tmp_path / "run"
     run.mkdir()
