@@ -66,13 +66,13 @@ def command() -> int:
     args = parser.parse_args()
     published = read_published(args.published) if args.published else {}
     runs = [or_evaluated(run) for run in read(folders_among(args.runs))]
-    by = [name for name in args.by if name != "env.name"] or telling(runs)
+    by = [name for name in args.by if name != "env.name"] if args.by else telling(runs)
     groups = ordered(group(runs, by))
     try:
         args.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError(f"--out {args.out}: {error.strerror}") from error
-    print(f"{len(runs)} run{'s' * (len(runs) > 1)} by {', '.join(by)}", file=sys.stderr)
+    print(f"{len(runs)} run{'s' * (len(runs) > 1)} by {', '.join(by or args.by)}", file=sys.stderr)
     print(write(groups, args.out, published) + f"written: {args.out}")
     return 0
 

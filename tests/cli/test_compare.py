@@ -453,6 +453,16 @@ def test_one_command_writes_every_table_and_figure_the_same_each_time(tmp_path, 
     assert {p.name: p.read_bytes() for p in out.iterdir()} == first
 
 
+def test_by_the_task_alone_all_its_runs_are_one_setting(tmp_path, capsys):
+    for algo in ("cpo", "ppo_lag"):
+        write(tmp_path / "runs" / algo, algo=algo)
+    out = tmp_path / "out"
+    assert typed("plot", str(tmp_path / "runs"), "--out", str(out), "--by", "env.name") == 0
+    said = capsys.readouterr()
+    assert said.err == "2 runs by env.name\n"
+    assert "| `all` |" in said.out and "averaged over algo.name (cpo, ppo_lag)" in said.out
+
+
 def test_a_committed_study_is_read_like_the_runs_that_it_was_made_of():
     groups = compared(RESULTS / "goal")
     known = {(g.env, g.name): g for g in groups}
