@@ -173,7 +173,7 @@ def work(study: Study, args: argparse.Namespace, train: Callable[[list[str], Pla
             print(f"{name}: stopped, {minutes}", flush=True)
             return
         with one_at_a_time:
-            trained = read_one(folder) if files.there(folder / "metrics.csv") else []
+            trained = read_one(folder) if files.there(run_folder.metrics_file(folder)) else []
             if len(trained) > 1:
                 raise ConfigError(f"{run}: expected one setting a run, not {len(trained)} side by side")
             failure = {0: "", DIVERGED: "diverged"}.get(status, "failed")

@@ -160,7 +160,10 @@ def estimate_of(name: str) -> str:
 
 
 class Metrics:
-    """metrics.csv: appends rows, and on resumption drops those after the checkpoint."""
+    """metrics.csv: appends rows, and on resumption drops those after the checkpoint.
+
+    A run whose metrics.csv was packed continues with it unpacked; the packed one is no longer read.
+    """
 
     def __init__(self, folder: Path, names: list[str], iteration: int):
         """Open for appending after `iteration`; later rows and a torn last line are dropped.
@@ -173,13 +176,14 @@ class Metrics:
         self.path, self.names, self.seconds = folder / "metrics.csv", list(names), 0.0
         header = [*INDEX, *self.names]
         kept = []
-        if files.there(self.path) and iteration:
-            with files.reading(self.path):
-                rows = csv.reader(io.StringIO(files.read_text(self.path), newline=""))
+        before = metrics_file(folder)
+        if files.there(before) and iteration:
+            with files.reading(before):
+                rows = csv.reader(io.StringIO(files.read_text(before), newline=""))
                 found = next(rows, header)
                 odd = sorted(set(found) ^ set(header))
                 if not all(name in (*COLUMNS, *BAD) for name in odd):
-                    raise ConfigError(f"{self.path} has other columns ({', '.join(odd)})")
+                    raise ConfigError(f"{before} has other columns ({', '.join(odd)})")
                 self.names += [name for name in found if name not in header]
                 header = [*INDEX, *self.names]
                 kept = [

@@ -62,6 +62,17 @@ def test_packed_metrics_are_read_like_the_plain_ones(tmp_path):
             read_metrics(tmp_path)
 
 
+def test_a_run_whose_metrics_are_packed_continues_with_all_its_rows(tmp_path):
+    write(tmp_path, [1, 2, 3])
+    path = tmp_path / "metrics.csv"
+    whole = path.read_text()
+    path.with_name("metrics.csv.xz").write_bytes(lzma.compress(path.read_bytes()))
+    path.unlink()
+    log = write(tmp_path, [3], resume_at=2)
+    assert (path.read_text(), log.seconds) == (whole, 2.0)
+    assert read_metrics(tmp_path)["iteration"].tolist() == [1, 1, 2, 2, 3, 3]
+
+
 def test_metrics_of_other_columns_are_refused(tmp_path):
     write(tmp_path, [1])
     with pytest.raises(ConfigError, match="other columns"):
