@@ -151,11 +151,8 @@ def rows_of(
     named = {name: x for name, x in values.items() if not name.startswith("normalised")}
     if trained.estimated:  # they have columns of their own
         named |= dict.fromkeys(("return", "cost"), np.full(len(trained.seeds), np.nan))
-    known = dict.fromkeys(trained.seeds.astype(int).astype(str), "done")
-    if "train/nonfinite" in table:
-        bad = run_folder.last_tenth(table, "train/nonfinite") > 0
-        known = {seed: "diverged" if b else "done" for seed, b in zip(known, bad, strict=True)}
-    state = failure or ("" if trained.ended else "unfinished")
+    usual = failure or ("done" if trained.ended else "unfinished")
+    states = {int(seed): usual for seed in trained.seeds} | dict.fromkeys(trained.diverged, "diverged")
     seconds = [table["seconds"][table["seed"] == s].max() for s in trained.seeds]
     clock = run_folder.step_column(table)
     named = {"minutes": np.array(seconds) / 60} | named
@@ -165,13 +162,13 @@ def rows_of(
             "env": trained.env,
             "algo": trained.config["algo.name"],
             "settings": " ".join(f"{k}={v}" for k, v in unusual(trained.config).items()),
-            "seed": seed,
-            "state": state or of_seed,
-            "steps": str(int(table[clock][table["seed"] == int(seed)].max())),
+            "seed": str(seed),
+            "state": state,
+            "steps": str(int(table[clock][table["seed"] == seed].max())),
         }
         | {name: "" if np.isnan(x[i]) else f"{x[i]:.9g}" for name, x in named.items()}
         | origin._asdict()
-        for i, (seed, of_seed) in enumerate(known.items())
+        for i, (seed, state) in enumerate(states.items())
     ]
 
 

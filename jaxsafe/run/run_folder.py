@@ -8,6 +8,7 @@ tensorboard/    the same for TensorBoard, a folder for each seed (and setting)
 checkpoints/    train states, to resume from: see jaxsafe.run.checkpoint
 policy/         the policies alone: all that evaluation, films and init_from read
 curves.png, video.mp4, evaluation.json   written at the end; calibration.png of a shield
+diverged.json   the members that were given up, if there are any
 """
 
 import csv

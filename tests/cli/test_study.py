@@ -28,6 +28,7 @@ from jaxsafe.report.read import defaults, read, read_one
 from jaxsafe.run import files, run_folder
 from jaxsafe.run.arguments import compose
 from jaxsafe.run.checkpoint import Progress
+from jaxsafe.run.divergence import Lost, write_lost
 
 ROOT = Path(__file__).parent.parent.parent
 TOY = """
@@ -297,8 +298,9 @@ def test_what_a_step_promises_and_keeps_is_a_slope_by_hand():
 
 
 def test_rows_say_what_a_run_was_made_with_and_how_it_ended(toy, tmp_path):
-    for i, (steps, nonfinite) in enumerate([(4000, (0, 1)), (2000, (0, 0))]):
+    for i, (steps, nonfinite) in enumerate([(4000, (1, 0)), (2000, (0, 0))]):
         trained(tmp_path / str(i), toy.command(toy.runs[i]), steps, nonfinite)
+        write_lost(tmp_path / str(i), [Lost(50, 1, "", "why")] if i == 0 else [])
         (run,) = read_one(tmp_path / str(i))
         studies.add(toy, toy.runs[i], run, studies.origin_of(tmp_path / str(i)))
     rows = study_files.read(toy.folder).rows
