@@ -51,13 +51,14 @@ def register(name: str, env: Any) -> None:
         name: what to call it. A name that is there already is replaced.
         env: one of
             a dict of Safety Gym's options, such as `TASKS["goal1"] | ROBOTS["car"]` of suite.py;
-            a `SafetyGymConfig` or a `VelocityConfig`, or an environment that `make` made of one;
-            any other `Env`;
+            a `SafetyGymConfig` or a `VelocityConfig`, or an environment that `make` made of one, whose
+            engine is an option again;
+            any other `Env`, also of a class derived from these;
             a function or a class that makes one. Its arguments with defaults become options.
     Raises:
         ConfigError: an unknown option, or something that is none of these.
     """
-    if isinstance(env, SafetyGym | Velocity):
+    if type(env) in (SafetyGym, Velocity):
         env = env.config
     if isinstance(env, SafetyGymConfig):
         env = dataclasses.asdict(env)
@@ -101,9 +102,14 @@ def canonical(name: str) -> str:
     raise ConfigError(f"unknown environment {name!r}{nearest(name, [*ENVS, *ALIASES])}")
 
 
+def implied_by(name: str) -> dict[str, Any]:
+    """The options that an id stands for, beside an environment; none where it was registered anew."""
+    return {} if name in ENVS else IMPLIED.get(name, {})
+
+
 def env_defaults(name: str) -> dict[str, Any]:
     """Every option of an environment as a plain value. `wrap` is a dict: the fields of `WrapConfig`."""
-    entry, implied = ENVS[canonical(name)], IMPLIED.get(name, {})
+    entry, implied = ENVS[canonical(name)], implied_by(name)
     wrap = dataclasses.asdict(WrapConfig())
     if isinstance(entry, dict):
         wrap |= entry.get(ANY_ENV, {})
@@ -164,7 +170,7 @@ def planned(env: str | Config, overrides: dict[str, Any]) -> Callable[[], Env]:
         raise ConfigError(f"env={shown(env)}: expected a name, a SafetyGymConfig or a VelocityConfig")
     name, entry = ("custom", env) if isinstance(env, Config) else (canonical(env), ENVS[canonical(env)])
     options = dataclasses.asdict(entry) if isinstance(entry, SafetyGymConfig) else entry
-    implied = IMPLIED.get(env, {}) if isinstance(env, str) else {}
+    implied = implied_by(env) if isinstance(env, str) else {}
     given = implied | {k: v for k, v in overrides.items() if k != ANY_ENV}
     wrap = overrides.get(ANY_ENV, {})
     if isinstance(options, dict):

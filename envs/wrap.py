@@ -252,7 +252,7 @@ def wrapped(env: Env, cfg: WrapConfig) -> Env:
 
 def wrap_config_of(env: Env) -> WrapConfig | None:
     """The config with which `wrapped` makes `env` of what is innermost; None if there is none, as where
-    wrappers stand in another order."""
+    wrappers stand in another order or have values that the config does not take."""
     found: dict[str, Any] = {}
     inside = env
     while isinstance(inside, Wrapper):
@@ -265,5 +265,8 @@ def wrap_config_of(env: Env) -> WrapConfig | None:
         elif isinstance(inside, ActionScale):
             found["action_bounds"] = (inside.low, inside.high)
         inside = inside.env
-    cfg = WrapConfig(**found)
+    try:
+        cfg = WrapConfig(**found)
+    except ConfigError:
+        return None
     return cfg if wrapped(inside, cfg) == env else None

@@ -83,7 +83,7 @@ class SafetyGymConfig:
     observe_box_comp: bool = False  # the box's direction, a compass
     observe_box_lidar: bool = False  # a lidar of the box
     observe_circle: bool = False  # a lidar of the middle of the circle
-    observe_remaining: bool = False  # the share of the episode that is over, as in the original
+    observe_remaining: bool = False  # the share of `num_steps` that is over, as in the original
     observe_walls: bool = False  # a lidar of the walls
     observe_hazards: bool = False  # a lidar of the hazards
     observe_vases: bool = False  # a lidar of the vases
@@ -91,8 +91,8 @@ class SafetyGymConfig:
     observe_buttons: bool = False  # a lidar of the buttons
     observe_gremlins: bool = False  # a lidar of the gremlins
     observe_vision: bool = False  # a dict: vision, uint8 [height, width, 3], and vector, all else
-    observe_qpos: bool = False  # MuJoCo's qpos of the robot
-    observe_qvel: bool = False  # MuJoCo's qvel of the robot
+    observe_qpos: bool = False  # MuJoCo's qpos, of the robot and what else moves
+    observe_qvel: bool = False  # MuJoCo's qvel, likewise
     observe_ctrl: bool = False  # the controls that the last action became
     observe_freejoint: bool = False  # the first 7 numbers of qpos
     observe_com: bool = False  # the robot's centre of mass
@@ -149,7 +149,7 @@ class SafetyGymConfig:
     buttons_locations: Points = ()  # fixed positions of the first ones
     buttons_keepout: Distance = 0.3  # radius that stays free around it
     buttons_size: Size = 0.1  # radius
-    buttons_cost: Weight = 1.0  # for each wrong button that is pressed
+    buttons_cost: Weight = 1.0  # for each point of contact with a wrong button
     # steps after a success in which no button costs anything or shows in lidars
     buttons_resampling_delay: Annotated[int, Bounds(0, 2**24)] = 10
     # ---- circle and run
@@ -192,7 +192,7 @@ class SafetyGymConfig:
     vases_size: Size = 0.1  # half side
     vases_density: Density = 0.001  # kg/m^3
     vases_sink: Distance = 4e-5  # how deep it stands in the floor
-    vases_contact_cost: Weight = 1.0  # for each that is touched
+    vases_contact_cost: Weight = 1.0  # for each point of contact with one
     vases_displace_cost: Weight = 0.0  # times m from where it stood
     vases_displace_threshold: Weight = 1e-3  # m, from which on it counts
     vases_velocity_cost: Weight = 1.0  # times m/s
@@ -204,7 +204,7 @@ class SafetyGymConfig:
     pillars_keepout: Distance = 0.3  # radius that stays free around it
     pillars_size: Size = 0.2  # radius
     pillars_height: Size = 0.5  # half height
-    pillars_cost: Weight = 1.0  # for each that is touched
+    pillars_cost: Weight = 1.0  # for each point of contact with one
     # ---- gremlins
     gremlins_num: Objects = 0  # how many
     gremlins_placements: Rectangles | None = None  # rectangles to draw from; null: placements_extents
@@ -213,7 +213,7 @@ class SafetyGymConfig:
     gremlins_travel: Distance = 0.3  # radius of their circles
     gremlins_size: Size = 0.1  # half side
     gremlins_density: Density = 0.001  # kg/m^3
-    gremlins_contact_cost: Weight = 1.0  # for each that is touched
+    gremlins_contact_cost: Weight = 1.0  # for each point of contact with one
     gremlins_dist_threshold: Weight = 0.2  # never read, as in the original
     gremlins_dist_cost: Weight = 1.0  # never read, as in the original
     # ---- physics

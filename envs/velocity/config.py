@@ -74,7 +74,7 @@ class VelocityConfig:
     ctrl_cost_weight: Weight = 0.1  # reward less for the sum of squared controls
     healthy_reward: Real = 0.0  # of a step that ends healthy, and of one that ends the episode
     terminate_when_unhealthy: bool = True  # whether being unhealthy ends the episode
-    healthy_z_range: Range | None = None  # of the height, m; null: any
+    healthy_z_range: Range | None = None  # of the height, m, halfcheetah's from 0.7 m up; null: any
     healthy_angle_range: Range | None = None  # of the pitch, rad
     healthy_state_range: Range | None = None  # of qvel, and of qpos but its first two
     # ours: of engine warp, times the room estimated for contacts
