@@ -58,6 +58,6 @@ def train(config: dict[str, Any], number: int | None) -> int:
 
 
 def resume_command(settings: Settings, folder: Path) -> str:
-    """The command that continues a run. It names the user's code and files, or they are not read."""
+    """The command that continues a run. It names what no run folder may set, as the user's code."""
     given = {"resume": folder, **yours(settings)}
     return f"{called('train')} {shlex.join(argument(name, value) for name, value in given.items())}"

@@ -1,10 +1,11 @@
 """Where the metrics of training go: metrics.csv, TensorBoard and the progress report."""
 
+import contextlib
 import time
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -12,7 +13,7 @@ import numpy as np
 from jaxsafe.learn.metrics import BAD
 from jaxsafe.run import clock, files, run_folder
 from jaxsafe.run.divergence import KINDS, Health, Watch, write_lost
-from jaxsafe.run.loggers import Callback
+from jaxsafe.run.loggers import Callback, WandbRun
 from jaxsafe.run.programs import Member, Program
 from jaxsafe.run.progress import Reporter
 
@@ -63,17 +64,22 @@ class Log:
             )
             for m in members
         ]
+        self.runs = contextlib.ExitStack()  # of Weights & Biases
         self.thread = ThreadPoolExecutor(1)
         self.writing: Future[tuple[clock.Progress, dict[str, np.ndarray], Health]] | None = None
 
     def __enter__(self) -> "Log":
+        for callback in self.callbacks:
+            if isinstance(callback, WandbRun):
+                self.runs.enter_context(callback)
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *error: Any) -> None:
         self.thread.shutdown()
         self.csv.close()
         for board in self.boards:
             board.close()
+        self.runs.__exit__(*error)
 
     def append(self, iteration: int, metrics: dict[str, jax.Array], health: Health) -> None:
         """Begin to write the metrics of an iteration, once those of the last one are written."""

@@ -1,5 +1,7 @@
 """Where metrics go beside the run folder: a callback of the caller's, or Weights & Biases."""
 
+import hashlib
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,8 @@ from jaxsafe.run.programs import Member
 
 # (how far each seed is, metrics by name: float32 [members], NaN where there is no value) -> None
 Callback = Callable[[Progress, dict[str, np.ndarray]], None]
+
+LONGEST = 100  # letters of a folder's name in the id of a run of Weights & Biases, which takes 128
 
 
 def check_logger(name: str) -> None:
@@ -28,30 +32,53 @@ def import_wandb() -> Any:
     return wandb
 
 
-def wandb_callback(folder: Path, config: dict[str, Any], members: Sequence[Member]) -> Callback:
+def wandb_callback(folder: Path, config: dict[str, Any], members: Sequence[Member]) -> "WandbRun":
     """What logs to a run of Weights & Biases that is called like the run folder.
 
-    Several members have a name each, as in 'train/cost/seed1'. A resumed run goes on in the same one.
+    A resumed run goes on in the same one, as long as its folder stays where it is.
     """
-    run = import_wandb().init(
-        project="jaxsafe",
-        name=folder.name,
-        id=folder.name,
-        dir=str(folder),
-        config=config,
-        resume="allow",
-    )
+    name = re.sub(r"[^\w.=-]+", "_", folder.name)[:LONGEST]
+    place = hashlib.sha256(str(folder.resolve()).encode()).hexdigest()[:8]
+    how = {
+        "project": "jaxsafe",
+        "name": folder.name,
+        "id": f"{name}-{place}",
+        "dir": str(folder),
+        "config": config,
+        "resume": "allow",
+    }
+    return WandbRun(how, members)
 
-    def log(clock: Progress, metrics: dict[str, np.ndarray]) -> None:
+
+class WandbRun:
+    """A callback that logs to a run of Weights & Biases. The run begins and ends with its context.
+
+    Several members have a name each, as in 'train/cost/seed1'.
+
+    Args:
+        how: the arguments of `wandb.init`.
+        members: of the program.
+    """
+
+    def __init__(self, how: dict[str, Any], members: Sequence[Member]):
+        self.how, self.members = how, members
+        self.run: Any = None
+
+    def __enter__(self) -> "WandbRun":
+        self.run = import_wandb().init(**self.how)
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        self.run.finish(exit_code=int(kind is not None))
+
+    def __call__(self, clock: Progress, metrics: dict[str, np.ndarray]) -> None:
         row = {
-            f"{name}{suffix(member, members)}": float(values[i])
+            f"{name}{suffix(member, self.members)}": float(values[i])
             for name, values in metrics.items()
-            for i, member in enumerate(members)
+            for i, member in enumerate(self.members)
             if np.isfinite(values[i])
         }
-        run.log(row | {"steps": clock.steps, "updates": clock.updates}, step=clock.iteration)
-
-    return log
+        self.run.log(row | {"steps": clock.steps, "updates": clock.updates}, step=clock.iteration)
 
 
 def suffix(member: Member, members: Sequence[Member]) -> str:

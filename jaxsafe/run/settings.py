@@ -317,10 +317,12 @@ def files_named(settings: Settings) -> dict[str, Any]:
 
 
 def yours(settings: Settings) -> dict[str, Any]:
-    """The options that name the user's code and files. A command that continues the run gives them
-    again. Only a fresh run reads `init_from`."""
+    """The options that no run folder may set: the user's code and files, and the logger. A command that
+    continues the run gives them again. Only a fresh run reads `init_from`."""
     names = {"env": settings.env_name, "algo": settings.algo_name}
     named = {k: v for k, v in files_named(settings).items() if k != "init_from"}
+    logger = settings.train.logger
+    named |= {"logger": logger} if logger != "none" else {}
     return {kind: name for kind, name in names.items() if ":" in name} | named
 
 
