@@ -543,7 +543,8 @@ def course(player: Player, key: jax.Array, sampled: bool) -> Course:
 
 def came_true(found: Course, horizon: int) -> tuple[jax.Array, jax.Array]:
     """Of each step whether one of the next `horizon` steps had a violation, and whether that is known,
-    bool [T] each. It is not where the episode ran out of time before."""
+    bool [T] each. It is not where fewer than `horizon` steps were left of an episode that did not fail:
+    to count those of them that had a violation would choose steps by what came."""
 
     def backward(
         later: tuple[jax.Array, jax.Array], x: tuple[jax.Array, ...]
@@ -557,8 +558,7 @@ def came_true(found: Course, horizon: int) -> tuple[jax.Array, jax.Array]:
     start = jnp.int32(horizon), jnp.int32(0)
     series = (found.violation, found.failed, found.alive)
     until, known = jax.lax.scan(backward, start, series, reverse=True)[1]
-    happened = until <= horizon
-    return happened, found.alive & (happened | (known >= horizon))
+    return until <= horizon, found.alive & (known >= horizon)
 
 
 def brier_score(found: Course, horizon: int) -> jax.Array:

@@ -119,7 +119,7 @@ class CRABSConfig(EnsembleConfig, CertificateConfig, sac.SACConfig):
     horizon: Amount = 40  # Steps of each environment in an update. Four updates have those of a refit.
     learn_every: Amount = 4  # Steps of each environment between two rounds of gradient steps.
     # Transitions replayed for each environment step. The paper's code has 85.
-    replay_ratio: Amount = 128
+    replay_ratio: Amount | Annotated[float, Bounds(1e-6, 1e6)] = 128
     batch_size: Amount = 256  # Transitions of a gradient step, as in the paper.
     # Transitions kept, rounded to whole updates. The paper keeps all of a run.
     replay_size: Annotated[int, Bounds(1, 2**31 - 1)] = 200_000
@@ -149,7 +149,8 @@ class CRABSConfig(EnsembleConfig, CertificateConfig, sac.SACConfig):
     # Actions that are tried before the certified policy takes over. The paper's code has 100.
     candidates: Amount = 20
     adversary_lr: Rate = 3e-4  # Adam's step against violations, as in the paper's code.
-    # Gradient steps against violations for each other gradient step, at first. As in the paper's code.
+    # Gradient steps against violations for each other gradient step, before the first search, as in the
+    # paper's code. Searches that fail double it, also those before the first certificate.
     adversary_init: Annotated[float, Bounds(LEAST, MOST)] = 2.0
 
 
@@ -346,9 +347,10 @@ def crabs(env: Env) -> Learner:
                 "search": found.search,
                 "pressure": jnp.clip(pressure, LEAST, MOST),
             }
+            found_volume = volume(here, found.barrier, found.search, cfg)
             metrics |= {
                 "train/certified": found.certified.astype(jnp.float32),
-                "train/certified_volume": volume(here, params["barrier"], found.search, cfg),
+                "train/certified_volume": jnp.where(found.certified, found_volume, jnp.nan),
                 "train/barrier_steps": found.steps.astype(jnp.float32),
                 "train/pressure": state["pressure"],
             }
@@ -366,7 +368,7 @@ def make(env: Env, axis_name: str | None = None) -> Algorithm:
 # roosephu/crabs @823da6c, configs/Swing-train_policy.json5 and run/main.py, for one environment
 PUBLISHED: dict[str, Any] = {
     "num_envs": 1, "horizon": 60, "learn_every": 3, "stagger": False, "replay_size": 1_000_000,
-    "replay_ratio": 256, "learning_starts": 10_000, "hidden": (256, 256), "layer_norm": False,
+    "replay_ratio": 256 / 3, "learning_starts": 10_000, "hidden": (256, 256), "layer_norm": False,
     "lr": 3e-4, "critic_lr": 3e-4, "alpha_init": 1.0, "alpha_lr": 3e-4, "max_grad_norm": math.inf,
     "model_hidden": (256, 256, 256, 256), "refit_every": 6000, "epoch_steps": 1000, "candidates": 100,
     "barrier_hidden": (256, 256), "barrier_lr": 3e-4, "chains": 10_000, "barrier_steps": 20_000,

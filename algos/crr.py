@@ -153,7 +153,7 @@ def learner(env: Env, treatment: Treatment = no_treatment) -> Learner:
 
         # critics
         after = next_values(nets.params["targets"], batch, next_key, cfg)
-        if at.ranges:
+        if at.ranges and not idle(cfg):  # OmniSafe's have no bounds
             after = Values(*(jnp.clip(x, *ends) for x, ends in zip(after, at.ranges, strict=True)))
         charged = constrained(batch, names(cfg))
         y = targets_of(batch, charged, after, names(cfg), cfg)

@@ -87,7 +87,8 @@ class OSRPLagConfig(CappedPIDConfig, PriceClockConfig, OSRPConfig):
 
     # Environment steps between two moves of the price. The authors' moves with each episode.
     dual_every: Annotated[int, Bounds(1, 2**30)] = 1_000
-    # Environment steps before the price first moves, as in the authors' code.
+    # Environment steps before cost counts, as in the authors' code. The price first moves `dual_every`
+    # steps later.
     dual_starts: Annotated[int, Bounds(0, 2**31 - 1)] = 5_000
 
 

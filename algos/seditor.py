@@ -128,8 +128,8 @@ class SEditorConfig(LagrangianConfig, PriceClockConfig, EncoderConfig, OffPolicy
     tau: Share = 0.005
     alpha_init: Positive = 1.0  # Both temperatures at first, as in the authors' code.
     alpha_lr: Rate = 3e-4  # The learning rate of log alpha, by Adam, as in the authors' code.
-    # The proposals' target entropy is that of a uniform density this high, in each dimension, as in
-    # the authors' code.
+    # The proposals' target entropy is that of a uniform density over this share of [-1, 1], in each
+    # dimension, as in the authors' code.
     min_prob: Chance = 0.1
     # The same for the editor's changes. The authors have 0.1 on Safety Gym, and 0.2 in racing.
     editor_min_prob: Chance = 0.1

@@ -53,7 +53,8 @@ class CertificateConfig:
 
     barrier_hidden: tuple[Units, ...] = (64, 64)  # Units of f. The paper has 256 and 256.
     barrier_lr: Rate = 1e-3  # Adam's step of f. The paper has 3e-4.
-    barrier_decay: Weight = 1e-4  # The decay of f's weights, as in the paper's code.
+    # The decay of weights, of f and of the policy in steps against violations, as in the paper's code.
+    barrier_decay: Weight = 1e-4
     # The weight of mean (h - h_ref)+, which keeps C from shrinking; h_ref is of the last certificate.
     barrier_keep: Weight = 1e-3
     margin: Weight = 0.01  # eps, by which u has to be below 0. As in the paper's code.

@@ -902,7 +902,7 @@ def test_the_brier_score_by_hand():
     failed = found._replace(failed=no.at[5].set(True))  # then it is known that no violation follows
     np.testing.assert_allclose(ambs.brier_score(failed, 2), np.mean([*errors, 0.81]), rtol=1e-6)
     short = found._replace(alive=yes.at[4:].set(False))
-    np.testing.assert_allclose(ambs.brier_score(short, 2), np.mean(errors[:4]), rtol=1e-6)
+    np.testing.assert_allclose(ambs.brier_score(short, 2), np.mean(errors[:3]), rtol=1e-6)
     assert jnp.isnan(ambs.brier_score(found._replace(violation=no), 9))
 
 
