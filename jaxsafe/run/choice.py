@@ -63,8 +63,8 @@ def choose_env(env: Any) -> tuple[dict[str, Any], dict[str, EnvEntry]]:
     inner = innermost(env)
     gym = isinstance(inner, SafetyGym | Velocity)
     fields = to_plain(plain_fields(env))
-    ours = type(inner) in (SafetyGym, Velocity)  # a derived class has a step of its own
-    if ours and isinstance(envs.ENVS.get(inner.name), BY_OPTIONS) and (wrap := wrap_config_of(env)):
+    wrap = wrap_config_of(env) if type(inner) in (SafetyGym, Velocity) else None  # no derived class
+    if gym and isinstance(envs.ENVS.get(inner.name), BY_OPTIONS) and wrap:
         defaults = flat(find_env(inner.name)[1].defaults)
         fields = to_plain(plain_fields(inner)) | {"wrap": to_plain(dataclasses.asdict(wrap))}
         fields["engine"] = "auto" if inner.engine == default_engine() else inner.engine

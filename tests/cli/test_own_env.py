@@ -13,8 +13,12 @@ from toys import Corridor, Ticker
 from jaxsafe import algos, envs
 from jaxsafe.config import ConfigError
 from jaxsafe.envs.check import check_env
+from jaxsafe.envs.safety_gym.config import SafetyGymConfig
 from jaxsafe.envs.safety_gym.suite import ROBOTS, TASKS
+from jaxsafe.envs.safety_gym.task import SafetyGym
+from jaxsafe.envs.wrap import ActionScale, wrap_config_of
 from jaxsafe.run.arguments import compose
+from jaxsafe.run.choice import choose_env
 
 
 @pytest.fixture(autouse=True)
@@ -38,6 +42,34 @@ def test_a_task_is_registered_by_its_options():
     assert envs.env_defaults("maze2")["lidar_num_bins"] == 8
     with pytest.raises(ConfigError, match="did you mean 'hazards_num'"):
         envs.register("maze3", {"hazard_num": 3})
+
+
+class Generous(SafetyGym):
+    def step(self, state, action):
+        return dataclasses.replace(super().step(state, action), reward=jnp.float32(7))
+
+
+def test_a_class_derived_from_a_task_stays_what_it_is():
+    config = SafetyGymConfig(**TASKS["goal0"] | ROBOTS["point"])
+    env = Generous(config, "c", "point_goal0")
+    envs.register("generous", env)
+    assert envs.make("generous") is env
+    given, entries = choose_env(env)
+    assert given["env"] == "point_goal0" and entries["point_goal0"].make() is env
+    given, entries = choose_env(envs.make("point_goal0", engine="c"))
+    assert not entries
+
+
+def test_a_task_in_wrappers_that_no_option_makes_is_taken_as_it_is():
+    env = ActionScale(envs.make("point_goal0", engine="c"), (-1.0, -1.0), (1.0, 0.5))
+    assert wrap_config_of(env) is None
+    _, entries = choose_env(env)
+    assert entries["point_goal0"].make() is env
+
+
+def test_an_id_that_is_registered_anew_implies_nothing():
+    envs.register("SafetyAntVelocity-v0", Corridor)
+    assert made("SafetyAntVelocity-v0", half_width=0.3).half_width == 0.3
 
 
 def test_a_layout_without_room_is_refused_though_nothing_is_overridden():
