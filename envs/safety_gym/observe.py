@@ -18,12 +18,6 @@ from jaxsafe.envs.vision.poses import rotation_of
 COORDINATE_SENSORS = ("velocimeter", "accelerometer", "gyro", "magnetometer")
 HAZARDS_AT = 9  # numbers before the hazards', where coordinates are observed
 RAY_HEIGHT = 0.3  # m, of natural lidar's rays by SEditor's rules
-JOINT_SENSORS = (  # in the order in which Safety-Gymnasium observes them
-    mujoco.mjtSensor.mjSENS_JOINTVEL,
-    mujoco.mjtSensor.mjSENS_BALLANGVEL,
-    mujoco.mjtSensor.mjSENS_JOINTPOS,
-    mujoco.mjtSensor.mjSENS_BALLQUAT,
-)
 
 
 def observe(
@@ -85,7 +79,7 @@ def in_order(arena: Arena, names: Iterable[str]) -> list[str]:
     if arena.config.rules != "safety_gymnasium":
         return sorted(names)
     order = list(arena.config.sensors_obs)
-    for kind in JOINT_SENSORS:
+    for kind in scenes.JOINT_SENSORS:
         order += [name for name, (_, found) in arena.sensors.items() if found == kind]
     for kind in (*layouts.ORDER[arena.config.rules], "circle"):
         order += [f"{kind}_lidar", f"{kind}_compass"]

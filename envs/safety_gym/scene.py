@@ -46,6 +46,12 @@ GROUP = {
     "circle": 6,
 }
 MOCAPS = ("gremlins", "pillars", "walls", "buttons")  # in the order of their mocap ids
+JOINT_SENSORS = (  # in the order in which Safety-Gymnasium observes them
+    mujoco.mjtSensor.mjSENS_JOINTVEL,
+    mujoco.mjtSensor.mjSENS_BALLANGVEL,
+    mujoco.mjtSensor.mjSENS_JOINTPOS,
+    mujoco.mjtSensor.mjSENS_BALLQUAT,
+)
 MJX_LIMITS = {"max_geom_pairs": 16, "max_contact_points": 48}  # nearest pairs a type, deepest contacts
 HALF = math.sqrt(0.5)
 BACK = {  # where a robot's rear camera is in its frame: level, and turned away from its front
@@ -169,7 +175,8 @@ def build(cfg: SafetyGymConfig, mjx: bool = False, drawn: bool = False) -> Scene
     add_fixed_objects(spec, cfg, pillar, fixed)
     kept = needed_sensors(cfg)
     for sensor in list(spec.sensors):
-        if sensor.name not in kept and not sensor.name.startswith(("jointpos_", "jointvel_", "ball")):
+        of_joint = sensor.name and sensor.type in JOINT_SENSORS
+        if sensor.name not in kept and not of_joint:
             spec.delete(sensor)
     if mjx:
         for name, value in MJX_LIMITS.items():
@@ -256,6 +263,17 @@ def watched_bodies(cfg: SafetyGymConfig) -> dict[str, list[str]]:
 
 
 def check_robot(cfg: SafetyGymConfig, robot: mujoco.MjModel) -> None:
+    if not robot.njnt or robot.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
+        check_planar(cfg, robot)
+    own = robot.body("robot").id
+    for i in range(robot.njnt):
+        if robot.body_rootid[robot.jnt_bodyid[i]] != robot.body_rootid[own]:
+            raise ConfigError(
+                f"env.robot_base={cfg.robot_base!r}: joint {robot.joint(i).name!r} is of another body "
+                "than 'robot' and its parts"
+            )
+    if any(robot.geom(i).name == "floor" for i in range(robot.ngeom)):
+        raise ConfigError(f"env.robot_base={cfg.robot_base!r}: leave out its floor, the task has one")
     for i in np.flatnonzero(robot.actuator_ctrllimited == 0):
         name = robot.actuator(i).name
         raise ConfigError(f"env.robot_base={cfg.robot_base!r}: actuator {name!r} has no ctrlrange")
@@ -265,12 +283,41 @@ def check_robot(cfg: SafetyGymConfig, robot: mujoco.MjModel) -> None:
             raise ConfigError(
                 f"env.sensors_obs: {cfg.robot_base} has no sensor {name!r}{nearest(name, sensors)}"
             )
+    for name in needed_sensors(cfg) - {*sensors}:
+        raise ConfigError(
+            f"env.robot_base={cfg.robot_base!r}: it has no sensor {name!r}, which env.task={cfg.task} "
+            "or env.observe_com=true needs"
+        )
     bodies = [robot.body(i).name for i in range(robot.nbody) if robot.body(i).name]
     if cfg.reward_orientation and cfg.reward_orientation_body not in bodies:
         name = cfg.reward_orientation_body
         raise ConfigError(f"env.reward_orientation_body={name!r}{nearest(name, bodies)}")
     if cfg.observe_freejoint and robot.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
         raise ConfigError(f"env.observe_freejoint=true: {cfg.robot_base} has no free joint")
+
+
+def check_planar(cfg: SafetyGymConfig, robot: mujoco.MjModel) -> None:
+    """Refuse a robot without a free joint whose first three numbers are not x, y and heading, as
+    lidars, layouts and costs take them."""
+    slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
+    body, root = robot.body("robot"), robot.njnt >= 3 and robot.jnt_bodyid[:3]
+    if not (
+        robot.njnt >= 3
+        and [*robot.jnt_type[:3]] == [slide, slide, hinge]
+        and np.allclose(robot.jnt_axis[:3], np.eye(3))
+        and np.all(root == body.id)
+        and body.parentid == 0
+    ):
+        raise ConfigError(
+            f"env.robot_base={cfg.robot_base!r}: expected a free joint, or first a slide along x, a "
+            "slide along y and a hinge about z, all of the body 'robot'"
+        )
+    still = np.allclose(body.quat, (1, 0, 0, 0)) and not robot.qpos0[:3].any()
+    if body.pos[:2].any() or not still:
+        raise ConfigError(
+            f"env.robot_base={cfg.robot_base!r}: expected the body 'robot' at x = y = 0, not turned, "
+            "and its first three joints without ref"
+        )
 
 
 def needed_sensors(cfg: SafetyGymConfig) -> set[str]:

@@ -32,9 +32,11 @@ def command() -> int:
         raise ConfigError(f"{what.options[0]}: expected a run folder too")
     several = len(folders) > 1
     out = args.out or (Path("compared.mp4") if several else folders[0] / "video.mp4")
+    if args.out:
+        check_video(out)
     policies = what.policies(args.index)
     check_one_task(folders, policies)
-    check_video(out)
+    check_video(out)  # makes its folder
     names = labels(folders, [policy.settings.algo_name for policy in policies]) if several else None
     task = policies[0].settings.env_name
     print(f"filming {len(policies)} x 1 episode of {task} ...", file=sys.stderr)

@@ -324,6 +324,49 @@ def test_a_robot_whose_actions_have_no_bounds_is_refused(tmp_path):
         envs.make("point_goal0", engine="c", robot_base=str(tmp_path / "wild.xml"))
 
 
+SLIDES = '<joint name="x" type="slide" axis="1 0 0"/><joint name="y" type="slide" axis="0 1 0"/>'
+HINGE = '<joint name="z" type="hinge" axis="0 0 1"/>'
+SENSORS = "".join(
+    f'<{kind} name="{kind}" site="robot"/>'
+    for kind in ("accelerometer", "velocimeter", "gyro", "magnetometer")
+)
+
+
+def puck(joints=SLIDES + HINGE, body='pos="0 0 0.1"', more="", sensors="") -> str:
+    return f"""<mujoco><worldbody>{more}
+        <body name="robot" {body}>{joints}
+        <geom type="cylinder" size="0.1 0.08"/><site name="robot"/></body></worldbody>
+        <actuator><motor joint="x" ctrlrange="-1 1"/></actuator>
+        <sensor>{SENSORS}{sensors}</sensor></mujoco>"""
+
+
+OTHER = '<body pos="1 1 1"><freejoint name="o"/><geom size="0.1"/></body>'
+OFF = {
+    "off": (puck(body='pos="0.5 0 0.1"'), {}, "at x = y = 0, not turned"),
+    "turned": (puck(body='pos="0 0 0.1" euler="0 0 90"'), {}, "at x = y = 0, not turned"),
+    "order": (puck(HINGE + SLIDES), {}, "expected a free joint, or first a slide along x"),
+    "two": (puck(SLIDES), {}, "a slide along y and a hinge about z"),
+    "other": (puck(more=OTHER), {}, "joint 'o' is of another body"),
+    "floor": (puck(more='<geom name="floor" type="plane" size="1 1 1"/>'), {}, "leave out its floor"),
+    "com": (puck(), {"observe_com": True}, "it has no sensor 'subtreecom'"),
+}
+
+
+@pytest.mark.parametrize("name", OFF)
+def test_a_robot_that_moves_otherwise_than_tasks_take_it_is_refused_in_one_line(name, tmp_path):
+    text, options, says = OFF[name]
+    (tmp_path / "own.xml").write_text(text)
+    with pytest.raises(ConfigError, match=says) as error:
+        envs.make("point_goal0", engine="c", robot_base=str(tmp_path / "own.xml"), **options)
+    assert "\n" not in str(error.value)
+
+
+def test_every_named_sensor_of_a_joint_is_observed(tmp_path):
+    (tmp_path / "own.xml").write_text(puck(sensors='<jointpos name="heading" joint="z"/>'))
+    env = envs.make("point_goal0", engine="c", robot_base=str(tmp_path / "own.xml"))
+    assert "heading" in env.observation_spec
+
+
 def test_the_reward_of_an_exception_is_an_option(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # MuJoCo writes MUJOCO_LOG.TXT
     t = task("point_goal0", reward_exception=-3.0)
