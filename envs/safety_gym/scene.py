@@ -52,7 +52,6 @@ JOINT_SENSORS = (  # in the order in which Safety-Gymnasium observes them
     mujoco.mjtSensor.mjSENS_JOINTPOS,
     mujoco.mjtSensor.mjSENS_BALLQUAT,
 )
-MJX_LIMITS = {"max_geom_pairs": 16, "max_contact_points": 48}  # nearest pairs a type, deepest contacts
 HALF = math.sqrt(0.5)
 BACK = {  # where a robot's rear camera is in its frame: level, and turned away from its front
     "point": {"pos": (0, 0, 0.15), "quat": (HALF, HALF, HALF, HALF)},
@@ -152,7 +151,7 @@ def build(cfg: SafetyGymConfig, mjx: bool = False, drawn: bool = False) -> Scene
     Args:
         mjx: build it for engine `jax`. Pillars become capsules with their caps out of reach, which
             collide better there than cylinders. Fixed bodies do not meet each other. There is room for
-            the contacts of `MJX_LIMITS` only.
+            the contacts of `mjx_limits` only.
         drawn: add what only rendering needs (light, cameras, colours, the gremlins' guides).
     Raises:
         ConfigError: an unknown robot, sensor or body.
@@ -179,7 +178,7 @@ def build(cfg: SafetyGymConfig, mjx: bool = False, drawn: bool = False) -> Scene
         if sensor.name not in kept and not of_joint:
             spec.delete(sensor)
     if mjx:
-        for name, value in MJX_LIMITS.items():
+        for name, value in mjx_limits(cfg, robot).items():
             spec.add_numeric(name=name, data=[value], size=1)
     model = spec.compile()
     orbit = np.zeros(model.nmocap)
@@ -209,6 +208,20 @@ def read_robot(cfg: SafetyGymConfig) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
     if spec.body("robot") is None or not any(site.name == "robot" for site in spec.sites):
         raise ConfigError(f"env.robot_base={cfg.robot_base!r}: it has no body and site named 'robot'")
     return spec, robot
+
+
+def mjx_limits(cfg: SafetyGymConfig, robot: mujoco.MjModel) -> dict[str, int]:
+    """How many contacts engine `jax` computes: the nearest pairs of each two types of shapes, and the
+    deepest points of all.
+
+    16 pairs and 48 points are enough where up to 40 points rest: 4 of a block, 20 of a box with its
+    columns, and 1 of each of the robot's geoms. With each point more there is room for a pair, and for
+    2 points of bodies that meet.
+    """
+    box = cfg.task == "push"
+    resting = 4 * (cfg.vases_num + cfg.gremlins_num) + 20 * box + robot.ngeom
+    more = max(0, resting - 40)
+    return {"max_geom_pairs": 16 + more, "max_contact_points": 48 + 3 * more}
 
 
 def add_free_objects(spec: mujoco.MjSpec, cfg: SafetyGymConfig) -> None:

@@ -4,11 +4,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import FAST
+from mujoco import mjx
 from tasks import ROBOT_AT_ORIGIN, Task, change, task, with_qpos
 
 from jaxsafe import envs
 from jaxsafe.config import ConfigError
-from jaxsafe.envs.safety_gym import sleeping
+from jaxsafe.envs.engines.jax import engine as jax_engine  # noqa: F401  (has the collisions)
+from jaxsafe.envs.registry import OURS
+from jaxsafe.envs.safety_gym import scene, sleeping
+from jaxsafe.envs.safety_gym.config import config_from_plain as read_config
 
 
 def walk(t: Task, steps: int, count: int = 4):
@@ -120,3 +125,42 @@ def test_settings_that_need_everyone_are_refused():
         envs.make("point_goal2", engine="c", awake=0)
     with pytest.raises(ConfigError, match=r"env.awake=2: expected 10 or null with .*natural"):
         envs.make("point_goal2", engine="c", awake=2, lidar_type="natural")
+
+
+def on_mjx(name: str, **options) -> scene.Scene:
+    """The scene that engine `jax` has of a task."""
+    config = read_config({k: v for k, v in OURS[name].items() if k != "wrap"} | options)
+    return scene.build(sleeping.small_config(config, sleeping.awake(config, "jax")), mjx=True)
+
+
+def test_the_jax_engine_has_room_for_the_contacts_of_all_that_are_awake():
+    options = {"vases_num": 16, "vases_keepout": 0.1, "hazards_num": 0, "awake": 16}
+    built = on_mjx("point_goal1", **options)
+    start = built.qpos_slice("vases").start
+    qpos = built.model.qpos0.copy()
+    for i in range(16):
+        qpos[start + 7 * i : start + 7 * i + 3] = i % 4 - 1.5, i // 4 - 1.5, 0.1 - 4e-5
+
+    def touching(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
+        model = mjx.put_model(built.model, impl="jax")
+        data = mjx.kinematics(model, mjx.make_data(built.model, impl="jax").replace(qpos=qpos))
+        contact = mjx.collision(model, data)._impl.contact  # type: ignore[union-attr]
+        return contact.geom, contact.dist <= 0
+
+    geom, met = map(np.asarray, jax.jit(touching, compiler_options=FAST)(jnp.asarray(qpos)))
+    floor = built.model.geom("floor").id
+    for i in range(16):
+        pair = [floor, built.model.geom(f"vase{i}").id]
+        assert (met & (np.sort(geom) == np.sort(pair)).all(1)).sum() == 4
+
+
+def test_the_room_for_contacts_of_the_jax_engine_grows_with_what_is_awake():
+    def room(*args, **options) -> list[float]:
+        built = on_mjx(*args, **options)
+        names = ("max_geom_pairs", "max_contact_points")
+        return [float(built.model.numeric(name).data[0]) for name in names]
+
+    for name in OURS:
+        assert room(name) == [16, 48], name
+    assert room("point_goal2", awake=10) == [18, 54]
+    assert room("doggo_goal2", vases_num=16, awake=16, hazards_num=0) == [54, 162]
