@@ -38,6 +38,7 @@ ORDER = {  # of placing
 }
 ORDER["seditor"] = ORDER["safety_gym"]
 GOAL_BATCH = 16  # draws of a new goal examined at once
+ROUNDING = 1e-6  # of distances in float32, times the largest coordinate
 
 
 class Search(NamedTuple):
@@ -75,8 +76,14 @@ class Placement:
 
     @property
     def apart(self) -> np.ndarray:
-        """The distance required between any two objects, [n, n] in m."""
-        return np.maximum(self.keepouts[:, None] + self.keepouts[None, :] + self.margin, 0.0)
+        """The distance required between any two objects, [n, n] in m, less what float32 rounds.
+
+        Fixed objects may be just as far apart as required. In Safety Gym they then pass in about half
+        of their draws, which differ by 1e-9 m.
+        """
+        required = self.keepouts[:, None] + self.keepouts[None, :] + self.margin
+        rounding = ROUNDING * max(1.0, float(np.abs(self.areas).max()))
+        return np.maximum(required - rounding, 0.0)
 
     @cached_property
     def lanes(self) -> int:

@@ -177,6 +177,21 @@ def test_locations_fix_the_first_objects_of_a_kind():
     assert np.ptp(hazards[:, 2:], axis=0).min() > 0.1
 
 
+@pytest.mark.parametrize("x", [0.0, 0.05, 0.1, 0.2, -0.3, 7.3, 301.7])
+def test_fixed_objects_may_be_just_as_far_apart_as_required(x):
+    options = {
+        "task": "none",
+        "hazards_num": 2,
+        "hazards_keepout": 0.3,
+        "robot_locations": ((x, 2.0),),
+    }
+    for gap, fits in ((0.6, True), (0.599, False)):
+        locations = ((x, 0.0), (x + gap, 0.0))
+        place = layouts.placement(config_from_plain(defaults(**options, hazards_locations=locations)))
+        _, found = layouts.sample_layout(place, jax.random.key(0))
+        assert layouts.feasible(place) == fits and found == fits
+
+
 def test_placements_are_chosen_by_their_shrunken_areas():
     """Keepout 0.18 shrinks a 1 x 1 square to 0.4096 m^2, and a 0.5 x 1 one to 0.0896 m^2."""
     rectangles = ((-3.0, -3.0, -2.0, -2.0), (2.0, 2.0, 2.5, 3.0), (0.0, 0.0, 0.3, 5.0))
