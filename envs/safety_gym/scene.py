@@ -154,7 +154,7 @@ def build(cfg: SafetyGymConfig, mjx: bool = False, drawn: bool = False) -> Scene
             the contacts of `mjx_limits` only.
         drawn: add what only rendering needs (light, cameras, colours, the gremlins' guides).
     Raises:
-        ConfigError: an unknown robot, sensor or body.
+        ConfigError: an unknown robot, sensor or body; for engine `jax`, a pillar with its cap in reach.
     """
     spec, robot = read_robot(cfg)
     check_robot(cfg, robot)
@@ -170,6 +170,8 @@ def build(cfg: SafetyGymConfig, mjx: bool = False, drawn: bool = False) -> Scene
     for i in range(cfg.gremlins_num):
         half = cfg.half_height(cfg.gremlins_size) if drawn else None
         add_gremlin_guide(spec, i, cfg.gremlins_size, half)
+    if mjx:
+        check_pillars(cfg, robot)
     pillar = mujoco.mjtGeom.mjGEOM_CAPSULE if mjx else mujoco.mjtGeom.mjGEOM_CYLINDER
     add_fixed_objects(spec, cfg, pillar, fixed)
     kept = needed_sensors(cfg)
@@ -208,6 +210,31 @@ def read_robot(cfg: SafetyGymConfig) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
     if spec.body("robot") is None or not any(site.name == "robot" for site in spec.sites):
         raise ConfigError(f"env.robot_base={cfg.robot_base!r}: it has no body and site named 'robot'")
     return spec, robot
+
+
+def check_pillars(cfg: SafetyGymConfig, robot: mujoco.MjModel) -> None:
+    """Raise `ConfigError` for pillars lower than the robot or a block as they stand."""
+    if not cfg.pillars_num:
+        return
+    data = mujoco.MjData(robot)
+    mujoco.mj_kinematics(robot, data)
+    up = data.geom_xmat.reshape(-1, 3, 3)[:, 2]  # of each geom's axes
+    middle, half = robot.geom_aabb[:, :3], robot.geom_aabb[:, 3:]
+    heights = data.geom_xpos[:, 2] + (up * middle + np.abs(up) * half).sum(1)
+    carried = robot.body_rootid[robot.geom_bodyid] == robot.body("robot").id
+    tops = [
+        float(heights[carried].max(initial=0.0)),
+        (cfg.vases_num > 0) * 2 * cfg.half_height(cfg.vases_size),
+        (cfg.gremlins_num > 0) * (cfg.gremlins_size + 2 * cfg.half_height(cfg.gremlins_size)),  # hover
+        (cfg.task == "push") * 2 * cfg.half_height(cfg.box_size),
+    ]
+    tallest = round(max(tops), 6)
+    if 2 * cfg.pillars_height < tallest:
+        raise ConfigError(
+            f"env.pillars_height={cfg.pillars_height} with env.engine=jax, where pillars have round "
+            f"caps: expected at least {math.ceil(500 * tallest) / 1000:g}, half of the tallest body's "
+            "height; engines c and warp take lower pillars"
+        )
 
 
 def mjx_limits(cfg: SafetyGymConfig, robot: mujoco.MjModel) -> dict[str, int]:

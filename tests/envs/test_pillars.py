@@ -11,6 +11,7 @@ from mujoco import mjx
 from mujoco.mjx.third_party import mujoco_warp
 
 from jaxsafe import envs
+from jaxsafe.config import ConfigError
 from jaxsafe.envs.engines.jax import contacts as jax_contacts
 from jaxsafe.envs.engines.warp import pillars as warp_pillars
 from jaxsafe.envs.safety_gym import scene
@@ -188,3 +189,24 @@ def test_only_pillars_and_boxes_are_taken():
         if pillars:
             assert sorted(map(sorted, pillars.pairs.numpy().tolist())) == sorted(map(sorted, taken))
             assert {frozenset({"pillar0", "box"}), frozenset({"pillar0", "robot"})} <= bodies
+
+
+def test_pillars_whose_caps_could_be_touched_are_refused_on_engine_jax():
+    def built(name, **options):
+        return scene.build(envs.make(name, engine="c", pillars_num=1, **options).config, mjx=True)
+
+    limits = [
+        ("point_goal0", {}, 0.1),  # the robot
+        ("doggo_goal0", {}, 0.148),
+        ("point_goal0", {"vases_num": 1, "vases_size": 0.15}, 0.15),
+        ("point_button1", {}, 0.15),  # gremlins hover
+        ("point_push1", {}, 0.2),
+    ]
+    for name, options, limit in limits:
+        built(name, pillars_height=limit, **options)
+        says = f"env.pillars_height={limit - 0.001:g} .*jax.* expected at least {limit:g}, half of the"
+        with pytest.raises(ConfigError, match=says):
+            built(name, pillars_height=round(limit - 0.001, 6), **options)
+    scene.build(envs.make("point_goal0", engine="c", pillars_height=0.01).config, mjx=True)  # none
+    with pytest.raises(ConfigError, match="engines c and warp take lower pillars"):
+        envs.make("point_push1", engine="jax", pillars_height=0.01)
