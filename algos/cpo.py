@@ -76,8 +76,7 @@ class CPOConfig(LimitsConfig, trpo.TRPOConfig):
     line_search_tries: Iterations = 20  # Steps that the line search tries at most, as in OmniSafe.
     # Whether the violation v is in cost per step, as b is. OmniSafe's is per episode.
     per_step: bool = True
-    # A step is asked to take back this many times v. Below the limit it may spend as many times -v.
-    violation_gain: Weight = 5.0
+    violation_gain: Weight = 5.0  # A step is asked to take back this many times v.
     # How fast the margin grows with v, as in safety-starter-agents, where it is off. 0: no margin.
     margin_lr: Weight = 0.05
     margin_max: Weight = 2.0  # Bound of the margin, as a multiple of the most that a step can promise.

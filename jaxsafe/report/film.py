@@ -18,10 +18,14 @@ class NoVideo(RuntimeError):
     """Nothing to render with. The message is one line for the user."""
 
 
-def check_video(path: Path) -> None:
-    """Make the folder of a film. Raise ConfigError where none could be written."""
+def check_suffix(path: Path) -> None:
     if path.suffix not in (".mp4", ".gif"):
         raise ConfigError(f"{path}: expected a name that ends in .mp4 or .gif")
+
+
+def check_video(path: Path) -> None:
+    """Make the folder of a film. Raise ConfigError where none could be written."""
+    check_suffix(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:

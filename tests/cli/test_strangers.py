@@ -416,7 +416,7 @@ def test_an_interpolation_stays_the_text_that_it_is(place, capsys):
 
 def test_a_data_set_that_the_user_names_himself_is_read(place, capsys):
     says(dataset="data.npz")(place)
-    words = ("train", f"resume={place.run}", "dataset=data.npz", *LONGER)
+    words = ("train", f"resume={place.run}", "dataset=data.npz", TOY, "eval_episodes=1")
     assert typed(*words) == 2 and "there is no such file" in capsys.readouterr().err
 
 

@@ -15,6 +15,9 @@ def rounds(value: Any, facts: Facts) -> dict[str, Any] | None:
     """From vector_env_nums, update_cycle, update_iters, size and batch_size. OmniSafe's size and
     batch_size are those of each environment."""
     envs_there = facts.whole("train_cfgs.vector_env_nums", 1)
+    if "algo.chains" in facts.options:  # CRABS learns 2,000 times in 6,000 steps, as its preset does
+        size = facts.whole("algo_cfgs.size", 1_000_000)
+        return {"algo.batch_size": facts.whole("algo_cfgs.batch_size", 256), "algo.replay_size": size}
     cycle = facts.whole("algo_cfgs.update_cycle", 1)
     batch = envs_there * facts.whole("algo_cfgs.batch_size", 256)
     replayed = facts.whole("algo_cfgs.update_iters", 1) * batch
