@@ -57,6 +57,7 @@ BACK = {  # where a robot's rear camera is in its frame: level, and turned away 
     "point": {"pos": (0, 0, 0.15), "quat": (HALF, HALF, HALF, HALF)},
     "car": {"pos": (0, 0, 0.2), "quat": (HALF, HALF, 0, 0)},
 }
+PLANAR = ["slide (1 0 0)", "slide (0 1 0)", "hinge (0 0 1)"]  # the joints of a robot without a free one
 FREES = ("vases", "gremlins", "box")  # in the order of their free joints
 
 
@@ -303,8 +304,6 @@ def watched_bodies(cfg: SafetyGymConfig) -> dict[str, list[str]]:
 
 
 def check_robot(cfg: SafetyGymConfig, robot: mujoco.MjModel) -> None:
-    if not robot.njnt or robot.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
-        check_planar(cfg, robot)
     own = robot.body("robot").id
     for i in range(robot.njnt):
         if robot.body_rootid[robot.jnt_bodyid[i]] != robot.body_rootid[own]:
@@ -312,6 +311,14 @@ def check_robot(cfg: SafetyGymConfig, robot: mujoco.MjModel) -> None:
                 f"env.robot_base={cfg.robot_base!r}: joint {robot.joint(i).name!r} is of another body "
                 "than 'robot' and its parts"
             )
+    joints = [in_words(robot, i) for i in range(robot.njnt) if i < 3 or robot.jnt_bodyid[i] == own]
+    if joints == PLANAR:
+        check_planar(cfg, robot)
+    elif joints[:1] != ["free"]:
+        raise ConfigError(
+            f"env.robot_base={cfg.robot_base!r}: its joints are {', '.join(joints) or 'none'}: "
+            f"expected of body 'robot' free, or {', '.join(PLANAR)} alone"
+        )
     if any(robot.geom(i).name == "floor" for i in range(robot.ngeom)):
         raise ConfigError(f"env.robot_base={cfg.robot_base!r}: leave out its floor, the task has one")
     for i in np.flatnonzero(robot.actuator_ctrllimited == 0):
@@ -336,28 +343,38 @@ def check_robot(cfg: SafetyGymConfig, robot: mujoco.MjModel) -> None:
         raise ConfigError(f"env.observe_freejoint=true: {cfg.robot_base} has no free joint")
 
 
+def in_words(robot: mujoco.MjModel, i: int) -> str:
+    """The kind and the axis of joint `i`, and its body if that is not 'robot'."""
+    kind = mujoco.mjtJoint(robot.jnt_type[i]).name.removeprefix("mjJNT_").lower()
+    axis = f" ({numbers(robot.jnt_axis[i])})" if kind in ("slide", "hinge") else ""
+    body = robot.body(robot.jnt_bodyid[i]).name
+    return f"{kind}{axis}" + (f" of {body!r}" if body != "robot" else "")
+
+
+def numbers(values: Any) -> str:
+    return " ".join(f"{x + 0.0:g}" for x in np.round(values, 6))
+
+
 def check_planar(cfg: SafetyGymConfig, robot: mujoco.MjModel) -> None:
-    """Refuse a robot without a free joint whose first three numbers are not x, y and heading, as
-    lidars, layouts and costs take them."""
-    slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
-    body, root = robot.body("robot"), robot.njnt >= 3 and robot.jnt_bodyid[:3]
-    if not (
-        robot.njnt >= 3
-        and [*robot.jnt_type[:3]] == [slide, slide, hinge]
-        and np.allclose(robot.jnt_axis[:3], np.eye(3))
-        and np.all(root == body.id)
-        and body.parentid == 0
+    """Refuse a robot whose first three numbers are not its x, y and heading in the world."""
+    body = robot.body("robot")
+    parent = robot.body(int(body.parentid[0])).name
+    if parent != "world":
+        raise ConfigError(
+            f"env.robot_base={cfg.robot_base!r}: body 'robot' is in body {parent!r}: expected it in "
+            "the worldbody"
+        )
+    for what, came, expected in (
+        ("x, y of body 'robot'", body.pos[:2], (0, 0)),
+        ("quat of body 'robot'", body.quat, (1, 0, 0, 0)),
+        ("ref of its first three joints", robot.qpos0[:3], (0, 0, 0)),
+        ("x, y of its hinge", robot.jnt_pos[2, :2], (0, 0)),
     ):
-        raise ConfigError(
-            f"env.robot_base={cfg.robot_base!r}: expected a free joint, or first a slide along x, a "
-            "slide along y and a hinge about z, all of the body 'robot'"
-        )
-    still = np.allclose(body.quat, (1, 0, 0, 0)) and not robot.qpos0[:3].any()
-    if body.pos[:2].any() or not still:
-        raise ConfigError(
-            f"env.robot_base={cfg.robot_base!r}: expected the body 'robot' at x = y = 0, not turned, "
-            "and its first three joints without ref"
-        )
+        if numbers(came) != numbers(expected):
+            raise ConfigError(
+                f"env.robot_base={cfg.robot_base!r}: {what} = {numbers(came)}: expected "
+                f"{numbers(expected)}"
+            )
 
 
 def needed_sensors(cfg: SafetyGymConfig) -> set[str]:

@@ -341,11 +341,40 @@ def puck(joints=SLIDES + HINGE, body='pos="0 0 0.1"', more="", sensors="") -> st
 
 
 OTHER = '<body pos="1 1 1"><freejoint name="o"/><geom size="0.1"/></body>'
+UP = '<joint name="up" type="slide" axis="0 0 1"/>'
+BASE = '<body name="base" pos="0 0 0.1"><freejoint/><geom size="0.1"/>'
+ALONE = r"expected of body 'robot' free, or slide \(1 0 0\), slide \(0 1 0\), hinge \(0 0 1\) alone"
 OFF = {
-    "off": (puck(body='pos="0.5 0 0.1"'), {}, "at x = y = 0, not turned"),
-    "turned": (puck(body='pos="0 0 0.1" euler="0 0 90"'), {}, "at x = y = 0, not turned"),
-    "order": (puck(HINGE + SLIDES), {}, "expected a free joint, or first a slide along x"),
-    "two": (puck(SLIDES), {}, "a slide along y and a hinge about z"),
+    "off": (puck(body='pos="0.5 0 0.1"'), {}, "x, y of body 'robot' = 0.5 0: expected 0 0"),
+    "turned": (puck(body='pos="0 0 0.1" euler="0 0 180"'), {}, "= 0 0 0 1: expected 1 0 0 0"),
+    "inside": (
+        puck().replace("<body", '<body name="a" pos="1 0 0"><body').replace("</body>", "</body>" * 2),
+        {},
+        "is in body 'a': expected",
+    ),
+    "ref": (
+        puck(SLIDES.replace("/>", ' ref="0.3"/>', 1) + HINGE),
+        {},
+        "ref of .* = 0.3 0 0: expected 0 0 0",
+    ),
+    "beside": (
+        puck(SLIDES + HINGE.replace("/>", ' pos="0.1 0 0"/>')),
+        {},
+        "x, y of its hinge = 0.1 0: expected",
+    ),
+    "order": (puck(HINGE + SLIDES), {}, rf"its joints are hinge \(0 0 1\), .*: {ALONE}"),
+    "two": (puck(SLIDES), {}, rf"its joints are slide \(1 0 0\), slide \(0 1 0\): {ALONE}"),
+    "height": (puck(SLIDES + UP + HINGE), {}, rf"slide \(0 0 1\), hinge \(0 0 1\): {ALONE}"),
+    "fourth": (puck(SLIDES + HINGE + UP), {}, rf"hinge \(0 0 1\), slide \(0 0 1\): {ALONE}"),
+    "none": (puck("").replace('joint="x"', 'site="robot"'), {}, f"its joints are none: {ALONE}"),
+    "carried": (
+        puck("")
+        .replace('joint="x"', 'site="robot"')
+        .replace("<body", BASE + "<body")
+        .replace("</body>", "</body>" * 2),
+        {},
+        f"free of 'base': {ALONE}",
+    ),
     "other": (puck(more=OTHER), {}, "joint 'o' is of another body"),
     "floor": (puck(more='<geom name="floor" type="plane" size="1 1 1"/>'), {}, "leave out its floor"),
     "com": (puck(), {"observe_com": True}, "it has no sensor 'subtreecom'"),
