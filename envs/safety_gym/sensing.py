@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from jaxsafe.config import ConfigError
+
 TINY = 1e-12
 PARALLEL = 1e-6  # in float32 a ray this close to a face runs along it
 
@@ -94,6 +96,12 @@ def natural_lidar(
     rays = (level[:, None] * rotation).sum(-1)
     distances = [jnp.full((1, bins), jnp.inf)]
     for kind in sorted({*shapes.kind[shapes.group == group]}):  # all of a kind at once
+        if kind not in HITS:
+            name = mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_").lower()
+            raise ConfigError(
+                f"env.lidar_type=natural: a geom of group {group}, which a lidar observes, is of type "
+                f"{name}: expected plane, sphere, capsule, cylinder or box; pseudo takes any"
+            )
         which = np.flatnonzero((shapes.group == group) & (shapes.kind == kind))
         hit = jax.vmap(functools.partial(HITS[int(kind)], slack=slack), (0, None, None))
 

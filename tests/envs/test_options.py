@@ -377,6 +377,13 @@ OFF = {
     ),
     "other": (puck(more=OTHER), {}, "joint 'o' is of another body"),
     "floor": (puck(more='<geom name="floor" type="plane" size="1 1 1"/>'), {}, "leave out its floor"),
+    "egg": (
+        puck().replace(
+            "<site", '<body name="egg"><geom type="ellipsoid" size="0.1 0.1 0.2"/></body><site'
+        ),
+        {"lidar_type": "natural"},
+        "a geom of group 0, which a lidar observes, is of type ellipsoid: expected plane, sphere",
+    ),
     "com": (puck(), {"observe_com": True}, "it has no sensor 'subtreecom'"),
 }
 
