@@ -8,6 +8,8 @@ which draws the arrays over it.
 
 import dataclasses
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -155,10 +157,33 @@ def build(cfg: SafetyGymConfig, mjx: bool = False, drawn: bool = False) -> Scene
             the contacts of `mjx_limits` only.
         drawn: add what only rendering needs (light, cameras, colours, the gremlins' guides).
     Raises:
-        ConfigError: an unknown robot, sensor or body; for engine `jax`, a pillar with its cap in reach.
+        ConfigError: an unknown robot, sensor or body; a robot that does not fit; for engine `jax`, a
+            pillar with its cap in reach.
     """
     spec, robot = read_robot(cfg)
     check_robot(cfg, robot)
+    with in_one_line(cfg):
+        model = add_task(spec, robot, cfg, mjx, drawn)
+    orbit = np.zeros(model.nmocap)
+    orbit[: cfg.gremlins_num] = cfg.gremlins_travel
+    return Scene(
+        spec=spec,
+        model=model,
+        planar=bool(robot.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE),
+        robot_height=float(robot.body("robot").pos[2]),
+        robot_nq=robot.nq,
+        robot_nv=robot.nv,
+        frees={"vases": cfg.vases_num, "gremlins": cfg.gremlins_num, "box": int(cfg.task == "push")},
+        mocaps={kind: getattr(cfg, f"{kind}_num") for kind in MOCAPS},
+        orbit=orbit,
+        watched=watched_bodies(cfg),
+    )
+
+
+def add_task(
+    spec: mujoco.MjSpec, robot: mujoco.MjModel, cfg: SafetyGymConfig, mjx: bool, drawn: bool
+) -> mujoco.MjModel:
+    """Add to the robot what `build` says, and compile it all."""
     half = max(map(abs, cfg.placements_extents)) + 0.1 if cfg.floor_display_mode else 3.5
     fixed = OBJECT | ({"contype": 0} if mjx else {})
     floor = spec.worldbody.add_geom(
@@ -183,34 +208,29 @@ def build(cfg: SafetyGymConfig, mjx: bool = False, drawn: bool = False) -> Scene
     if mjx:
         for name, value in mjx_limits(cfg, robot).items():
             spec.add_numeric(name=name, data=[value], size=1)
-    model = spec.compile()
-    orbit = np.zeros(model.nmocap)
-    orbit[: cfg.gremlins_num] = cfg.gremlins_travel
-    return Scene(
-        spec=spec,
-        model=model,
-        planar=bool(robot.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE),
-        robot_height=float(robot.body("robot").pos[2]),
-        robot_nq=robot.nq,
-        robot_nv=robot.nv,
-        frees={"vases": cfg.vases_num, "gremlins": cfg.gremlins_num, "box": int(cfg.task == "push")},
-        mocaps={kind: getattr(cfg, f"{kind}_num") for kind in MOCAPS},
-        orbit=orbit,
-        watched=watched_bodies(cfg),
-    )
+    return spec.compile()
 
 
 def read_robot(cfg: SafetyGymConfig) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
     """The robot's file, and the robot alone, compiled."""
     path = robot_file(cfg.robot_base)
-    try:
+    with in_one_line(cfg):
         spec = mujoco.MjSpec.from_file(str(path))
         robot = spec.compile()
-    except ValueError as error:
-        raise ConfigError(f"env.robot_base={cfg.robot_base!r}: {str(error).splitlines()[0]}") from error
     if spec.body("robot") is None or not any(site.name == "robot" for site in spec.sites):
         raise ConfigError(f"env.robot_base={cfg.robot_base!r}: it has no body and site named 'robot'")
     return spec, robot
+
+
+@contextmanager
+def in_one_line(cfg: SafetyGymConfig) -> Iterator[None]:
+    """What MuJoCo refuses of the robot's file, as a `ConfigError`."""
+    try:
+        yield
+    except ConfigError:
+        raise
+    except ValueError as error:
+        raise ConfigError(f"env.robot_base={cfg.robot_base!r}: {str(error).splitlines()[0]}") from error
 
 
 def check_pillars(cfg: SafetyGymConfig, robot: mujoco.MjModel) -> None:

@@ -377,6 +377,11 @@ OFF = {
     ),
     "other": (puck(more=OTHER), {}, "joint 'o' is of another body"),
     "floor": (puck(more='<geom name="floor" type="plane" size="1 1 1"/>'), {}, "leave out its floor"),
+    "named": (
+        puck(more='<geom name="pillar0" size="0.1"/>'),
+        {"pillars_num": 1},
+        "repeated name 'pillar0' in geom",
+    ),
     "egg": (
         puck().replace(
             "<site", '<body name="egg"><geom type="ellipsoid" size="0.1 0.1 0.2"/></body><site'
