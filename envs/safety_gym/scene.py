@@ -339,6 +339,12 @@ def check_robot(cfg: SafetyGymConfig, robot: mujoco.MjModel) -> None:
             f"env.robot_base={cfg.robot_base!r}: its joints are {', '.join(joints) or 'none'}: "
             f"expected of body 'robot' free, or {', '.join(PLANAR)} alone"
         )
+    if robot.nmocap:
+        name = robot.body(int(np.flatnonzero(robot.body_mocapid >= 0)[0])).name
+        raise ConfigError(
+            f"env.robot_base={cfg.robot_base!r}: body {name!r} is a mocap body: expected none, for the "
+            "task has its own"
+        )
     if any(robot.geom(i).name == "floor" for i in range(robot.ngeom)):
         raise ConfigError(f"env.robot_base={cfg.robot_base!r}: leave out its floor, the task has one")
     for i in np.flatnonzero(robot.actuator_ctrllimited == 0):

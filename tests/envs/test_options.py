@@ -377,6 +377,7 @@ OFF = {
     ),
     "other": (puck(more=OTHER), {}, "joint 'o' is of another body"),
     "floor": (puck(more='<geom name="floor" type="plane" size="1 1 1"/>'), {}, "leave out its floor"),
+    "mocap": (puck(more='<body name="m" mocap="true"/>'), {}, "body 'm' is a mocap body"),
     "named": (
         puck(more='<geom name="pillar0" size="0.1"/>'),
         {"pillars_num": 1},
