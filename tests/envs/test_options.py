@@ -390,6 +390,8 @@ OFF = {
         {"lidar_type": "natural"},
         "a geom of group 0, which a lidar observes, is of type ellipsoid: expected plane, sphere",
     ),
+    "run": (puck(), {"task": "x"}, "no sensor 'subtreecom', which env.task=x"),
+    "circle": (puck(), {"task": "circle"}, "no sensor 'subtreecom', which env.task=circle"),
     "com": (puck(), {"observe_com": True}, "it has no sensor 'subtreecom'"),
 }
 
