@@ -126,9 +126,8 @@ class OnPolicyConfig(EncoderConfig):
     # Whether `reward_normalize` also takes the mean from rewards, as OmniSafe's does. That changes what
     # is best where episodes can fail: one that fails no longer loses the rewards of the rest.
     reward_centre: bool = False
-    cost_centre: bool = (
-        False  # Whether `cost_normalize` also takes the mean from costs. OmniSafe's does.
-    )
+    # Whether `cost_normalize` also takes the mean from costs. OmniSafe's does.
+    cost_centre: bool = False
     # Weight of the policy's entropy, which is added to what the policy maximises.
     entropy_coef: Weight = 0.0
     entropy_decay: bool = False  # Whether entropy_coef falls on a line to 0 at `total_iterations`.
