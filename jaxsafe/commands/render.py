@@ -6,7 +6,7 @@ from pathlib import Path
 from jaxsafe.commands import viewing
 from jaxsafe.commands.guard import guarded
 from jaxsafe.config import ConfigError
-from jaxsafe.report.film import check_one_task, check_suffix, check_video, film, labels
+from jaxsafe.report.film import check_one_task, check_video, film, labels
 from jaxsafe.run.policies import CODE
 
 
@@ -32,10 +32,9 @@ def command() -> int:
         raise ConfigError(f"{what.options[0]}: expected a run folder too")
     several = len(folders) > 1
     out = args.out or (Path("compared.mp4") if several else folders[0] / "video.mp4")
-    check_suffix(out)
+    check_video(out)
     policies = what.policies(args.index)
     check_one_task(folders, policies)
-    check_video(out)  # makes its folder
     names = labels(folders, [policy.settings.algo_name for policy in policies]) if several else None
     task = policies[0].settings.env_name
     print(f"filming {len(policies)} x 1 episode of {task} ...", file=sys.stderr)

@@ -18,19 +18,15 @@ class NoVideo(RuntimeError):
     """Nothing to render with. The message is one line for the user."""
 
 
-def check_suffix(path: Path) -> None:
+def check_video(path: Path) -> None:
+    """Raise ConfigError where no film could be written. Makes no folder."""
     if path.suffix not in (".mp4", ".gif"):
         raise ConfigError(f"{path}: expected a name that ends in .mp4 or .gif")
-
-
-def check_video(path: Path) -> None:
-    """Make the folder of a film. Raise ConfigError where none could be written."""
-    check_suffix(path)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}") from error
-    if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
+    place = path.absolute()
+    there = next(part for part in (place, *place.parents) if os.path.exists(part))
+    if there != place and not there.is_dir():
+        raise ConfigError(f"{path}: {there} is not a folder")
+    if path.is_dir() or not os.access(there, os.W_OK):
         raise ConfigError(f"{path} cannot be written")
 
 

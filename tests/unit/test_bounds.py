@@ -217,13 +217,15 @@ def test_a_wrong_number_of_another_command_is_one_line(line, capsys):
 def test_where_a_film_goes_is_looked_at_before_any_run_is_opened(tmp_path, capsys):
     (tmp_path / "file").write_text("")
     for out, says in (
-        ("file/x.mp4", "File exists"),
+        ("file/x.mp4", "is not a folder"),
         (".", "ends in .mp4"),
         ("folder.mp4", "cannot"),
+        ("new/x.mp4", "no config.yaml"),
     ):
         (tmp_path / "folder.mp4").mkdir(exist_ok=True)
         assert typed("render", str(tmp_path), "--out", str(tmp_path / out)) == 2
         assert says in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
 
 
 # ---- mutations ---------------------------------------------------------------------------------
