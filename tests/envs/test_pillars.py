@@ -13,7 +13,7 @@ from mujoco.mjx.third_party import mujoco_warp
 from jaxsafe import envs
 from jaxsafe.config import ConfigError
 from jaxsafe.envs.engines.jax import contacts as jax_contacts
-from jaxsafe.envs.engines.warp import pillars as warp_pillars
+from jaxsafe.envs.engines.warp import constraints
 from jaxsafe.envs.safety_gym import scene
 
 XML = """
@@ -45,13 +45,14 @@ def by_warp(poses):
     model = mujoco.MjModel.from_xml_string(XML)
     m = mujoco_warp.put_model(model)
     d = mujoco_warp.make_data(model, nworld=len(poses), naconmax=4 * len(poses), njmax=64)
-    pillars = warp_pillars.adopt(model, m, d, ["upright", "leaning"])
-    assert pillars and pillars.pairs.numpy().tolist() == [[0, 1]]
-    assert [0, 1] not in m.nxn_geom_pair_filtered.numpy().tolist()  # no longer MuJoCo Warp's
+    found = constraints.adopt(model, m, d, ["upright", "leaning"], limits=False)
+    assert found and found.geoms.upright == 1  # the leaning one is MuJoCo Warp's
+    assert found.geoms.pairs.numpy()[1:].tolist() == [[0, 1]]
     d.qpos.assign(poses.astype(np.float32))
     mujoco_warp.kinematics(m, d)
     d.nacon.zero_()
-    pillars.contacts(len(poses))
+    d.ncollision.zero_()
+    found.find(len(poses))
     count = int(d.nacon.numpy()[0])
     return {k: getattr(d.contact, k).numpy()[:count] for k in (*FIELDS, "worldid")}
 
@@ -178,16 +179,17 @@ def test_only_pillars_and_boxes_are_taken():
         simulation = scene.build(config).simulation(config)
         model = simulation.compile(count=True)
         m = mujoco_warp.put_model(model)
-        before = m.nxn_geom_pair_filtered.numpy().tolist()
         d = mujoco_warp.make_data(model, nworld=1, naconmax=100, njmax=100)
-        pillars = warp_pillars.adopt(model, m, d, simulation.pillars)
-        after = m.nxn_geom_pair_filtered.numpy().tolist()
-        assert bool(pillars) == some
-        taken = [pair for pair in before if pair not in after]
+        found = constraints.adopt(model, m, d, simulation.pillars, limits=False)
+        assert found is not None
+        pairs = found.geoms.pairs.numpy()
+        given = m.nxn_geom_pair_filtered.numpy()  # each pair of the model is there once
+        assert sorted(map(sorted, pairs.tolist())) == sorted(map(sorted, given.tolist()))
+        taken = pairs[found.geoms.upright :]
+        assert bool(len(taken)) == some
         bodies = {frozenset(model.body(model.geom_bodyid[g]).name for g in pair) for pair in taken}
         assert all(any("pillar" in name for name in pair) for pair in bodies)
-        if pillars:
-            assert sorted(map(sorted, pillars.pairs.numpy().tolist())) == sorted(map(sorted, taken))
+        if some:
             assert {frozenset({"pillar0", "box"}), frozenset({"pillar0", "robot"})} <= bodies
 
 

@@ -1,6 +1,6 @@
 """Engine `warp`, on Warp's CPU device: the same kernels and packing as on a GPU, without its graphs."""
-# MuJoCo's bindings come without types:
-# pyright: reportAttributeAccessIssue=false
+# MuJoCo's bindings come without types, and a kernel is Warp's language in Python's syntax:
+# pyright: reportAttributeAccessIssue=false, reportIndexIssue=false
 
 import dataclasses
 
@@ -186,6 +186,149 @@ def simulated(name: str, worlds: int, **options):
     return model, m, *data
 
 
+@pytest.mark.parametrize(
+    ("name", "convex"), [("point_goal1", 1), ("ant_velocity", 0), ("halfcheetah_velocity", 0)]
+)
+def test_a_physics_step_takes_few_kernels(name, convex, monkeypatch):
+    """Of few worlds their number sets the pace."""
+    import warp as wp
+    from mujoco.mjx.third_party import mujoco_warp
+
+    from jaxsafe.envs.engines.warp import dynamics
+
+    if name.endswith("velocity"):
+        model = envs.make(name, engine="warp").model
+        m, d = mujoco_warp.put_model(model), mujoco_warp.make_data(model, nworld=2)
+    else:
+        model, m, d, _ = simulated(name, 2)
+    assert dynamics.adopt(model, m, d)
+    launched = []
+
+    def counted(launch):
+        def call(kernel, dim, *args, **settings):
+            if np.prod(dim):  # else nothing is launched
+                launched.append(kernel.key)
+            return launch(kernel, *args, dim=dim, **settings)
+
+        return call
+
+    for name in ("launch", "launch_tiled"):
+        monkeypatch.setattr(wp, name, counted(getattr(wp, name)))
+    dynamics.step(m, d)
+    assert len(launched) == (4 if d.dynamics.euler else 16), launched
+    assert len(d.dynamics.constraints.others.launches) == convex
+    launched.clear()
+    dynamics.forward(m, d)  # and one for all sensors
+    assert len(launched) == 4 + bool(model.nsensor), launched
+
+
+SENSED = """
+<mujoco>
+  <option magnetic="1 2 3"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="5 5 1"/>
+    <body name="trunk" pos="0 0 .3">
+      <freejoint/><geom type="box" size=".2 .1 .1"/><site name="chest" pos=".1 0 .05" euler="10 20 30"/>
+      <body name="leg" pos="0 0 -.1">
+        <joint name="knee" type="ball"/><geom type="capsule" fromto="0 0 0 0 .1 -.1" size=".05"/>
+        <body name="foot" pos="0 .1 -.1">
+          <joint name="ankle" axis="1 0 0"/><geom type="sphere" size=".1" condim="CONDIM"/>
+          <site name="sole" pos="0 0 -.05" type="sphere" size=".06"/>
+          <site name="heel" pos="0 .2 0" type="box" size=".06 .06 .06"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <sensor>
+    <jointpos joint="ankle"/><jointvel joint="ankle"/><ballquat joint="knee"/><ballangvel joint="knee"/>
+    <velocimeter site="chest"/><gyro site="sole"/><magnetometer site="chest"/>
+    <accelerometer site="sole"/><accelerometer site="chest"/><touch site="sole"/><touch site="heel"/>
+    <contact body1="trunk" body2="world" data="found"/>
+  </sensor>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize("condim", [1, 4])
+def test_sensors_read_what_mujocos_read(condim):
+    """Of a robot that falls on its foot, which is pressed, turns and slides."""
+    from mujoco.mjx.third_party import mujoco_warp
+
+    from jaxsafe.envs.engines.warp import dynamics
+
+    spec = mujoco.MjSpec.from_string(SENSED.replace("CONDIM", str(condim)))
+    contact = spec.sensors[-1]
+    contact.objtype, contact.reftype = mujoco.mjtObj.mjOBJ_XBODY, mujoco.mjtObj.mjOBJ_BODY
+    model = spec.compile()
+    m, d = mujoco_warp.put_model(model), mujoco_warp.make_data(model, nworld=2, nconmax=20, njmax=80)
+    assert dynamics.adopt(model, m, d) and d.dynamics.sensors
+    c, touched = mujoco.MjData(model), np.zeros(3)
+    c.qvel[:] = np.random.default_rng(1).normal(size=model.nv)
+    for _ in range(250):
+        mujoco.mj_step(model, c)
+        for k in ("qpos", "qvel", "qacc_warmstart"):
+            getattr(d, k).assign(np.tile(getattr(c, k), (2, 1)))
+        mujoco.mj_forward(model, c)
+        dynamics.forward(m, d)
+        found, right = d.sensordata.numpy()[1], c.sensordata
+        np.testing.assert_allclose(found, right, rtol=2e-3, atol=2e-3 * (1 + np.abs(right).max()))
+        touched = np.maximum(touched, right[-3:])
+    assert touched[0] > 1 and touched[1] == 0 and touched[2] >= 1
+
+
+LIMITS = """
+<mujoco>
+  <option timestep="0.005"/>
+  <worldbody>
+    <body pos="0 0 1">
+      <joint name="a" axis="0 1 0" limited="true" range="-20 30" solreflimit=".03 1"/>
+      <geom type="capsule" fromto="0 0 0 .3 0 0" size=".05" contype="0" conaffinity="0"/>
+      <body pos=".3 0 0">
+        <joint name="b" type="slide" axis="1 0 0" limited="true" range="-.1 .02" margin=".01"/>
+        <joint name="c" axis="0 1 0" limited="true" range="-40 40" solimplimit=".8 .95 .01 .5 2"/>
+        <geom type="capsule" fromto="0 0 0 .3 0 0" size=".05" contype="0" conaffinity="0"/>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def test_joints_stop_at_their_limits_as_mujocos(lanes):
+    from mujoco.mjx.third_party import mujoco_warp
+
+    from jaxsafe.envs.engines.warp import dynamics
+
+    model = compiled(LIMITS)
+    m, d = mujoco_warp.put_model(model), mujoco_warp.make_data(model, nworld=3, njmax=8)
+    assert dynamics.adopt(model, m, d) and not d.dynamics.plain_rows
+    rng, counts = np.random.default_rng(0), set()
+    states = [mujoco.MjData(model) for _ in range(3)]
+    for _ in range(20):
+        for c in states:
+            c.qpos[:], c.qvel[:] = rng.uniform(-0.9, 0.9, 3), rng.normal(size=3)
+            c.qpos[1] /= 5
+            mujoco.mj_forward(model, c)
+        d.qpos.assign(np.array([c.qpos for c in states]))
+        d.qvel.assign(np.array([c.qvel for c in states]))
+        dynamics.forward(m, d)
+        for world, c in enumerate(states):
+            rows = d.nefc.numpy()[world]
+            assert rows == c.nefc == d.nl.numpy()[world]
+            counts.add(int(rows))
+            if not rows:
+                continue
+            dofs = np.abs(d.efc.J.numpy()[world, :rows]).argmax(1)  # in any order
+            theirs = np.abs(c.efc_J.reshape(rows, 3)).argmax(1)
+            for k in ("D", "aref", "J"):
+                right = getattr(c, f"efc_{k}").reshape(rows, -1)[theirs.argsort()]
+                found = getattr(d.efc, k).numpy()[world, :rows].reshape(rows, -1)[dofs.argsort()]
+                np.testing.assert_allclose(found[:, : right.shape[1]], right, rtol=1e-4, atol=1e-5)
+            scale = 1e-3 * (1 + np.abs(c.qacc).max())
+            np.testing.assert_allclose(d.qacc.numpy()[world], c.qacc, atol=scale)
+    assert counts == {0, 1, 2, 3}
+
+
 WRITTEN = (  # by the dynamics, for what comes after them
     "xpos", "xquat", "xmat", "geom_xpos", "geom_xmat", "site_xpos", "site_xmat", "cinert", "cvel",
     "cdof", "cdof_dot", "M", "qfrc_smooth", "subtree_com",
@@ -196,18 +339,16 @@ WRITTEN = (  # by the dynamics, for what comes after them
 def test_the_dynamics_are_mujocos(name, lanes):
     """All that the dynamics write, and steps, from states on the way of one that tumbles."""
     from mujoco.mjx.third_party import mujoco_warp
-    from mujoco.mjx.third_party.mujoco_warp._src.forward import euler
 
     from jaxsafe.envs.engines.warp import dynamics
 
     worlds = 9  # not a multiple of those that share a block
     model, m, theirs, ours = simulated(name, worlds)
     assert dynamics.adopt(model, m, ours) and dynamics.solver.adopt(model, m, theirs)
-    ours.dynamics.pillars = None  # whose contacts `theirs` does not get: they left the model's list
     rng = np.random.default_rng(0)
     theirs.qvel.assign(rng.normal(size=(worlds, model.nv)))
     roots = np.unique(model.body_rootid[1:])
-    for _ in range(6):
+    for step in range(6):
         theirs.ctrl.assign(rng.uniform(-1.5, 1.5, size=(worlds, model.nu)))
         if model.nmocap:
             theirs.mocap_pos.assign(rng.normal(size=(worlds, model.nmocap, 3)))
@@ -223,15 +364,31 @@ def test_the_dynamics_are_mujocos(name, lanes):
         assert np.abs(ours.sensordata.numpy() - theirs.sensordata.numpy()).max() < 0.01 * (
             1 + np.abs(theirs.sensordata.numpy()).max()
         )
-        # Euler's step from the same accelerations
-        for k in ("qacc", "qfrc_constraint"):
-            getattr(ours, k).assign(getattr(theirs, k).numpy().copy())
-        ours.efc.Ma.assign(theirs.efc.Ma.numpy().copy())
-        euler(m, theirs)
-        dynamics.advance(m, ours, *ours.dynamics.stages)
-        for k in ("qpos", "qvel", "qacc_warmstart", "time"):
-            a, b = getattr(ours, k).numpy(), getattr(theirs, k).numpy()
-            assert np.abs(a - b).max() < 2e-6 * np.abs(b).max(), k
+        # Euler's step
+        begin = {k: getattr(ours, k).numpy().astype(float) for k in ("qpos", "qvel")}
+        dynamics.step(m, ours)
+        for world in range(worlds):
+            qpos, qvel = begin["qpos"][world], begin["qvel"][world]
+            damping = model.opt.timestep * np.diag(model.dof_damping)
+            rate = ours.qacc.numpy()[world].astype(float)
+            if damping.any():
+                rate = np.linalg.solve(mass(model, qpos) + damping, ours.efc.Ma.numpy()[world])
+            qvel += model.opt.timestep * rate
+            mujoco.mj_integratePos(model, qpos, qvel, model.opt.timestep)
+            for k, b in (("qpos", qpos), ("qvel", qvel)):
+                assert np.abs(getattr(ours, k).numpy()[world] - b).max() < 5e-6 * np.abs(b).max(), k
+        np.testing.assert_array_equal(ours.qacc_warmstart.numpy(), ours.qacc.numpy())
+        np.testing.assert_allclose(ours.time.numpy(), (step + 1) * model.opt.timestep, rtol=1e-6)
+        mujoco_warp.step(m, theirs)
+
+
+def mass(model, qpos):
+    """M at a state, by MuJoCo."""
+    data, full = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+    data.qpos[:] = qpos
+    mujoco.mj_forward(model, data)
+    mujoco.mj_fullM(model, data, full)
+    return full
 
 
 def test_the_dynamics_are_for_every_task():
@@ -407,3 +564,36 @@ def test_the_solver_stops_where_numbers_have_ended():
     solver.solve(m, d)
     assert np.isnan(d.qacc.numpy()[0]).any() and d.solver_niter.numpy()[0] < 3
     np.testing.assert_allclose(d.qacc.numpy()[1], right[1], rtol=1e-3, atol=1e-3)
+
+
+def test_a_recording_repeats_what_was_launched_on_zeros_and_leaves_other_threads_alone():
+    import threading
+
+    import warp as wp
+
+    from jaxsafe.envs.engines.warp.recording import Recording
+
+    @wp.kernel
+    def add(given: wp.array[float], total: wp.array[float]):
+        i = wp.tid()
+        total[i] = total[i] + given[i]
+
+    given, beside, found = wp.ones(3, dtype=float), wp.zeros(3, dtype=float), []
+
+    def call():
+        total = wp.zeros(3, dtype=float)
+        found.append(total)
+        for _ in range(2):
+            wp.launch(add, 3, inputs=[given], outputs=[total])
+        wp.launch(add, 0, inputs=[given], outputs=[total])
+        other = threading.Thread(target=wp.launch, args=(add, 3, [given], [beside]))
+        other.start()
+        other.join()
+
+    launch = wp.launch
+    recording = Recording(call)
+    assert wp.launch is launch and len(recording.launches) == 2 and len(recording.zeros) == 1
+    assert found[0].numpy().tolist() == [0, 0, 0] and beside.numpy().tolist() == [1, 1, 1]
+    for _ in range(3):
+        recording.repeat()
+    assert found[0].numpy().tolist() == [2, 2, 2]

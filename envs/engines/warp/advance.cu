@@ -1,9 +1,9 @@
 // A step from the accelerations of a forward pass: the body of a function in dynamics.py, after lanes.cu.
-// DAMPED and STAGE are constants, p, world and lane its arguments.
+// DAMPED and EULER are constants, p, stage, world and lane its arguments.
 //
-// STAGE -1: Euler's step, semi-implicit; if DAMPED the forces of dampers are taken at its end.
-// STAGE 0 to 3: one of the four of Runge and Kutta. Each of the first three goes from the start to where
-// the next forward pass looks; the last goes from the start to the end, by the mean of all.
+// EULER: a semi-implicit step; if DAMPED the forces of dampers are taken at its end.
+// Else stage 0 to 3 is one of the four of Runge and Kutta. Each of the first three goes from the start to
+// where the next forward pass looks; the last goes from the start to the end, by the mean of all.
 
 #if defined(__CUDA_ARCH__)
 __shared__ float M[DAMPED ? NV * N : 1], v[NV];
@@ -11,9 +11,9 @@ __shared__ float M[DAMPED ? NV * N : 1], v[NV];
 static float M[DAMPED ? NV * N : 1], v[NV];
 #endif
 
-constexpr bool EULER = STAGE < 0, FIRST = STAGE == 0, LAST = EULER || STAGE == 3;
-constexpr float WEIGHT = FIRST || STAGE == 3 ? 1.0f / 6.0f : 1.0f / 3.0f;
-const float h = p.timestep.data[0] * (STAGE == 0 || STAGE == 1 ? 0.5f : 1.0f);  // how far to go
+const bool first = stage == 0, last = EULER || stage == 3;
+const float weight = first || last ? 1.0f / 6.0f : 1.0f / 3.0f;
+const float h = p.timestep.data[0] * (EULER || stage > 1 ? 1.0f : 0.5f);  // how far to go
 const float *qacc = row_of(p.qacc), *Ma = row_of(p.Ma);
 float change[OWN], H[OWN][N];  // of the velocity, per second
 for (int s = 0; s < OWN; ++s) {
@@ -43,18 +43,18 @@ for (int s = 0; s < OWN; ++s) {
     } else {
         float &start = row_of(p.start_qvel)[j], &rate = row_of(p.mean_qvel)[j];
         float& rise = row_of(p.mean_qacc)[j];
-        if (FIRST) start = now;
-        rate = (FIRST ? 0.0f : rate) + WEIGHT * now;
-        rise = (FIRST ? 0.0f : rise) + WEIGHT * change[s];
-        v[j] = LAST ? rate : now;
-        now = start + h * (LAST ? rise : change[s]);
+        if (first) start = now;
+        rate = (first ? 0.0f : rate) + weight * now;
+        rise = (first ? 0.0f : rise) + weight * change[s];
+        v[j] = last ? rate : now;
+        now = start + h * (last ? rise : change[s]);
     }
-    if (LAST) row_of(p.qacc_warmstart)[j] = qacc[j];
+    if (last) row_of(p.qacc_warmstart)[j] = qacc[j];
 }
 float* qpos = row_of(p.qpos);
 if (!EULER) {
     float* start = row_of(p.start_qpos);
-    for (int i = lane; i < p.start_qpos.shape[1]; i += LANES) (FIRST ? start : qpos)[i] = (FIRST ? qpos : start)[i];
+    for (int i = lane; i < p.start_qpos.shape[1]; i += LANES) (first ? start : qpos)[i] = (first ? qpos : start)[i];
 }
 sync();
 
@@ -84,7 +84,7 @@ for (int j = lane; j < p.jnt_type.shape[0]; j += LANES) {
     }
 }
 if (lane == 0) {
-    if (LAST) p.time.data[world] += h;
+    if (last) p.time.data[world] += h;
     if (p.nefc.data[world] > p.rows) p.overflow.data[world] |= NO_NEFC;
     if (p.ncollision.data[0] > p.contacts) p.overflow.data[world] |= NO_BROADPHASE;
     if (p.nacon.data[0] > p.contacts) p.overflow.data[world] |= NO_NARROWPHASE;

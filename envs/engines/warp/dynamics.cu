@@ -14,6 +14,11 @@ auto sync = [] { WP_TILE_SYNC(); };
 
 const int lane = thread % LANES, world = block * WORLDS + thread / LANES;
 if (world >= p.qpos.shape[0]) return;
+if (lane == 0) {  // nothing constrains yet
+    p.ne.data[world] = p.nf.data[world] = p.nl.data[world] = p.nefc.data[world] = 0;
+    p.count.data[world] = 0;
+    if (world == 0) p.nacon.data[0] = p.ncollision.data[0] = 0;
+}
 
 struct Quat { float w, x, y, z; };
 struct Motion { wp::vec3 turn, move; };  // also a force: torque, force

@@ -1,10 +1,14 @@
-"""A physics step of engine `warp` in a dozen kernels: one for the dynamics, one to integrate.
+"""A physics step of engine `warp` in four kernels, and one or two for each kind of convex collision.
 
-MuJoCo Warp takes some 50 kernels of a few microseconds each to get from positions and velocities to the
-forces without constraints, for robots of 4 to 30 bodies. Here that is one kernel, in which 8, 16 or 32
-threads share a world and keep what they compute in shared memory, and one more moves the state on.
-Between them collisions are MuJoCo Warp's, but for `pillars.py`. Plain constraint rows are MuJoCo Warp's
-too. The solver is `solver.py`.
+    dynamics      from positions and velocities to the forces without constraints: dynamics.cu
+    constraints   where geoms touch, and limits of joints: constraints.py
+    lists         of the contacts of each world: solver.py
+    end           accelerations by the solver, and with them the next state: newton.cu, advance.cu
+
+With a few thousand worlds or fewer the number of kernels sets the pace. MuJoCo Warp takes some 50 of a
+few microseconds each for the first alone, for robots of 4 to 30 bodies. Here 8, 16 or 32 threads share
+a world and keep what they compute in shared memory. Equalities, dry friction, limits of ball joints and
+collisions of meshes and of convex shapes without a formula are MuJoCo Warp's. Sensors are `sensors.py`.
 
 Of `Data` only what later kernels and this project read is written: no `qacc_smooth`, no parts of
 `qfrc_smooth`, no inertial frames, cameras, lights or energy. A pass whose sensors read more is MuJoCo
@@ -22,6 +26,7 @@ Source: MuJoCo's documentation, Computation; Featherstone (2008), Rigid Body Dyn
 import dataclasses
 import functools
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +35,9 @@ import numpy as np
 import warp as wp
 from mujoco.mjx.third_party import mujoco_warp
 
-from jaxsafe.envs.engines.warp import pillars, solver
-from jaxsafe.envs.engines.warp.solver import THREADS, threads
+from jaxsafe.envs.engines.warp import constraints, sensors, solver
+from jaxsafe.envs.engines.warp.recording import Recording
+from jaxsafe.envs.engines.warp.solver import REGISTERS, THREADS, Problem, threads
 
 EULER, RK4 = mujoco_warp.IntegratorType.EULER, mujoco_warp.IntegratorType.RK4
 SHARED_MEMORY = 47 * 1024  # bytes of a block; Warp takes one more KiB
@@ -54,7 +60,11 @@ READABLE = [  # sensors that need nothing which is not written
         "JOINTLIMITVEL", "JOINTLIMITFRC", "GEOMDIST", "GEOMNORMAL", "GEOMFROMTO", "CONTACT", "CLOCK",
     )
 ]  # fmt: skip
+OF_LIMITS = [
+    int(getattr(mujoco.mjtSensor, f"mjSENS_JOINTLIMIT{what}")) for what in ("POS", "VEL", "FRC")
+]
 UNWRITTEN = {"qfrc_actuator", "cfrc_ext"}  # fields that are not written
+STAY = wp.constant(-1)  # no stage of the integrator
 
 
 @wp.struct
@@ -146,7 +156,11 @@ class System:
     start_qvel: wp.array2d[float]
     mean_qvel: wp.array2d[float]
     mean_qacc: wp.array2d[float]
+    ne: wp.array[int]
+    nf: wp.array[int]
+    nl: wp.array[int]
     nefc: wp.array[int]
+    count: wp.array[int]  # of the solver: contacts
     nacon: wp.array[int]
     ncollision: wp.array[int]
     overflow: wp.array[int]
@@ -181,16 +195,20 @@ def dynamics_kernel(
 
 
 @functools.cache
-def advance_kernel(nv: int, damped: bool, stage: int, lanes: int) -> Any:
-    sizes = f"NV = {nv}, DAMPED = {int(damped)}, STAGE = {stage}, LANES = {lanes}"
+def end_kernel(nv: int, room: int, damped: bool, euler: bool, lanes: int) -> Any:
+    """Of a pass: the solver, and unless `stage` is STAY a stage of the integrator."""
+    sizes = f"NV = {nv}, DAMPED = {int(damped)}, EULER = {int(euler)}, LANES = {lanes}"
+    newton = solver.newton_function(nv, room, lanes)
 
     @wp.func_native(f"constexpr int {sizes};\n{ENUMS}{LANES}{ADVANCE}")
-    def advance(p: System, world: int, lane: int): ...
+    def advance(p: System, stage: int, world: int, lane: int): ...
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def kernel(p: System):
+    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=REGISTERS)
+    def kernel(problem: Problem, p: System, stage: int):
         world, lane = wp.tid()
-        advance(p, world, lane)
+        newton(problem, world, lane)
+        if stage != STAY:
+            advance(p, stage, world, lane)
 
     return kernel
 
@@ -203,9 +221,11 @@ class Plan:
     sizes: tuple[int, int, int, int]  # bodies, joints, degrees of freedom, actuators
     fluid: bool
     damped: bool  # whether a step takes the forces of dampers at its end
-    stages: tuple[int, ...]  # of the integrator, as advance.cu counts them
+    euler: bool
+    plain_rows: Recording | None  # MuJoCo Warp's kernels for them; None: there are only limits of ours
     readable: bool  # whether its sensors, and the fields asked for, need nothing else
-    pillars: pillars.Pillars | None
+    constraints: constraints.Constraints | None  # None: contacts are MuJoCo Warp's
+    sensors: sensors.Reader | None  # None: they are MuJoCo Warp's
 
 
 def tree(model: mujoco.MjModel) -> dict[str, np.ndarray]:
@@ -253,7 +273,8 @@ def uncovered(model: mujoco.MjModel, m: Any, d: Any) -> list[str]:
     thrusters = on_site & (bias == bias_type.NONE)
     linear = (motors | thrusters).all() and (model.actuator_gaintype == gain_type.FIXED).all()
     shared = 4 * shared_size(*sizes_of(model)) * (THREADS // lanes_of(sizes_of(model)))
-    batched = [getattr(m, name) for name in System.vars if hasattr(m, name)]
+    names = (*System.vars, *constraints.Joints.vars)
+    batched = [getattr(m, name) for name in names if hasattr(m, name)]
     batched = [x for x in batched if x.ndim == 2]
     batched += [m.opt.gravity, m.opt.density, m.opt.viscosity, m.opt.wind]
     stiff = m.jnt_stiffness.numpy()[0, turns].any()
@@ -310,14 +331,21 @@ def adopt(
     for name in ("start_qpos", "start_qvel", "mean_qvel", "mean_qacc"):
         shape = (d.nworld, model.nq if name == "start_qpos" else model.nv)
         setattr(p, name, wp.zeros(shape if four else (0, 0), dtype=float, device=d.qacc.device))
+    p.count = d.newton.count
+    others = model.neq or m.dof_frictionloss.numpy().any() or m.jnt_limited_ball_adr.size
+    others = bool(others or np.isin(model.sensor_type, OF_LIMITS).any())
+    found = constraints.adopt(model, m, d, upright, limits=not others)
+    theirs = others or (found is None and m.jnt_limited_slide_hinge_adr.size > 0)
     d.dynamics = Plan(
         system=p,
         sizes=sizes_of(model),
         fluid=m.has_fluid,
         damped=not four and bool(m.dof_damping.numpy().any()),
-        stages=(0, 1, 2, 3) if four else (-1,),
+        euler=not four,
+        plain_rows=Recording(partial(solver.plain_rows, m, d)) if theirs else None,
         readable=bool(np.isin(model.sensor_type, READABLE).all()) and UNWRITTEN.isdisjoint(fields),
-        pillars=pillars.adopt(model, m, d, upright),
+        constraints=found,
+        sensors=sensors.adopt(model, m, d, p.body_deepest),
     )
     return True
 
@@ -333,49 +361,60 @@ def lanes_of(sizes: tuple[int, ...]) -> int:
 def forward(m: Any, d: Any) -> None:
     """In place of MuJoCo Warp's, for data that was adopted."""
     plan = getattr(d, "dynamics", None)
-    sensors = not m.opt.disableflags & mujoco_warp.DisableBit.SENSOR
-    if plan is None or (sensors and not plan.readable):
+    see = not m.opt.disableflags & mujoco_warp.DisableBit.SENSOR
+    if plan is None or (see and not plan.readable):
         mujoco_warp.forward(m, d)
         return
-    lanes = min(threads(d), lanes_of(plan.sizes))
-    worlds = threads(d) // lanes  # of a block
-    wp.launch_tiled(
-        dynamics_kernel(*plan.sizes, plan.fluid, lanes, worlds),
-        dim=-(-d.nworld // worlds),
-        inputs=[plan.system, sensors],
-        block_dim=threads(d),
-    )
-    mujoco_warp.collision(m, d)
-    if plan.pillars:
-        plan.pillars.contacts(d.nworld)
-    solver.make_constraint(m, d)
-    if sensors:
+    until_solved(m, d, see)
+    if see and not plan.sensors:
         d.sensordata.zero_()
         mujoco_warp.sensor_pos(m, d)
         mujoco_warp.sensor_vel(m, d)
-    solver.solve(m, d)
-    if sensors:
+    end(m, d, STAY)
+    if see and plan.sensors:
+        plan.sensors.read(d.nworld)
+    elif see:
         if m.sensor_rne_postconstraint:
             mujoco_warp.rne_postconstraint(m, d)
         mujoco_warp.sensor_acc(m, d, skip_rne_postconstraint=True)
 
 
 def step(m: Any, d: Any) -> None:
-    """In place of MuJoCo Warp's, for data that was adopted."""
+    """In place of MuJoCo Warp's, for data that was adopted. Sensors are not read."""
     if getattr(d, "dynamics", None) is None:
         mujoco_warp.step(m, d)
         return
-    for stage in d.dynamics.stages:
-        forward(m, d)
-        advance(m, d, stage)
+    for stage in range(1 if d.dynamics.euler else 4):
+        until_solved(m, d, False)
+        end(m, d, stage)
 
 
-def advance(m: Any, d: Any, stage: int) -> None:
-    """A stage of the integrator, from the accelerations of `forward`: see advance.cu."""
+def until_solved(m: Any, d: Any, for_sensors: bool) -> None:
+    """All of a pass that comes before the solver."""
     plan = d.dynamics
+    lanes = min(threads(d), lanes_of(plan.sizes))
+    worlds = threads(d) // lanes  # of a block
     wp.launch_tiled(
-        advance_kernel(m.nv, plan.damped, stage, threads(d)),
-        dim=d.nworld,
-        inputs=[plan.system],
+        dynamics_kernel(*plan.sizes, plan.fluid, lanes, worlds),
+        dim=-(-d.nworld // worlds),
+        inputs=[plan.system, for_sensors],
         block_dim=threads(d),
+    )
+    if plan.plain_rows:
+        plan.plain_rows.repeat()
+    if plan.constraints:
+        plan.constraints.find(d.nworld)
+    else:
+        mujoco_warp.collision(m, d)
+    solver.list_contacts(m, d)
+
+
+def end(m: Any, d: Any, stage: int) -> None:
+    """The solver, and a stage of the integrator, as advance.cu counts them, or STAY."""
+    plan, lanes = d.dynamics, threads(d)
+    wp.launch_tiled(
+        end_kernel(m.nv, d.newton.listed.shape[1], plan.damped, plan.euler, lanes),
+        dim=d.nworld,
+        inputs=[solver.problem(m, d), plan.system, stage],
+        block_dim=lanes,
     )

@@ -18,6 +18,7 @@ from typing import Any
 
 import jax
 import mujoco
+import numpy as np
 import warp as wp
 from mujoco.mjx.third_party import mujoco_warp
 from mujoco.mjx.third_party.mujoco_warp._src import (
@@ -100,39 +101,73 @@ def hold(substeps: wp.array2d[float], k: int, before: wp.array2d[float], after: 
         after[world, column] = before[world, column]
 
 
+@wp.struct
+class Column:
+    """Where a number of each world is: in the first world, and how far from world to world, bytes."""
+
+    address: wp.uint64
+    stride: int
+
+
+@wp.func_native("return *(const float*)(address + (uint64_t)world * stride);")
+def number(address: wp.uint64, stride: int, world: int) -> float: ...
+
+
+@wp.func_native("*(float*)(address + (uint64_t)world * stride) = value;")
+def put(address: wp.uint64, stride: int, world: int, value: float): ...
+
+
 @wp.kernel
-def flag(
+def unpack_rows(rows: wp.array2d[float], columns: wp.array[Column], overflow: wp.array[int]):
+    """From packed rows to the working data. The last column is none of it: there flags are cleared."""
+    world, i = wp.tid()
+    if i == columns.shape[0]:
+        overflow[world] = 0
+    else:
+        put(columns[i].address, columns[i].stride, world, rows[world, i])
+
+
+@wp.kernel
+def pack_rows(
+    columns: wp.array[Column],
     overflow: wp.array[int],
     mask: int,
     nacon: wp.array[int],
     ncollision: wp.array[int],
     contacts: int,
     nefc: wp.array[int],
-    rows: int,
-    out: wp.array2d[float],
+    room: int,
+    rows: wp.array2d[float],
 ):
-    """1 where a substep set a bit of `mask`, or the last forward pass, which sets none, had no room."""
-    world = wp.tid()
-    full = (overflow[world] & mask) != 0 or nefc[world] > rows
-    if full or nacon[0] > contacts or ncollision[0] > contacts:
-        out[world, 0] = 1.0
-    else:
-        out[world, 0] = 0.0
+    """From the working data to packed rows. In the last column 1 where a substep set a bit of `mask`,
+    or the last forward pass, which sets none, had no room."""
+    world, i = wp.tid()
+    if i < columns.shape[0]:
+        rows[world, i] = number(columns[i].address, columns[i].stride, world)
+        return
+    full = (overflow[world] & mask) != 0 or nefc[world] > room
+    rows[world, i] = wp.where(full or nacon[0] > contacts or ncollision[0] > contacts, 1.0, 0.0)
 
 
 Kind = mujoco_warp.OverflowType
 NO_ROOM = int(
     Kind.NEFC | Kind.NJMAX_NNZ | Kind.BROADPHASE | Kind.NARROWPHASE | Kind.CCD | Kind.CONTACT_MATCH
 )
+CLOCK = ("done", "substeps")  # the last columns that go in
 FEW_WORLDS = 128  # contacts more: the average of few worlds varies
 # Several devices call from several threads; on a CPU the memory that lanes share is the kernel's.
 one_at_a_time = threading.Lock()
 
 
-def floats(x: wp.array) -> wp.array:
-    """A view of `x` [worlds, n], of floats, vectors or matrices, as floats [worlds, m]."""
-    width = x.size * wp.types.type_size(x.dtype) // x.shape[0]
-    return wp.array(ptr=x.ptr, dtype=float, shape=(x.shape[0], width), device=x.device)
+def columns_of(arrays: list[wp.array]) -> wp.array:
+    """The columns of arrays [worlds, n], of floats, vectors or matrices."""
+    found = []
+    for x in arrays:
+        start = x.ptr or 0  # None, of no columns
+        for k in range(x.size * wp.types.type_size(x.dtype) // x.shape[0]):
+            found.append((start + 4 * k, x.strides[0]))
+    table = np.array(found, dtype=Column.numpy_dtype())
+    return wp.array(table, dtype=Column, device=arrays[0].device)
 
 
 @dataclasses.dataclass
@@ -144,7 +179,9 @@ class Worlds:
     data: Any
     orbits: wp.array  # [nmocap], m
     into: wp.array  # [worlds, columns]
+    given: wp.array  # where all but the last of these columns go: `done` and `substeps` stay
     out: wp.array
+    wanted: wp.array  # where all but the last of these columns come from
     graphs: dict[int, Any]  # by the number of substeps
 
 
@@ -210,7 +247,9 @@ class Kernels:
             data=data,
             orbits=wp.array(self.orbits, dtype=float),
             into=wp.zeros((worlds, sum(self.inputs.values())), dtype=float),
+            given=columns_of([getattr(data, name) for name in self.inputs if name not in CLOCK]),
             out=wp.zeros((worlds, sum(self.results.values())), dtype=float),
+            wanted=columns_of([getattr(data, name) for name in self.results if name != "overflow"]),
             graphs={},
         )
 
@@ -235,16 +274,13 @@ class Kernels:
     def advance(self, w: Worlds, substeps: int) -> None:
         """From the rows in `w.into` to those in `w.out`."""
         data = w.data
-        given = {name: w.into[:, where] for name, where in columns(self.inputs).items()}
-        wanted = {name: w.out[:, where] for name, where in columns(self.results).items()}
-        for name, column in given.items():
-            if column.size and name not in ("done", "substeps"):
-                wp.copy(floats(getattr(data, name)), column)
-        data.overflow.zero_()
+        done, taken = (w.into[:, columns(self.inputs)[name]] for name in CLOCK)
+        width = (data.nworld, len(w.given) + 1)
+        wp.launch(unpack_rows, width, inputs=[w.into, w.given], outputs=[data.overflow])
         base = wp.clone(data.mocap_pos) if self.orbits.any() else None
         for k in range(substeps):
             if base is not None:
-                clock = [given["done"], given["substeps"], self.model.opt.timestep, k]
+                clock = [done, taken, self.model.opt.timestep, k]
                 wp.launch(
                     go_round,
                     dim=base.shape,
@@ -257,13 +293,13 @@ class Kernels:
             step(w.blind, data)
             for name, old in before.items():
                 new = getattr(data, name)
-                wp.launch(hold, new.shape, inputs=[given["substeps"], k, old], outputs=[new])
+                wp.launch(hold, new.shape, inputs=[taken, k, old], outputs=[new])
         forward(w.model, data)
-        full = wanted.pop("overflow")
         wp.launch(
-            flag,
-            data.nworld,
+            pack_rows,
+            w.out.shape,
             inputs=[
+                w.wanted,
                 data.overflow,
                 NO_ROOM,
                 data.nacon,
@@ -272,8 +308,5 @@ class Kernels:
                 data.nefc,
                 data.njmax,
             ],
-            outputs=[full],
+            outputs=[w.out],
         )
-        for name, column in wanted.items():
-            if column.size:
-                wp.copy(column, floats(getattr(data, name)))

@@ -13,21 +13,14 @@ A pillar is an upright cylinder of a mocap body, with ends out of the boxes' rea
 # pyright: reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false
 # pyright: reportInvalidTypeForm=false
 
-import dataclasses
 from collections.abc import Sequence
-from typing import Any
 
 import mujoco
 import numpy as np
 import warp as wp
 from mujoco.mjx.third_party import mujoco_warp
-from mujoco.mjx.third_party.mujoco_warp._src.collision_core import (
-    contact_material_params,
-    write_contact,
-)
-from mujoco.mjx.third_party.mujoco_warp._src.math import make_frame
 
-vec5 = wp.types.vector(length=5, dtype=float)
+CYLINDER, BOX = int(mujoco_warp.GeomType.CYLINDER), int(mujoco_warp.GeomType.BOX)
 FLAT = wp.constant(0.02)  # rad that a side may lean and still lie flat
 TINY = wp.constant(1e-6)  # m, an edge whose shadow is a point
 
@@ -119,128 +112,13 @@ def touch(
     return wp.vec2(dist, dist), wp.vec2(height, height), normal, False
 
 
-@wp.struct
-class Geoms:
-    """The model's fields that say where geoms are and what they are made of."""
-
-    geom_size: wp.array2d[wp.vec3]
-    geom_condim: wp.array[int]
-    geom_priority: wp.array[int]
-    geom_solmix: wp.array2d[float]
-    geom_solref: wp.array2d[wp.vec2]
-    geom_solimp: wp.array2d[vec5]
-    geom_friction: wp.array2d[wp.vec3]
-    geom_adhesion: wp.array2d[float]
-    pair_dim: wp.array[int]
-    pair_solref: wp.array2d[wp.vec2]
-    pair_solreffriction: wp.array2d[wp.vec2]
-    pair_solimp: wp.array2d[vec5]
-    pair_adhesion: wp.array2d[float]
-    pair_friction: wp.array2d[vec5]
-    geom_xpos: wp.array2d[wp.vec3]
-    geom_xmat: wp.array2d[wp.mat33]
-
-
-@wp.struct
-class Contacts:
-    """The list of contacts of all worlds, and how many it has room for."""
-
-    dist: wp.array[float]
-    pos: wp.array[wp.vec3]
-    frame: wp.array[wp.mat33]
-    includemargin: wp.array[float]
-    friction: wp.array[vec5]
-    solref: wp.array[wp.vec2]
-    solreffriction: wp.array[wp.vec2]
-    solimp: wp.array[vec5]
-    dim: wp.array[int]
-    geom: wp.array[wp.vec2i]
-    efc_address: wp.array2d[int]
-    worldid: wp.array[int]
-    type: wp.array[int]
-    geomcollisionid: wp.array[int]
-    adhesion: wp.array[float]
-    count: wp.array[int]
-    room: int
-
-
-@wp.kernel(enable_backward=False)
-def pillar_contacts(pairs: wp.array[wp.vec2i], m: Geoms, out: Contacts):
-    world, i = wp.tid()
-    pair = pairs[i]
-    pillar = m.geom_xpos[world, pair[0]]
-    shape = m.geom_size[world % m.geom_size.shape[0], pair[0]]
-    at, axes = m.geom_xpos[world, pair[1]], m.geom_xmat[world, pair[1]]
-    size = m.geom_size[world % m.geom_size.shape[0], pair[1]]
-    far = shape[0] + wp.length(size)
-    if wp.length_sq(wp.vec2(pillar[0] - at[0], pillar[1] - at[1])) > far * far:
-        return
-    tall = shape[1] + wp.dot(wp.abs(axes[2]), size)
-    if wp.abs(pillar[2] - at[2]) > tall:
-        return
-    dists, heights, n, flat = touch(pillar, shape[0], at, axes, size)
-    deepest = wp.where(dists[0] < dists[1], 0, 1)
-    if dists[deepest] >= 0.0:
-        return
-    condim, friction, solref, solreffriction, solimp, adhesion = contact_material_params(
-        m.geom_condim, m.geom_priority, m.geom_solmix, m.geom_solref, m.geom_solimp, m.geom_friction,
-        m.geom_adhesion, m.pair_dim, m.pair_solref, m.pair_solreffriction, m.pair_solimp,
-        m.pair_adhesion, m.pair_friction, pair, -1, world,
-    )  # fmt: skip
-    frame = make_frame(-n)
-    for k in range(wp.where(flat, 2, 1)):
-        end = wp.where(dists[k] < 0.0, k, deepest)  # of a side that leans MuJoCo has one end twice
-        back = shape[0] + 0.5 * dists[end]
-        pos = wp.vec3(pillar[0] - back * n[0], pillar[1] - back * n[1], heights[end])
-        write_contact(
-            out.room, k, dists[end], pos, frame, 0.0, 0.0, condim, friction, solref, solreffriction,
-            solimp, adhesion, pair, wp.vec2i(-1, -1), world, out.dist, out.pos, out.frame,
-            out.includemargin, out.friction, out.solref, out.solreffriction, out.solimp, out.dim,
-            out.geom, out.efc_address, out.worldid, out.type, out.geomcollisionid, out.adhesion,
-            out.count,
-        )  # fmt: skip
-
-
-@dataclasses.dataclass
-class Pillars:
-    """Launches the kernel for one `Data`."""
-
-    pairs: wp.array
-    geoms: Any
-    out: Any
-
-    def contacts(self, worlds: int) -> None:
-        inputs = [self.pairs, self.geoms, self.out]
-        wp.launch(pillar_contacts, (worlds, len(self.pairs)), inputs=inputs)
-
-
-def adopt(model: mujoco.MjModel, m: Any, d: Any, upright: Sequence[str]) -> Pillars | None:
-    """Take pairs of a box and a pillar from MuJoCo Warp; None: there are none.
-
-    Args:
-        model: what `m` and `d` were made of.
-        upright: the names of the pillars' bodies.
-    """
-    cylinder, box = (int(t) for t in (mujoco_warp.GeomType.CYLINDER, mujoco_warp.GeomType.BOX))
+def upright_pairs(model: mujoco.MjModel, pairs: np.ndarray, names: Sequence[str]) -> np.ndarray:
+    """Which of `pairs` of geoms [P, 2] are a box and an upright cylinder of `names`, bool [P]."""
     stands = (np.abs(model.geom_quat[:, 1:3]) < 1e-6).all(1)
-    named = np.isin(model.geom_bodyid, [model.body(name).id for name in upright])
+    named = np.isin(model.geom_bodyid, [model.body(name).id for name in names])
     fixed = model.body_mocapid[model.geom_bodyid] >= 0
-    pillar = (model.geom_type == cylinder) & stands & named & fixed & (model.geom_margin == 0)
-    plain = (model.geom_type == box) & (model.geom_margin == 0)
-    given, ids = m.nxn_geom_pair_filtered.numpy(), m.nxn_pairid_filtered.numpy()
-    first, second = given.T
-    either = pillar[first] & plain[second] | plain[first] & pillar[second]
-    ours = either & (ids == -1).all(1)  # neither a pair with settings of its own nor a sensor's
-    if m.opt.broadphase != mujoco_warp.BroadphaseType.NXN or not ours.any():
-        return None
-    device = d.qacc.device
-    m.nxn_geom_pair_filtered = wp.array(given[~ours], dtype=wp.vec2i, device=device)
-    m.nxn_pairid_filtered = wp.array(ids[~ours], dtype=wp.vec2i, device=device)
-    pairs = np.where(pillar[first][:, None], given, given[:, ::-1])[ours]
-    geoms, out = Geoms(), Contacts()
-    for name in Geoms.vars:
-        setattr(geoms, name, getattr(m if hasattr(m, name) else d, name))
-    for name in Contacts.vars.keys() - {"count", "room"}:
-        setattr(out, name, getattr(d.contact, name))
-    out.count, out.room = d.nacon, d.naconmax
-    return Pillars(wp.array(pairs, dtype=wp.vec2i, device=device), geoms, out)
+    close = (model.geom_margin == 0) & (model.geom_gap == 0)
+    pillar = (model.geom_type == CYLINDER) & stands & named & fixed & close
+    box = (model.geom_type == BOX) & close
+    first, second = pairs.T
+    return pillar[first] & box[second] | box[first] & pillar[second]

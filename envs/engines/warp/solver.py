@@ -159,12 +159,18 @@ def scratch_size(nv: int, room: int) -> int:
     return room * (of_contact + of_pair) + (nv + 1) * width
 
 
-@functools.cache
-def newton_kernel(nv: int, room: int, lanes: int) -> Any:
+def newton_function(nv: int, room: int, lanes: int) -> Any:
     sizes = f"NV = {nv}, ROOM = {room}, LANES = {lanes}, SCRATCH = {scratch_size(nv, room)}"
 
     @wp.func_native(f"constexpr int {sizes};\n{SOURCE}")
     def newton(p: Problem, world: int, lane: int): ...
+
+    return newton
+
+
+@functools.cache
+def newton_kernel(nv: int, room: int, lanes: int) -> Any:
+    newton = newton_function(nv, room, lanes)
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=REGISTERS)
     def kernel(p: Problem):
@@ -246,9 +252,19 @@ def make_constraint(m: Any, d: Any) -> None:
     if work is None:
         their_constraints(m, d)
         return
-    opt = dataclasses.replace(m.opt, disableflags=m.opt.disableflags | work.never)
-    their_constraints(dataclasses.replace(m, opt=opt), d)
+    plain_rows(m, d)
     work.count.zero_()
+    list_contacts(m, d)
+
+
+def plain_rows(m: Any, d: Any) -> None:
+    opt = dataclasses.replace(m.opt, disableflags=m.opt.disableflags | d.newton.never)
+    their_constraints(dataclasses.replace(m, opt=opt), d)
+
+
+def list_contacts(m: Any, d: Any) -> None:
+    """After the plain rows, to lists that are empty."""
+    work = d.newton
     if m.opt.disableflags & (mujoco_warp.DisableBit.CONTACT | mujoco_warp.DisableBit.CONSTRAINT):
         return
     contact = d.contact
@@ -283,6 +299,14 @@ def solve(m: Any, d: Any) -> None:
     if work is None:
         theirs(m, d)
         return
+    lanes = threads(d)
+    kernel = newton_kernel(m.nv, work.listed.shape[1], lanes)
+    wp.launch_tiled(kernel, dim=d.nworld, inputs=[problem(m, d)], block_dim=lanes)
+
+
+def problem(m: Any, d: Any) -> Any:
+    """What is solved: the options of `m` as they are now, and the arrays of `d`, which was adopted."""
+    work = d.newton
     efc, contact = d.efc, d.contact
     p = Problem()
     p.iterations, p.ls_iterations = m.opt.iterations, m.opt.ls_iterations
@@ -302,6 +326,4 @@ def solve(m: Any, d: Any) -> None:
     p.address = contact.efc_address
     p.qacc, p.Ma, p.force, p.qfrc_constraint = d.qacc, efc.Ma, efc.force, d.qfrc_constraint
     p.niter, p.overflow = d.solver_niter, d.overflow
-    lanes = threads(d)
-    kernel = newton_kernel(m.nv, work.listed.shape[1], lanes)
-    wp.launch_tiled(kernel, dim=d.nworld, inputs=[p], block_dim=lanes)
+    return p
