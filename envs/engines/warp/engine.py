@@ -21,12 +21,7 @@ import mujoco
 import numpy as np
 import warp as wp
 from mujoco.mjx.third_party import mujoco_warp
-from mujoco.mjx.third_party.mujoco_warp._src import (
-    collision_primitive,
-    collision_primitive_core,
-    constraint,
-    solver,
-)
+from mujoco.mjx.third_party.mujoco_warp._src import constraint, solver
 
 from jaxsafe.envs.engines.batching import batched
 from jaxsafe.envs.engines.rows import STATE, columns, pack, unpack, widths
@@ -37,42 +32,8 @@ from jaxsafe.envs.engines.warp.solver import make_constraint, solve
 wp.config.log_level = wp.LOG_WARNING  # a line for every kernel otherwise
 
 
-@wp.func
-def plane_capsule(
-    normal: wp.vec3,
-    plane_pos: wp.vec3,
-    pos: wp.vec3,
-    axis: wp.vec3,
-    radius: float,
-    half_length: float,
-) -> tuple[wp.vec2, collision_primitive_core.mat23f, wp.mat33]:
-    """Contacts of a capsule's two ends, with the frame of MuJoCo in C.
-
-    There the first tangent is the capsule's axis, however little of it lies in the plane. MuJoCo Warp
-    takes a fixed tangent once the axis is within 30 degrees of the normal; with pyramidal friction
-    cones the tangents matter, and Doggo's legs are mostly that upright.
-    """
-    tangent = wp.normalize(axis - normal * wp.dot(normal, axis))
-    if wp.length(tangent) < 0.5:
-        tangent = wp.vec3(1.0, 0.0, 0.0)
-    other = wp.cross(normal, tangent)
-    frame = wp.mat33(
-        normal[0], normal[1], normal[2],
-        tangent[0], tangent[1], tangent[2],
-        other[0], other[1], other[2],
-    )  # fmt: skip
-    end1, end2 = pos + axis * half_length, pos - axis * half_length
-    dist1 = wp.dot(end1 - plane_pos, normal) - radius
-    dist2 = wp.dot(end2 - plane_pos, normal) - radius
-    at1 = end1 - normal * (radius + 0.5 * dist1)
-    at2 = end2 - normal * (radius + 0.5 * dist2)
-    at = collision_primitive_core.mat23f(at1[0], at1[1], at1[2], at2[0], at2[1], at2[2])
-    return wp.vec2(dist1, dist2), at, frame
-
-
-# For all users of MuJoCo Warp in the process; before Warp compiles the kernels that name the function.
-collision_primitive.plane_capsule = plane_capsule
-constraint.make_constraint, solver.solve = make_constraint, solve  # ours for data that was `adopt`ed
+# for all users of MuJoCo Warp in the process: ours for data that was `adopt`ed
+constraint.make_constraint, solver.solve = make_constraint, solve
 
 
 @wp.kernel
