@@ -39,7 +39,7 @@ def write(
     files.write(out / "results.md", text)
     latex = [f"% {line}\n" for line in remarks] + [tables.latex(t) for t in (*main, *rest)]
     files.write(out / "results.tex", "\n".join(latex))
-    files.write(out / "results.csv", as_csv(groups, both, found, pairs))
+    files.write(out / "results.csv", as_csv(groups, both, scored, found, pairs))
     plots.save(plots.learning(groups), out / "curves")
     known = {(g.env, g.name): beside(g, published) for g in groups}
     plots.save(trade_off.draw(groups, period(groups), known), out / "trade_off")

@@ -203,8 +203,8 @@ def notes(groups: Sequence[Group]) -> list[str]:
     return list(dict.fromkeys(lines))
 
 
-def as_csv(groups: Sequence[Group], s: Suite, found: Mapping, pairs: Mapping) -> str:
-    """Every estimate, a row each."""
+def as_csv(groups: Sequence[Group], both: Suite, scored: Suite, found: Mapping, pairs: Mapping) -> str:
+    """Every estimate, a row each. `found` is of the tasks in `scored`, `pairs` of those in `both`."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     by = list(groups[0].by)
@@ -215,13 +215,13 @@ def as_csv(groups: Sequence[Group], s: Suite, found: Mapping, pairs: Mapping) ->
             for kind, statistic in kinds:
                 e = g.estimate(metric, statistic)
                 writer.writerow([g.env, *g.by.values(), len(g.costs), metric, kind, *e])
-    tasks = " ".join(s.tasks)
+
+    def head(s: Suite, name: str) -> list:
+        of = s.groups[name]
+        return [" ".join(s.tasks), *of[0].by.values(), sum(len(g.costs) for g in of)]
+
     for (name, metric, kind), e in found.items():
-        values = s.groups[name][0].by.values()
-        seeds = sum(len(g.costs) for g in s.groups[name])
-        writer.writerow([tasks, *values, seeds, metric, kind, *e])
+        writer.writerow([*head(scored, name), metric, kind, *e])
     for (a, b, metric), e in pairs.items():
-        values = s.groups[a][0].by.values()
-        seeds = sum(len(g.costs) for g in s.groups[a])
-        writer.writerow([tasks, *values, seeds, metric, f"P(better than {b})", *e])
+        writer.writerow([*head(both, a), metric, f"P(better than {b})", *e])
     return out.getvalue()

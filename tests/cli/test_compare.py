@@ -453,6 +453,17 @@ def test_one_command_writes_every_table_and_figure_the_same_each_time(tmp_path, 
     assert {p.name: p.read_bytes() for p in out.iterdir()} == first
 
 
+def test_a_row_of_scores_names_the_tasks_that_have_scores_and_counts_their_seeds(tmp_path):
+    for env in ("point_goal1", "point_run"):  # the second has none
+        for algo in ("cpo", "ppo_lag"):
+            write(tmp_path / "runs" / f"{env}-{algo}", env, algo)
+    assert typed("plot", str(tmp_path / "runs"), "--out", str(tmp_path / "out")) == 0
+    rows = [*csv.DictReader(io.StringIO((tmp_path / "out" / "results.csv").read_text()))]
+    scored = {(r["task"], r["seeds"]) for r in rows if r["metric"].startswith("normalised")}
+    pairs = {(r["task"], r["seeds"]) for r in rows if r["statistic"].startswith("P(")}
+    assert scored == {("point_goal1", "2")} and pairs == {("point_goal1 point_run", "4")}
+
+
 def test_by_the_task_alone_all_its_runs_are_one_setting(tmp_path, capsys):
     for algo in ("cpo", "ppo_lag"):
         write(tmp_path / "runs" / algo, algo=algo)
