@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.text import Text
 from matplotlib.ticker import EngFormatter
 
@@ -143,7 +144,7 @@ def draw_setting(
     """The curves of one setting, `values` [S, T]. Estimates are dashed."""
     alone, few, ls = len(values) == 1, not stats.has_interval(values), "--" if estimated else "-"
     look = {"lw": 1.2 if few else 0.6, "alpha": 1 if few else 0.4, "color": color, "ls": ls}
-    lines = axes.plot(steps, values.T, **look)
+    lines = lines_or_dots(axes, steps, values.T, **look)
     label = ", ".join(filter(None, [setting, ESTIMATED * estimated]))
     if few:
         lines[0].set_label(label or ("" if alone else f"{len(values)} seeds"))
@@ -158,8 +159,17 @@ def band(
 ) -> None:
     """Mean over seeds and its 95% interval, of `values` [S, T] of `measure`."""
     e = stats.of_measure(measure, values)
-    (line,) = axes.plot(steps, e.mean, lw=2, label=label, **style)
+    (line,) = lines_or_dots(axes, steps, e.mean, lw=2, label=label, **style)
     axes.fill_between(steps, e.low, e.high, color=line.get_color(), alpha=0.2, lw=0)
+
+
+def lines_or_dots(axes: Axes, x: np.ndarray, y: np.ndarray | float, **style: Any) -> list[Line2D]:
+    """`axes.plot`, but a single point, which is no line, is a dot."""
+    lines = axes.plot(x, y, **style)
+    for line in lines:
+        if np.isfinite(np.asarray(line.get_ydata(), float)).sum() == 1:
+            line.set_marker("o")
+    return lines
 
 
 def traces(
@@ -169,7 +179,7 @@ def traces(
     if stats.has_interval(values):
         band(axes, measure, steps, values, label, **style)
         return
-    first, *_ = axes.plot(steps, values.T, lw=0.9, **style)
+    first, *_ = lines_or_dots(axes, steps, values.T, lw=0.9, **style)
     first.set_label(label)
 
 

@@ -145,6 +145,18 @@ def test_a_drawn_band_ends_where_its_measure_ends():
     assert low[0] < -1 and low[1] == 0
 
 
+@pytest.mark.parametrize("seeds", [1, 3])
+def test_a_single_point_is_a_dot_and_more_are_a_line(seeds):
+    """As of a run of one iteration, or one whose first episode ends in its last."""
+    values = np.full((seeds, 3), np.nan)
+    values[:, 2] = 1.0
+    for one, marker in ((values, "o"), (np.ones((seeds, 3)), "None")):
+        axes = Figure().subplots()
+        plots.draw_setting(axes, "train/return", np.arange(3), one, "C0", "")
+        plots.traces(axes, "train/return", np.arange(3), one, "")
+        assert {str(line.get_marker()) for line in axes.lines} == {marker}
+
+
 def test_a_figure_grows_by_a_legend_of_many_long_names():
     """Its panel keeps its height, and all of the legend is inside the figure."""
     figure, panels = plots.grid(1, size=(3.0, 3.0))
