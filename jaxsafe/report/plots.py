@@ -71,21 +71,23 @@ def curves(
     figure = Figure(figsize=(5 * len(panels), 4), layout="constrained")
     FigureCanvasAgg(figure)
     settings = run_folder.by_setting(metrics)
-    for axes, (name, label) in zip(figure.subplots(1, len(panels)), panels, strict=True):
+    for axes, (name, what) in zip(figure.subplots(1, len(panels)), panels, strict=True):
         for i, (setting, table) in enumerate(settings.items()):
-            if name in table and len(table["steps"]):
+            trained = name in table and len(table["steps"])
+            if trained:
                 column, estimated = drawn_of(table, name)
                 draw_setting(axes, name, *by_seed(table, column), f"C{i % 10}", setting, estimated)
             for end, (called, marker) in EVALUATED.items():
                 if (column := name.replace("train/", "eval/") + end) in table:
                     look = {"marker": marker, "mfc": "none" if end else None, "color": f"C{i % 10}"}
-                    axes.plot(*evaluated(table, column), ls="--", lw=1, label=called, **look)
+                    label = called if trained or not setting else f"{setting}, {called}"
+                    axes.plot(*evaluated(table, column), ls="--", lw=1, label=label, **look)
         if name in limits:
             common, column = limits[name]
             swept = {t[column][0]: i for i, t in enumerate(settings.values()) if column in t}
             for limit, i in (swept or {common: 3}).items():
                 axes.axhline(limit, color=f"C{i % 10}", ls="--", lw=1, label=f"limit {limit:g}")
-        axes.set(xlabel=axis_of(metrics), ylabel=label)
+        axes.set(xlabel=axis_of(metrics), ylabel=what)
         if axes.get_legend_handles_labels()[0]:
             axes.legend(frameon=False, fontsize="small")
     figure.suptitle(title)

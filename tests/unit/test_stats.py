@@ -157,6 +157,24 @@ def test_a_single_point_is_a_dot_and_more_are_a_line(seeds):
         assert {str(line.get_marker()) for line in axes.lines} == {marker}
 
 
+def test_evaluations_of_settings_side_by_side_are_named_where_training_has_no_episodes(
+    tmp_path, monkeypatch
+):
+    figures = []
+    monkeypatch.setattr(plots, "write", lambda figure, *_, **__: figures.append(figure))
+    rates = np.array([1.0, 2.0])
+    table = {
+        "iteration": np.ones(2), "steps": np.zeros(2), "updates": np.ones(2), "seed": np.zeros(2),
+        "algo.lr": rates, "eval/return": rates, "eval/cost": rates,
+    }  # fmt: skip
+    plots.curves(table, tmp_path / "curves.png", "", 25.0)
+    table |= {"train/return": rates, "train/cost": rates}
+    plots.curves(table, tmp_path / "curves.png", "", 25.0)
+    offline, online = (f.axes[0].get_legend_handles_labels()[1] for f in figures)
+    assert offline == [f"algo.lr={x}, evaluated, mean action" for x in (1, 2)]
+    assert online == ["algo.lr=1", "evaluated, mean action", "algo.lr=2", "evaluated, mean action"]
+
+
 def test_a_figure_grows_by_a_legend_of_many_long_names():
     """Its panel keeps its height, and all of the legend is inside the figure."""
     figure, panels = plots.grid(1, size=(3.0, 3.0))
