@@ -278,8 +278,10 @@ def write_page(study: Study) -> None:
     with files.in_turn(study.folder):
         text, pictures = page(study)
         images = files.make_folder(study.folder.parent, "images")
-        for old in images.glob(f"{study.folder.name}-*.png"):
-            old.unlink()
+        own = re.compile(rf"{re.escape(study.folder.name)}-(trade_off|curves\d+)\.png")
+        for old in images.iterdir():
+            if own.fullmatch(old.name):  # not one of a study whose name begins like this one's
+                old.unlink()
         for picture in pictures:
             save_small(picture.draw(), picture.path)
         files.write(study.folder / "README.md", text)

@@ -444,6 +444,19 @@ def test_a_page_keeps_the_words_around_its_tables(toy, tmp_path):
     assert "| `cpo` | " in text
 
 
+def test_a_page_replaces_the_pictures_of_its_study_and_no_others(toy, tmp_path):
+    trained(tmp_path / "run", toy.command(toy.runs[0]))
+    (run,) = read_one(tmp_path / "run")
+    studies.add(toy, toy.runs[0], run, study_files.Origin())
+    images = toy.folder.parent / "images"
+    images.mkdir()
+    for name in ("toy-curves9.png", "toy-trade_off.png", "toy-two-curves1.png", "toy-mine.png"):
+        (images / name).touch()
+    studies.write_page(toy)
+    kept = {path.name for path in images.iterdir()}
+    assert kept == {"toy-curves1.png", "toy-two-curves1.png", "toy-mine.png"}
+
+
 def test_failed_runs_are_kept_and_tried_again_last(toy, tmp_path, monkeypatch, capsys):
     asked: list[str] = []
 
