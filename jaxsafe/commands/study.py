@@ -114,11 +114,12 @@ def listing(study: Study, runs: Path) -> str:
 
 
 def find_study(name: str) -> Path:
-    """A folder with a study.yaml, or the name of one in docs/results."""
+    """A folder with a study.yaml, or the name of one in docs/results. Its path ends in its name, also
+    where it was given as `.`."""
     home = ROOT / "docs" / "results"
     for folder in (Path(name).expanduser(), home / name):
         if files.there(folder / "study.yaml"):
-            return folder
+            return Path(os.path.abspath(folder))
     known = sorted(path.parent.name for path in home.glob("*/study.yaml"))
     raise ConfigError(f"no study {name}{nearest(name, known)}; a new one begins with its study.yaml")
 

@@ -457,6 +457,20 @@ def test_a_page_replaces_the_pictures_of_its_study_and_no_others(toy, tmp_path):
     assert kept == {"toy-curves1.png", "toy-two-curves1.png", "toy-mine.png"}
 
 
+@pytest.mark.parametrize("where, name", [("toy", "."), ("toy/images", ".."), (".", "./toy")])
+def test_a_study_has_its_name_whichever_way_its_folder_is_given(
+    where, name, toy, tmp_path, monkeypatch
+):
+    trained(tmp_path / "run", toy.command(toy.runs[0]))
+    (run,) = read_one(tmp_path / "run")
+    studies.add(toy, toy.runs[0], run, study_files.Origin())
+    (toy.folder / "images").mkdir()
+    monkeypatch.chdir(toy.folder.parent / where)
+    assert call(monkeypatch, name, "--page") == 0
+    pictures = [path.relative_to(toy.folder.parent) for path in toy.folder.parent.rglob("*.png")]
+    assert pictures == [Path("images/toy-curves1.png")]
+
+
 def test_failed_runs_are_kept_and_tried_again_last(toy, tmp_path, monkeypatch, capsys):
     asked: list[str] = []
 
