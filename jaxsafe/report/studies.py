@@ -104,20 +104,34 @@ def read(folder: Path) -> Study:
             f"{path}: expected {', '.join(sorted(needed))} and perhaps {', '.join(sorted(more))}"
         )
     runs, printed = found["runs"], found.get("printed") or {}
-    if not isinstance(runs, list) or not all(isinstance(run, str) for run in runs):
-        raise ConfigError(f"{path}: expected runs as a list of options, as 'env=point_goal1 algo=cpo'")
+    published, ends = found.get("published"), found.get("ends")
+
+    def check(right: bool, expected: str) -> None:
+        if not right:
+            raise ConfigError(f"{path}: expected {expected}")
+
+    options = "'env=point_goal1 algo=cpo'"
+    check(isinstance(found["options"], str), f"options in one line, as {options}")
+    listed = isinstance(runs, list) and all(isinstance(run, str) and run.split() for run in runs)
+    check(listed, f"runs as a list of options, as {options}")
+    check(all(isinstance(x, str | None) for x in (published, ends)), "published and ends as file names")
+    check(isinstance(printed, dict) and all(isinstance(x, str) for x in printed.values()),
+          "printed as a text for each run")  # fmt: skip
+    try:
+        windows = [(float(begin), float(end)) for begin, end in found.get("windows") or []]
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"{path}: expected windows as [[begin, end], ...] in steps") from error
     names = [study_files.name_of(run) for run in runs]
     for name in names:
         if names.count(name) > 1:
             raise ConfigError(f"{path}: {name} occurs twice")
-    published, ends = found.get("published"), found.get("ends")
     return Study(
         folder,
         str(found["title"]),
         str(found["about"]).strip(),
-        str(found["options"]).split(),
+        found["options"].split(),
         runs,
-        [(float(begin), float(end)) for begin, end in found.get("windows") or []],
+        windows,
         folder / published if published else None,
         folder / ends if ends else None,
         printed,

@@ -510,6 +510,13 @@ def test_what_is_not_there_is_one_line_and_status_2(arguments, message, monkeypa
         ("title: Toy", "titel: Toy", "expected about, options, runs, title and perhaps"),
         ("algo=ppo_lag algo.dual_lr=0.2", "algo=cpo", "point_goal1-cpo occurs twice"),
         ("- env", "env", "cannot be read"),
+        ("options: total", "options: [a, b]\n#", "expected options in one line"),
+        ("options: total", "options:\n#", "expected options in one line"),
+        ("env=point_goal1 algo=cpo", "''", "expected runs as a list of options"),
+        ("[[1000, 2000]]", "[1000, 2000]", "expected windows as"),
+        ("[[1000, 2000]]", "[[early, late]]", "expected windows as"),
+        ("windows: [[1000, 2000]]", "printed: 9.4", "expected printed as a text for each run"),
+        ("windows: [[1000, 2000]]", "published: 3", "expected published and ends as file names"),
     ],
 )
 def test_a_study_yaml_that_says_something_else_is_refused(old, new, message, toy):
