@@ -31,6 +31,8 @@ DRAWS = 10_000  # bootstrap samples
 CONFIDENCE = 0.95
 LEAST = 3  # seeds of a task; Student's t of two is 12.7 standard errors, and says little
 DRAWN_AT_ONCE = 10_000_000  # numbers drawn at once
+# what the names of measures end in that are at most 1, beside the shares of episodes over a limit
+SHARES = ("violation rate", "override rate", "overruled", "Brier score")
 
 
 class Estimate(NamedTuple):
@@ -88,11 +90,11 @@ def of_measure(
 ) -> Estimate:
     """`estimate` of a measure with this name in tables. Its interval stops where the measure does.
 
-    The share of episodes over a limit is at most 1. Costs, rates and lengths are at least 0, unless a
-    value shows that this environment's are not.
+    Shares, as of episodes over a limit or of steps overruled, are at most 1. Costs, rates and lengths
+    are at least 0, unless a value shows that this environment's are not.
     """
     e = estimate(*samples, statistic=statistic)
-    share = name.endswith("violation rate") or " over " in name
+    share = name.endswith(SHARES) or " over " in name
     positive = share or "return" not in name
     least = 0.0 if positive and not any((x < 0).any() for x in samples) else -np.inf
     ends = np.clip(e[1:], least, 1.0 if share else np.inf)

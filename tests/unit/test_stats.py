@@ -107,6 +107,9 @@ WIDTH = 4.3026527 / 3**0.5  # half an interval's, of three seeds with a standard
     [
         ("violation rate", [0.0, 0.05, 0.1], (0.0, 0.05 + WIDTH * 0.05)),
         ("final violation rate", [0.9, 0.95, 1.0], (0.95 - WIDTH * 0.05, 1.0)),
+        ("override rate", [0.9, 0.95, 1.0], (0.95 - WIDTH * 0.05, 1.0)),
+        ("train/overruled", [0.9, 0.95, 1.0], (0.95 - WIDTH * 0.05, 1.0)),
+        ("Brier score", [0.9, 0.95, 1.0], (0.95 - WIDTH * 0.05, 1.0)),
         ("hazards over 10", [0.0, 0.5, 1.0], (0.0, 1.0)),
         ("cost", [1.0, 2.0, 3.0], (0.0, 2 + WIDTH)),
         ("cost rate", [0.0, 0.05, 0.1], (0.0, 0.05 + WIDTH * 0.05)),
