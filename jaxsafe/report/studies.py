@@ -228,7 +228,7 @@ def more_figures(
             found.setdefault(f"cost {name}", []).append(cost.mean() if len(cost) else np.nan)
             swing = spans(cost).mean(1).std() if len(cost) >= SPAN else np.nan
             found.setdefault(f"swing {name}", []).append(swing)
-        if {"train/objective_c", "train/violation"} <= part.keys() and len(part["steps"]) > 2 * SPAN:
+        if {"train/objective_c", "train/violation"} <= part.keys() and len(part["steps"]) >= 3 * SPAN:
             promise, violation = (spans(part[f"train/{k}"]) for k in ("objective_c", "violation"))
             slope = np.polyfit(promise.sum(1)[:-1], np.diff(violation.mean(1)), 1)[0]
             found.setdefault("promised", []).append(-part["train/objective_c"].mean())

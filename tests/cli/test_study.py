@@ -295,6 +295,9 @@ def test_what_a_step_promises_and_keeps_is_a_slope_by_hand():
     found = studies.more_figures(table, [])
     np.testing.assert_allclose(found["promised"], [0.18])
     np.testing.assert_allclose(found["kept"], [0.5])  # half of each promise comes true
+    # two spans have one change, which has no slope
+    short = {name: x[: 3 * studies.SPAN - 1] for name, x in table.items()}
+    assert studies.more_figures(short, []) == {}
 
 
 def test_rows_say_what_a_run_was_made_with_and_how_it_ended(toy, tmp_path):
