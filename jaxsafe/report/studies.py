@@ -223,6 +223,7 @@ def more_figures(
         for begin, end in windows:
             inside = (part["steps"] > begin) & (part["steps"] <= end)
             ret, cost = (part[f"train/{name}"][inside] for name in ("return", "cost"))
+            ret, cost = (x[np.isfinite(x)] for x in (ret, cost))  # where an episode ended
             name = window_name(begin, end)
             found.setdefault(f"return {name}", []).append(ret.mean() if len(ret) else np.nan)
             found.setdefault(f"cost {name}", []).append(cost.mean() if len(cost) else np.nan)

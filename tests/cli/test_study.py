@@ -280,6 +280,9 @@ def test_a_window_has_means_and_the_swing_of_the_cost_by_hand(toy, tmp_path):
     # costs are 21 .. 39, 0, then 1 .. 20, and so on: means of spans are 28.5 and 10.5 in turn
     np.testing.assert_allclose(found["cost 1000-2000"], [21.3, 30])
     np.testing.assert_allclose(found["swing 1000-2000"], [18 * (0.6 * 0.4) ** 0.5, 0])
+    # the first episode ends at step 50: iterations without one count for nothing
+    early = studies.more_figures(run.table, [(0, 100)])
+    np.testing.assert_allclose(early["return 0-100"], [7.5, 15])
 
 
 def test_what_a_step_promises_and_keeps_is_a_slope_by_hand():
