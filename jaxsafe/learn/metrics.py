@@ -58,7 +58,7 @@ def step_metrics(
     return {
         **episode_metrics(env, steps, axis_name),
         **world_metrics(steps.bad, axis_name),
-        "train/cost_rate": cost_rate,  # per environment step
+        "train/cost_rate": cost_rate,  # per step of the policy
         "train/cost_estimate": cost_rate * length,  # of an episode, this iteration's
         "train/return_estimate": rate(steps.reward) * length,  # likewise
     }

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from jaxsafe.envs.wrap import raw_steps
 from jaxsafe.learn.constraints import limits_of
 from jaxsafe.report import scores, stats
 from jaxsafe.report.stats import Estimate
@@ -56,7 +57,7 @@ def evaluate(
         found |= {name: x[i * seeds : (i + 1) * seeds] for name, x in examined.measures.items()}
         counts = examined.calibration
         of_risk = {} if counts is None else calibrated(counts[i * seeds : (i + 1) * seeds].sum(0))
-        rows = summary(settings.env_name, found, limits.get(""), metrics)
+        rows = summary(settings.env_name, found, limits.get(""), metrics, raw_steps(run.env))
         if settings.train.dataset is not None:
             rows |= dsrl_scores(settings.env_name, rows, limits.get(""))
             rows |= of_data(data, limits.get(""))
@@ -88,11 +89,12 @@ def summary(
     found: Mapping[str, np.ndarray],
     cost_limit: float | None,
     metrics: dict[str, np.ndarray],
+    repeat: int = 1,
 ) -> dict[str, Estimate]:
     """The rows of the table: `measures`, then the cost rate of training and normalised scores.
 
     `cost_limit` is None where named costs have limits in its place. Then there is no normalised
-    violation.
+    violation. One step of the policy has `repeat` of the environment, of which published rates are.
     """
     rows = {name: estimate_over_seeds(name, values) for name, values in found.items()}
     rate = cost_rate(metrics)
@@ -111,9 +113,8 @@ def summary(
                 violation = stats.of_measure("normalised violation", of_seeds)
             rows["normalised violation"] = violation
         if rate is not None:
-            rows["normalised cost rate"] = scaled(
-                scores.normalized_cost_rate, rows["cost rate (training)"]
-            )
+            of_raw = Estimate(*(x / repeat for x in rows["cost rate (training)"]))
+            rows["normalised cost rate"] = scaled(scores.normalized_cost_rate, of_raw)
     return rows
 
 
@@ -158,7 +159,7 @@ def estimate_over_seeds(name: str, values: np.ndarray) -> Estimate:
 
 
 def cost_rate(metrics: dict[str, np.ndarray]) -> np.ndarray | None:
-    """Safety Gym's cost rate, [S]: total training cost over total training steps; None if unknown.
+    """Total training cost over total training steps of the policy, [S]; None if unknown.
 
     `metrics` are the columns of metrics.csv.
     """

@@ -146,7 +146,8 @@ def read_one(folder: Path, extras: Extras = NO_EXTRAS) -> list[SettingRun]:
     for cfg, name, table in zip(saved.configs, names, parts, strict=False):
         limits = limits_of(cfg)
         fields = flat(saved._replace(configs=(cfg,)).plain()) | {"run_dir": str(folder)}
-        values, seeds = measured(saved.env_name, table, limits), np.unique(table["seed"])
+        values = measured(saved.env_name, table, limits, repeat_of(fields))
+        seeds = np.unique(table["seed"])
         for what, final in run_folder.read_evaluation(folder, name).items():
             if len(final) != len(seeds):
                 raise ConfigError(
@@ -169,7 +170,8 @@ def with_evaluation(run: SettingRun) -> SettingRun:
     shown = {"return", "cost", *map(cost_title, run.limits)}
     found = {name: run.values[f"final {name}"] for name in shown if f"final {name}" in run.values}
     values = run.values | found
-    return run._replace(values=values | normalised(run.env, values, run.limits), evaluated=True)
+    scored = normalised(run.env, values, run.limits, repeat_of(run.config))
+    return run._replace(values=values | scored, evaluated=True)
 
 
 def not_ended(table: Mapping[str, np.ndarray]) -> bool:
@@ -205,7 +207,7 @@ def runs_of(folder: Path, study: study_files.Condensed) -> list[SettingRun]:
         always = ("return", "cost")  # NaN where no episode was whole
         figures = [k for k in study.figures() if k in always or any(row[k] for row in of_run)]
         values = {k: np.array([float(row[k] or "nan") for row in of_run]) for k in figures}
-        values |= normalised(env, values, limits)
+        values |= normalised(env, values, limits, repeat_of(config))
         clock = "updates" if config.get("dataset") else "steps"  # learning from a data set takes none
         table = study_files.table(of_run, [curves[run, row["seed"]] for row in of_run], clock)
         seeds = np.array([float(row["seed"]) for row in of_run])
@@ -234,7 +236,7 @@ def defaults(env: str, algo: str, preset: str = "fast", compat: str = "none") ->
 
 
 def measured(
-    env: str, table: Mapping[str, np.ndarray], limits: Mapping[str, float]
+    env: str, table: Mapping[str, np.ndarray], limits: Mapping[str, float], repeat: int = 1
 ) -> dict[str, np.ndarray]:
     """What is known of each seed, [S], from the columns of metrics.csv.
 
@@ -242,6 +244,7 @@ def measured(
         env: the task, for its characteristic scores.
         table: the columns.
         limits: by the name of a cost; '' is the name of `cost`.
+        repeat: steps of the environment in one of the policy.
 
     Return and cost are the learner's estimates where no episode has ended. What sampled actions make in
     the end is known of a run with `eval_every`.
@@ -272,13 +275,22 @@ def measured(
         column = table.get(f"eval/{what}_sampled", unknown)
         if np.isfinite(last := column[table["iteration"] == table["iteration"].max()]).all():
             values[f"final sampled {what}"] = last
-    return values | normalised(env, values, limits)
+    return values | normalised(env, values, limits, repeat)
+
+
+def repeat_of(config: Mapping[str, Any]) -> int:
+    """Steps of the environment in one of the policy."""
+    return config.get("env.wrap.action_repeat", 1)
 
 
 def normalised(
-    env: str, values: Mapping[str, np.ndarray], limits: Mapping[str, float]
+    env: str, values: Mapping[str, np.ndarray], limits: Mapping[str, float], repeat: int
 ) -> dict[str, np.ndarray]:
-    """Safety Gym's normalised scores of each seed, as far as there are any, [S]."""
+    """Safety Gym's normalised scores of each seed, as far as there are any, [S].
+
+    A cost rate is of the policy's steps, and the published one of the environment's. One step of the
+    policy has `repeat` of these.
+    """
     if env not in scores.CHARACTERISTIC:
         return {}
     found = {"normalised return": scores.normalized_return(env, values["return"])}
@@ -286,7 +298,7 @@ def normalised(
         excess = scores.normalized_violation(env, values["cost"], limits[""])
         found["normalised violation"] = excess
     if "cost rate" in values:
-        found["normalised cost rate"] = scores.normalized_cost_rate(env, values["cost rate"])
+        found["normalised cost rate"] = scores.normalized_cost_rate(env, values["cost rate"] / repeat)
     return found
 
 

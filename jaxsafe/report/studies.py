@@ -37,7 +37,7 @@ from jaxsafe.report import plots, scores, stats, study_files, tables, trade_off
 from jaxsafe.report.group import LATE, Group, group, tasks_of, telling
 from jaxsafe.report.looks import styles
 from jaxsafe.report.published import Published, beside, end_beside, read_ends, read_published
-from jaxsafe.report.read import SettingRun, defaults, with_evaluation
+from jaxsafe.report.read import SettingRun, defaults, repeat_of, with_evaluation
 from jaxsafe.report.read import read as read_runs
 from jaxsafe.report.study_files import CURVES, POINTS, Origin
 from jaxsafe.run import files, run_folder
@@ -521,7 +521,7 @@ def cost_so_far(run: SettingRun, steps: np.ndarray) -> np.ndarray:
     for row, seed in zip(found, run.seeds, strict=True):
         of_seed = run.table["seed"] == seed
         at, rate = run.table["steps"][of_seed], run.table["train/cost_rate"][of_seed]
-        taken = np.diff(at, prepend=0) / run.config.get("env.wrap.action_repeat", 1)
+        taken = np.diff(at, prepend=0) / repeat_of(run.config)
         # a row's rate is of the steps up to it; stretches without a row have that of the row before
         late = int(np.isnan(rate).argmin())  # stretches before the first row
         sums = np.cumsum(np.append(rate[late:], np.repeat(rate[-1], late)) * taken)

@@ -14,6 +14,7 @@ from jaxsafe import algos, envs
 from jaxsafe.config import ConfigError
 from jaxsafe.report import (
     comparison_tables,
+    evaluation,
     group,
     looks,
     plots,
@@ -24,7 +25,6 @@ from jaxsafe.report import (
     tables,
     trade_off,
 )
-from jaxsafe.report.evaluation import as_json
 from jaxsafe.report.published import Published, beside, end_beside, read_ends, read_published
 from jaxsafe.report.stats import Estimate
 from jaxsafe.run import run_folder
@@ -95,6 +95,20 @@ def test_what_is_known_of_each_seed_by_hand(tmp_path):
         np.testing.assert_allclose(run.values[name], values, rtol=1e-6, err_msg=name)
 
 
+def test_a_published_cost_rate_is_of_steps_of_the_environment(tmp_path):
+    """With an action repeated five times, a step of the policy has five of these."""
+    folder = write(tmp_path / "a")
+    config = run_folder.read_config(folder)
+    config["env"]["wrap"] = {"action_repeat": 5}
+    run_folder.write_config(folder, config)
+    (run,) = runs_in(folder)
+    expected = 0.105 / 5 / scores.CHARACTERISTIC["point_goal1"].cost_rate
+    np.testing.assert_allclose(run.values["normalised cost rate"], expected, rtol=1e-6)
+    found = {"return": np.zeros((2, 2)), "cost": np.zeros((2, 2))}
+    rows = evaluation.summary("point_goal1", found, 25.0, run.table, 5)
+    assert rows["normalised cost rate"].mean == pytest.approx(expected)
+
+
 def test_costs_under_limits_of_their_own_violate_when_one_of_them_does():
     table = {
         "iteration": np.array([1.0, 1.0]), "steps": np.array([1.0, 1.0]), "seed": np.array([0.0, 1.0]),
@@ -109,7 +123,7 @@ def test_costs_under_limits_of_their_own_violate_when_one_of_them_does():
 
 def test_evaluations_of_each_seed_join_in_where_the_run_has_them(tmp_path):
     a, b = write(tmp_path / "a"), write(tmp_path / "b", seeds=(2, 3))
-    rows = as_json({"return": Estimate(6.0, 5.0, float("nan"))})
+    rows = evaluation.as_json({"return": Estimate(6.0, 5.0, float("nan"))})
     assert rows == {"return": {"mean": 6.0, "low": 5.0, "high": None}}
     (a / "evaluation.json").write_text(json.dumps(rows | {"seeds": {"return": [5.0, 7.0]}}))
     # as earlier versions wrote it
