@@ -102,7 +102,11 @@ def strip(player: Player, episode: Episode, step: int, steps: int, key: jax.Arra
 
     Raises:
         ConfigError: the policy sees no pictures.
+        ValueError: the episode has fewer observations after `step`.
     """
+    left = len(episode.action) - 1 - step  # what its last action led to was not observed
+    if steps > left:
+        raise ValueError(f"steps={steps}: expected at most {left}, which the episode has after {step}")
     shown = slice(step, step + steps + 1)
     obs, latent = jax.tree.map(lambda x: x[shown], (episode.state.obs, episode.latent))
     if not isinstance(obs, dict):

@@ -82,6 +82,9 @@ def test_a_strip_has_true_and_imagined_frames_of_the_same_steps_below_each_other
     found = dreams.strip(player, episode, 3, 2, jax.random.key(0))
     assert found.shape == (6, 6, 3) and found.dtype == np.uint8
     np.testing.assert_array_equal(found[::2, ::2, 0], [[3, 4, 5], [3, 4, 5], [3, 5, 7]])
+    assert dreams.strip(player, episode, 6, 2, jax.random.key(0)).shape == (6, 6, 3)
+    with pytest.raises(ValueError, match="steps=3: expected at most 2, which the episode has after 6"):
+        dreams.strip(player, episode, 6, 3, jax.random.key(0))
     blind: Any = SimpleNamespace(state=SimpleNamespace(obs=t), latent=Latent(t, t), action=t)
     with pytest.raises(ConfigError, match="sees no pictures"):
         dreams.strip(player, blind, 3, 2, jax.random.key(0))
