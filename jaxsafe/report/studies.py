@@ -328,7 +328,10 @@ def page(study: Study) -> tuple[str, list[Picture]]:
         "runs": lambda: run_table(study, runs, known),
     }
     made = {name: make() for name, make in makers.items() if f"<!-- measured: {name} -->" in text}
-    return tables.between_marks(text, made, "measured"), pictures
+    try:
+        return tables.between_marks(text, made, "measured"), pictures
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
 
 
 def in_order(study: Study, runs: Sequence[SettingRun]) -> list[Group]:

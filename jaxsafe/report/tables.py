@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxsafe.config import ConfigError
 from jaxsafe.report.stats import Estimate
 
 # What LaTeX reads otherwise; the rest of Unicode that is used here it reads as it is.
@@ -69,13 +70,13 @@ def between_marks(text: str, written: Mapping[str, str], mark: str = "table") ->
     """`text` with these parts between the lines <!-- MARK: NAME --> and <!-- end -->.
 
     Raises:
-        ValueError: a name has no such lines.
+        ConfigError: a name has no such lines.
     """
     for name, part in written.items():
         begin, end = f"<!-- {mark}: {name} -->\n", "<!-- end -->"
         before, begun, rest = text.partition(begin)
         _, ended, after = rest.partition(end)
         if not (begun and ended):
-            raise ValueError(f"no {begin.strip()} with {end} after it")
+            raise ConfigError(f"no {begin.strip()} with {end} after it")
         text = before + begin + part + "\n" + end + after
     return text

@@ -448,6 +448,11 @@ def test_a_page_keeps_the_words_around_its_tables(toy, tmp_path):
     text = page.read_text()
     assert text.startswith("# Mine\n\nbefore\n") and text.endswith("\n\nafter\n") and "old" not in text
     assert "| `cpo` | " in text
+    page.write_text("<!-- measured: matrix -->\nold\n")
+    with pytest.raises(
+        ConfigError, match=r"README\.md: no <!-- measured: matrix --> with <!-- end -->"
+    ):
+        studies.write_page(toy)
 
 
 def test_a_page_replaces_the_pictures_of_its_study_and_no_others(toy, tmp_path):
