@@ -5,8 +5,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from jaxsafe.config import ConfigError, one_line
+from jaxsafe.config import ConfigError
 from jaxsafe.report.group import Group
+from jaxsafe.run import files
 
 PUBLISHED = ("task", "algo", "source", "return", "return_std", "cost", "cost_std", "cost_limit")
 
@@ -35,39 +36,33 @@ class CurveEnd(NamedTuple):
 def read_published(path: Path) -> dict[tuple[str, str], Published]:
     """Published figures by task and algorithm, from a CSV with the columns of `PUBLISHED`, and `rules`
     where a task has others in `env.rules=safety_gym` and `safety_gymnasium`."""
-    try:
-        with path.open(newline="") as file:
-            rows = list(csv.DictReader(file))
+    found: dict[tuple[str, str], Published] = {}
+    with files.reading(path), path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
         missing = [name for name in PUBLISHED if not rows or name not in rows[0]]
         if missing:
             raise ConfigError(f"{path} has no column {missing[0]}; expected {', '.join(PUBLISHED)}")
-        found = {}
         for row in rows:
             ret, ret_std, cost, cost_std, limit = (float(row[name]) for name in PUBLISHED[3:])
-            figures = Published(
+            key = row["task"], row["algo"]
+            if key in found:
+                raise ConfigError(f"{path}: {' '.join(key)} occurs twice")
+            found[key] = Published(
                 (ret, ret_std), (cost, cost_std), limit, row["source"], row.get("rules") or ""
             )
-            found[row["task"], row["algo"]] = figures
-    except ConfigError:
-        raise
-    except (OSError, ValueError, TypeError) as error:
-        raise ConfigError(f"{path} cannot be read: {one_line(error)}") from error
     return found
 
 
 def read_ends(path: Path) -> dict[tuple[str, str], CurveEnd]:
     """Where published curves end, by task and algorithm, from a CSV with the columns env, algo, steps,
     return and cost."""
-    try:
-        with path.open(newline="") as file:
-            return {
-                (row["env"], row["algo"]): CurveEnd(
-                    *(float(row[name] or "nan") for name in ("steps", "return", "cost"))
-                )
-                for row in csv.DictReader(file)
-            }
-    except (OSError, ValueError, KeyError) as error:
-        raise ConfigError(f"{path} cannot be read: {one_line(error)}") from error
+    with files.reading(path), path.open(newline="") as file:
+        return {
+            (row["env"], row["algo"]): CurveEnd(
+                *(float(row[name] or "nan") for name in ("steps", "return", "cost"))
+            )
+            for row in csv.DictReader(file)
+        }
 
 
 def end_beside(

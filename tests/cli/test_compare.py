@@ -503,6 +503,8 @@ BAD = {
     "runs --by cost_limit": "unknown field cost_limit; did you mean 'algo.cost_limit'?",
     "runs --published none.csv": "none.csv cannot be read",
     "runs --published bad.csv": "bad.csv has no column algo; expected task, algo, source",
+    "runs --published quote.csv": "quote.csv cannot be read: field larger than field limit",
+    "runs --published twice.csv": "twice.csv: point_goal1 cpo occurs twice",
     "runs --published words.csv": "words.csv cannot be read: could not convert string to float: 'many'",
     "runs --out runs/a/config.yaml": "--out runs/a/config.yaml: File exists",
     "runs --out /proc/here": "--out /proc/here: No such file or directory",
@@ -530,6 +532,8 @@ def test_bad_input_is_one_line_and_status_2(arguments, tmp_path, monkeypatch, ca
     write(Path("torn"))
     Path("torn/metrics.csv").write_text("iteration,steps\n1,many\n")
     Path("bad.csv").write_text("task,return\npoint_goal1,3\n")
+    Path("quote.csv").write_text(f'{HEADER}"{200_000 * "x"}')
+    Path("twice.csv").write_text(HEADER + 2 * "point_goal1,cpo,Peer,1,1,1,1,25\n")
     Path("words.csv").write_text(f"{HEADER}point_goal1,cpo,Peer,many,1,1,1,25\n")
     assert typed("plot", *arguments.split()) == 2
     lines = capsys.readouterr().err.splitlines()
