@@ -89,7 +89,8 @@ def draw_panel(axes: Axes, points: Sequence[Point]) -> None:
     chains = in_chains(points)
     points = [p for chain in chains for p in chain]
     most = cut(points)
-    axes.set(**frames(points, most))
+    # None would hold an axis at 0 to 1, wherever the points lie
+    axes.set(**{name: ends for name, ends in frames(points, most).items() if ends})
     for chain in chains:
         draw_chain(axes, chain, most)
     if limits := {p.limit for p in points if p.swept}:

@@ -305,6 +305,13 @@ def test_the_frame_of_a_trade_off_holds_every_seed_and_cuts_wide_intervals(tmp_p
     assert plots.frame([3.0, np.nan, 3.0]) is None
 
 
+def test_a_lone_seed_is_inside_its_trade_off(tmp_path):
+    write(tmp_path / "a", returns=(5.0,), costs=(25.0,), seeds=(0,))  # at the limit
+    axes = trade_off.draw(compared(tmp_path / "a"), "").axes[0]
+    assert axes.get_xlim()[0] < 25 < axes.get_xlim()[1]
+    assert axes.get_ylim()[0] < 5 < axes.get_ylim()[1]
+
+
 def in_the_legend(figure: Any) -> list[str]:
     return [text.get_text() for text in figure.legends[0].get_texts()]
 
