@@ -160,8 +160,9 @@ def read_one(folder: Path, extras: Extras = NO_EXTRAS) -> list[SettingRun]:
 
 
 def or_evaluated(run: SettingRun) -> SettingRun:
-    """`with_evaluation` where training has no episodes, else the run."""
-    known = "final return" in run.values and not np.isfinite(run.values["return"]).any()
+    """`with_evaluation` where training has no episodes, else the run. What was evaluated on the way, in
+    some runs and not in others, stands in where there is no final evaluation."""
+    known = "final return" in run.values
     return run if run.clock == "steps" or not known else with_evaluation(run)
 
 

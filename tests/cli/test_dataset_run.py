@@ -154,8 +154,11 @@ def test_a_sweep_falls_back_on_the_evaluation_of_a_named_cost_too(whole):
     assert np.isnan(read.measured("toys", run.table, run.limits)["return"]).all()
     found = read.or_evaluated(run)
     assert found.evaluated and found.values["cost wall"].tolist() == [1, 1]
+    watched = run._replace(values=run.values | {"return": np.zeros(2), "cost": np.zeros(2)})
     for name in ("return", "cost"):
         np.testing.assert_array_equal(found.values[name], run.values[f"final {name}"])
+        # what `eval_every` evaluated is not compared with the final evaluation of other runs
+        assert read.or_evaluated(watched).values[name] is run.values[f"final {name}"]
 
 
 def test_evaluation_during_training_stands_in_for_its_episodes(data, tmp_path):
