@@ -498,7 +498,7 @@ def measured(name: str) -> str:
         how += f", {steps:,} steps" if (steps := int(run.config["total_steps"])) != 10_000_000 else ""
         unusual = {k: v for k, v in studies.unusual(run.config).items() if k.startswith("algo.")}
         how += "".join(f", `{k}={v}`" for k, v in unusual.items())
-        rows.append(f"| {how} | {ret} | {cost} | {studies.published_cell(run.config, known)} |")
+        rows.append(f"| {how} | {ret} | {cost} | {studies.published_cell(run, known)} |")
     found = [study for study in OTHERS if name in algos_of(study)]
     if not rows and found:
         return f"[Its runs](../results/{found[0]}/README.md)."

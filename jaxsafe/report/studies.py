@@ -555,7 +555,7 @@ def run_table(
         odd = ", ".join(sorted(states[text] - {"done"}))
         cells = [f"{words}{f' ({odd})' if odd else ''}", str(len(run.seeds)), ret, cost]
         cells.append(final_policy(run, study.printed.get(text, "-")))
-        cells += [published_cell(run.config, known)] if known else []
+        cells += [published_cell(run, known)] if known else []
         known_minutes = run.values.get("minutes")
         cells.append("-" if known_minutes is None else f"{known_minutes.max():.1f}")
         cells.append(f"{row['commit'] or '-'}{' (dirty)' if row['dirty'] == 'yes' else ''}")
@@ -579,13 +579,11 @@ def final_policy(run: SettingRun, otherwise: str) -> str:
     return f"{made('')}; sampled: {made('sampled ')}"
 
 
-def published_cell(config: Mapping[str, Any], known: Mapping[tuple[str, str], Published]) -> str:
+def published_cell(run: SettingRun, known: Mapping[tuple[str, str], Published]) -> str:
     """What others report of a setting, or where that is nothing constrained, unconstrained PPO."""
-    env, algo = config["env.name"], config["algo.name"]
-    theirs = known.get((env, algo))
-    if theirs and theirs.holds_for(config.get("env.rules", "safety_gym")):
+    if theirs := beside(Group(run.env, {}, [run]), known):
         (ret, ret_std), (cost, cost_std) = theirs.ret, theirs.cost
         return f"{theirs.source} {ret:.2f} ± {ret_std:.2f}, cost {cost:.2f} ± {cost_std:.2f}"
-    if ppo := scores.CHARACTERISTIC.get(env):
+    if ppo := scores.CHARACTERISTIC.get(run.env):
         return f"none (unconstrained PPO: {ppo.ret:.4g}, cost {ppo.cost:.4g})"
     return "none"

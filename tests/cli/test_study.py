@@ -187,6 +187,16 @@ def test_evaluated_policies_stand_beside_published_ones_and_training_apart(toy, 
     assert studies.matrices(groups, known) == studies.matrix(groups, {})
 
 
+def test_what_was_published_with_another_limit_is_not_said_to_be_of_a_setting(toy, tmp_path):
+    trained(tmp_path / "run", toy.command(toy.runs[0]))
+    (run,) = read_one(tmp_path / "run")
+    figures = Published((9.0, 1.0), (3.0, 1.0), 25.0, "theirs", "")
+    known = {("point_goal1", "cpo"): figures}
+    assert studies.published_cell(run, known) == "theirs 9.00 ± 1.00, cost 3.00 ± 1.00"
+    known = {("point_goal1", "cpo"): figures._replace(cost_limit=10.0)}
+    assert studies.published_cell(run, known).startswith("none (unconstrained PPO: ")
+
+
 def test_what_training_has_cost_is_told_along_the_way(toy, tmp_path):
     """Every step of the policy costs 0.1, for 4,000 and for 2,000 steps of the environment."""
     for i, (repeat, steps) in enumerate(((1, 4000), (2, 2000))):
