@@ -88,6 +88,9 @@ def read(folder: Path) -> Condensed:
         rows = list(csv.DictReader(io.StringIO(text, newline="")))
         if not all(isinstance(x, str) for row in rows for x in (*row.keys(), *row.values())):
             raise ValueError("final.csv has rows of another length than its header")
+        for name in (*ROW, "return", "cost", *Origin._fields):
+            if rows and name not in rows[0]:
+                raise ValueError(f"final.csv has no column {name}")
         keys = zip(found["run"].tolist(), found["seed"].tolist(), strict=True)
         kept = found["curves"]
         if kept.shape[1:] not in ((len(CURVES), POINTS), (OLDER, POINTS)) or kept.dtype.kind != "f":

@@ -363,9 +363,14 @@ def test_a_study_whose_files_do_not_belong_together_is_refused(toy, tmp_path):
     (run,) = read_one(tmp_path / "run")
     studies.add(toy, toy.runs[0], run, study_files.Origin())
     table = toy.folder / "final.csv"
-    table.write_text(table.read_text().replace("algo=cpo", "algo=pcpo"))
+    whole = table.read_text()
+    table.write_text(whole.replace("algo=cpo", "algo=pcpo"))
     with pytest.raises(ConfigError, match="lacks rows of final"):
         study_files.read(toy.folder)
+    for column in ("state", "return", "commit"):
+        table.write_text(whole.replace(f",{column},", ",other,", 1))
+        with pytest.raises(ConfigError, match=f"final.csv has no column {column}"):
+            study_files.read(toy.folder)
     (toy.folder / "curves.npz").write_bytes(b"PK no more")
     with pytest.raises(ConfigError, match="cannot be read"):
         study_files.read(toy.folder)
