@@ -99,7 +99,8 @@ def read(folder: Path) -> Condensed:
         whole = np.pad(kept, lacking, constant_values=np.nan)
         curves = dict(zip(keys, whole, strict=True))
         saved = json.loads(str(found["settings"]))
-        settings = {run: saved["common"] | own for run, own in saved["runs"].items()}
+        known = {row["run"] for row in rows}  # not one that was about to be added
+        settings = {run: saved["common"] | own for run, own in saved["runs"].items() if run in known}
         if any((row["run"], row["seed"]) not in curves or row["run"] not in settings for row in rows):
             raise ValueError("curves.npz lacks rows of final.csv")
     return Condensed(rows, curves, settings)

@@ -358,6 +358,16 @@ def test_rows_that_two_commands_add_at_once_are_all_kept(toy, tmp_path, monkeypa
     assert [row["algo"] for row in read_files(toy.folder).rows] == ["cpo"] * 2 + ["ppo_lag"] * 2
 
 
+def test_a_study_is_read_whole_where_its_writer_was_stopped_between_its_files(toy, tmp_path):
+    for i, run in enumerate(toy.runs):
+        trained(tmp_path / str(i), toy.command(run))
+        (found,) = read_one(tmp_path / str(i))
+        before = (toy.folder / "final.csv").read_bytes() if i else b""
+        studies.add(toy, run, found, study_files.Origin())
+    (toy.folder / "final.csv").write_bytes(before)  # curves.npz is written first
+    assert [run.config["algo.name"] for run in read([toy.folder])] == ["cpo"]
+
+
 def test_a_study_whose_files_do_not_belong_together_is_refused(toy, tmp_path):
     trained(tmp_path / "run", toy.command(toy.runs[0]))
     (run,) = read_one(tmp_path / "run")
