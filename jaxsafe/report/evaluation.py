@@ -166,7 +166,9 @@ def cost_rate(metrics: dict[str, np.ndarray]) -> np.ndarray | None:
     if "train/cost_rate" not in metrics or not len(metrics["seed"]):
         return None
     rates = metrics["train/cost_rate"]  # of one iteration; all have the same number of steps
-    return np.array([np.nanmean(rates[metrics["seed"] == seed]) for seed in np.unique(metrics["seed"])])
+    seeds, known = metrics["seed"], np.isfinite(rates)
+    of_seeds = (rates[known & (seeds == seed)] for seed in np.unique(seeds))
+    return np.array([x.mean() if len(x) else np.nan for x in of_seeds])  # NaN: every step was bad
 
 
 def table(rows: dict[str, Estimate]) -> str:

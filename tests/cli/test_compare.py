@@ -109,6 +109,13 @@ def test_a_published_cost_rate_is_of_steps_of_the_environment(tmp_path):
     assert rows["normalised cost rate"].mean == pytest.approx(expected)
 
 
+@pytest.mark.filterwarnings("error")
+def test_the_cost_rate_of_a_seed_whose_every_step_was_bad_is_not_known():
+    rates = np.array([0.25, 0.75, np.nan, 0.5, np.nan, np.nan])
+    table = {"seed": np.array([0.0, 0.0, 1.0, 1.0, 2.0, 2.0]), "train/cost_rate": rates}
+    np.testing.assert_array_equal(evaluation.cost_rate(table), [0.5, 0.5, np.nan])
+
+
 def test_costs_under_limits_of_their_own_violate_when_one_of_them_does():
     table = {
         "iteration": np.array([1.0, 1.0]), "steps": np.array([1.0, 1.0]), "seed": np.array([0.0, 1.0]),
