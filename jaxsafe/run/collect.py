@@ -157,14 +157,13 @@ def episodes(run: RunPolicies, steps: int, seed: int, sampled: bool) -> Iterator
     fill if none ends early, within `AT_ONCE`.
     """
     policies = len(jax.tree.leaves(run.learned)[0])
-    task = run.algo.task(jax.tree.map(lambda x: x[0], run.learned))
     wanted = math.ceil(steps / run.env.episode_length)
     seen = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(observation_like(run.env)))
     fit = max(1, AT_ONCE_BYTES // (seen * run.env.episode_length))
     each = math.ceil(min(AT_ONCE, fit, wanted) / policies)
 
     def of_one(learned: PyTree, keys: jax.Array) -> Steps:
-        player = Player(run.algo.policy, learned, task)
+        player = Player(run.algo.policy, learned, run.algo.task(learned))
         return jax.vmap(lambda key: episode(player, key, run.env.obs_size, sampled))(keys)
 
     play = jax.jit(jax.vmap(of_one))

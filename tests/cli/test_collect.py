@@ -11,13 +11,15 @@ import h5py
 import numpy as np
 import pytest
 from shell import SMALL, TOY, typed
-from toys import Corridor
+from toys import Corridor, Ticker
 
 import jaxsafe
 from jaxsafe.config import ConfigError
+from jaxsafe.learn.augment import Budget
 from jaxsafe.run import collect, dataset
 from jaxsafe.run.dataset import other_task, read_about, read_dataset, write_dataset
 from jaxsafe.run.policies import open_run
+from jaxsafe.types import Policy
 
 
 @pytest.fixture(scope="module")
@@ -177,6 +179,20 @@ def test_two_tasks_are_told_by_their_names():
     assert str(error.value) == "env.name is task_a in a, task_b in b; expected runs of the same task"
     with pytest.raises(ConfigError, match=r"env\.bounds is 2 in a, 0 in a; expected runs of the same"):
         collect.check_same_task([of("task_a", bounds=2), of("task_a", bounds=0)])
+
+
+def test_each_policy_meets_the_task_as_it_was_trained_in():
+    """What is left of the budget, which is the action here, depends on the setting and the seed."""
+    env = Ticker()
+    algo = SimpleNamespace(
+        policy=Policy(lambda learned: (), lambda learned, carry, obs, key: (obs[-1:], carry, {})),
+        task=lambda learned: Budget(env, learned["start"], learned["budget"], 1.0),
+    )
+    learned = {"start": np.array([1, 0.5], np.float32), "budget": np.array([4, 8], np.float32)}
+    run: Any = SimpleNamespace(algo=algo, env=env, learned=learned)
+    played = collect.episodes(run, 2 * env.episode_length, seed=1, sampled=False)
+    for expected in ([1, 0.5, 0, -0.5, -1], [0.5, 0.25, 0, -0.25, -0.5]):  # a step costs 2
+        np.testing.assert_allclose(next(played)[1].action[:, 0], expected)
 
 
 def test_a_run_that_terminates_gives_shorter_episodes():
