@@ -528,6 +528,10 @@ def test_offline_configs_count_gradient_steps_and_keep_a_path():
             "pendulum_swing",
             r"algo.temperature=\[1, 2\]: expected a number",
         ),
+        ({"seed": float("nan")}, "PPOLag", "point_goal1", "seed=nan: expected a whole number"),
+        ({"seed": -1}, "PPOLag", "point_goal1", "seed=-1: expected a whole number between 0 and"),
+        ({"algo": ["PPO"], "env_id": "point_goal1"}, "", "", r"algo=\['PPO'\]: expected a string"),
+        ({"env_id": 5}, "PPOLag", "", "env_id=5: expected a string"),
         ({}, "PPOlag", "point_goal1", "did you mean 'PPOLag'"),
         ({}, "CRABS", "SafetyPointGoal1-v0", "CRABS is for SafeInvertedPendulumSwing-v2 alone"),
         ({}, "", "point_goal1", "add --algo"),
@@ -603,12 +607,16 @@ def test_the_script_prints_a_command_and_refuses_in_a_line(tmp_path, capsys):
         out == f"python scripts/train.py {rules} algo=ppo_lag preset=published compat=omnisafe seed=3\n"
     )
     assert len(err.splitlines()) == len(migrate.flatten(PPO_LAG)) + 2
-    for text, message in (
-        ("{", "is no JSON"),
-        ("[1]", "expected names with values"),
-        (None, "cannot read"),
+    for source, text, message in (
+        ("omnisafe", "{", "is no JSON"),
+        ("omnisafe", "[" * 99_999, "is no JSON: maximum recursion depth"),
+        ("omnisafe", "[1]", "expected names with values"),
+        ("safety_gym", "1: 2", "unknown option 1 of Engine"),
+        ("omnisafe", "a: &a {b: *a}", "is no YAML: maximum recursion depth"),
+        ("omnisafe", None, "cannot read"),
     ):
+        path = tmp_path / ("config.yaml" if text and ":" in text else "config.json")
         path.unlink() if text is None else path.write_text(text)
-        assert typed("migrate", "omnisafe", str(path)) == 2
+        assert typed("migrate", source, str(path)) == 2
         error = capsys.readouterr().err
         assert message in error and error.count("\n") == 1

@@ -88,6 +88,7 @@ def test_a_command_of_alf_in_racing_sees_pictures():
     "migrate, command, says",
     [
         (ambs, "python train.py --task atari_seaquest", "we have Safety Gym's"),
+        (ambs, "python train.py --task 5", "--task 5 has no counterpart"),
         (ambs, "python train.py --task safetygym_Safexp-PointGoal9-v0", "did you mean"),
         (ambs, "python train.py --run.steps 5", "names no task: expected --task"),
         (ambs, AMBS.replace("500000", "many"), "--run.steps='many': expected a whole number"),

@@ -67,16 +67,16 @@ def algorithms() -> dict[str, str]:
     return dict(sorted((row.omnisafe, name) for name, row in algos.ALGOS.items() if row.omnisafe))
 
 
-def find_algorithm(theirs: Any) -> str:
+def find_algorithm(theirs: str) -> str:
     known = algorithms()
     if not theirs:
         raise ConfigError(f"no algorithm in the file: add --algo, one of {', '.join(known)}")
     if theirs not in known:
-        raise ConfigError(f"unknown algorithm {theirs} of OmniSafe{nearest(str(theirs), known)}")
+        raise ConfigError(f"unknown algorithm {theirs} of OmniSafe{nearest(theirs, known)}")
     return known[theirs]
 
 
-def find_environment(theirs: Any) -> list[str]:
+def find_environment(theirs: str) -> list[str]:
     """Options for the environment that OmniSafe calls `theirs`, or that is called so here."""
     if not theirs:
         raise ConfigError("no env_id in the file: add --env, as in --env SafetyPointGoal1-v0")

@@ -50,9 +50,9 @@ def read_file(path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path}: expected a name that ends in .json or .yaml")
     try:
         tree = json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)
-    except (json.JSONDecodeError, yaml.YAMLError) as error:
+        flatten(tree)
+    except (json.JSONDecodeError, yaml.YAMLError, RecursionError) as error:
         raise ConfigError(f"{path} is no {path.suffix[1:].upper()}: {one_line(error)}") from error
-    flatten(tree)
     return tree
 
 

@@ -45,8 +45,8 @@ class Flag(NamedTuple):
     lost: Callable[[Any], bool] = lambda value: True
 
 
-def ambs_task(value: str) -> dict[str, Any]:
-    suite, _, name = value.partition("_")
+def ambs_task(value: Any) -> dict[str, Any]:
+    suite, _, name = str(value).partition("_")
     if suite != "safetygym":
         raise ConfigError(f"--task {value} has no counterpart: of AMBS's tasks we have Safety Gym's")
     return {"env": envs.canonical(name)}

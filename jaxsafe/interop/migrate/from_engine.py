@@ -27,7 +27,7 @@ def safety_gym(config: dict[str, Any]) -> Migrated:
     known = [field for field in defaults() if field not in OURS_ALONE]
     for key in config:
         if key not in known:
-            raise ConfigError(f"unknown option {key} of Engine{nearest(key, known)}")
+            raise ConfigError(f"unknown option {key} of Engine{nearest(str(key), known)}")
     options = dataclasses.asdict(config_from_plain(defaults(**config)))
 
     def differences(name: str) -> dict[str, Any]:

@@ -30,10 +30,11 @@ def omnisafe(config: dict[str, Any], algo: str = "", env: str = "") -> Migrated:
         algo, env: OmniSafe's names, if the config has none; an env may be one of ours.
     Raises:
         ConfigError: a key, an algorithm or an environment that is unknown or has no counterpart, or a
-            value of the wrong type.
+            value of the wrong type or out of bounds.
     """
     values = values_of(config, env)
-    their_algo, their_env = algo or values.get("algo"), env or values.get("env_id")
+    their_algo = convert(algo or values.get("algo") or "", str, "algo")
+    their_env = convert(env or values.get("env_id") or "", str, "env_id")
     name, target = find_algorithm(their_algo), find_environment(their_env)
     row = algos.ALGOS[name]
     family = FAMILIES[family_of(row)]
@@ -117,7 +118,8 @@ def applied(rule: Rule, value: Any, facts: Facts, algo: str) -> Became:
 
 def in_place_of(became: Became, found: dict[str, Any]) -> str:
     """What earlier keys had made of the same options."""
-    replaced = [as_option(k, found[k]) for k, v in became.options.items() if found.get(k, v) != v]
+    options = became.options.items()
+    replaced = [as_option(k, found[k]) for k, v in options if k in found and found[k] != v]
     return "".join(f" in place of {option}" for option in replaced)
 
 
@@ -131,4 +133,6 @@ def checked(found: dict[str, Any], row: Row) -> dict[str, Any]:
             return getattr(cfg, key.removeprefix("algo."))
         return convert(value, str if key in ("dataset", "logger") else int, key)
 
-    return {key: typed(key, value) for key, value in found.items()}
+    whole = {key: typed(key, value) for key, value in found.items()}
+    from_dict(TrainConfig, {key: value for key, value in whole.items() if "." not in key})  # in bounds
+    return whole
