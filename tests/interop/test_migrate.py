@@ -499,6 +499,9 @@ def test_offline_configs_count_gradient_steps_and_keep_a_path():
     ]  # fmt: skip
     named = {"train_cfgs": {"dataset": "SafetyPointCircle1-v0_mixed_0.5"}}
     assert lost(migrated(named, "VAEBC")) == ["train_cfgs.dataset"]
+    for path in ("~/mixed.npz", "a,b.npz", "mixed (1).npz"):  # what Hydra reads as something else
+        argv = migrated({"train_cfgs": {"dataset": path}}, "VAEBC").argv
+        assert arguments.compose(argv).train.dataset == path
     dice = {"algo_cfgs": {"cost_limit": 0.1, "alpha": 0.01}, "model_cfgs": {"tau": {"lr": 0.1}}}
     found = migrated(dice, "COptiDICE").argv
     assert {"algo.cost_limit=50.0", "algo.alpha=0.01", "algo.tau_lr=0.1"} <= {*found}

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import yaml
 
 from jaxsafe.config import ConfigError, one_line
+from jaxsafe.run.arguments import argument
 from jaxsafe.run.plain import as_text
 
 
@@ -26,7 +27,7 @@ class Migrated(NamedTuple):
 
 def as_option(key: str, value: Any) -> str:
     """An option as train.py reads it."""
-    return f"{key}={as_text(value)}"
+    return argument(key, value) if isinstance(value, str) else f"{key}={as_text(value)}"
 
 
 def flatten(tree: Any, head: str = "") -> dict[str, Any]:
