@@ -25,6 +25,7 @@ from jaxsafe import envs
 from jaxsafe.config import ConfigError
 from jaxsafe.envs.registry import IMPLIED
 from jaxsafe.envs.view.render import FPS, Aerial, Renderer, renderer_of
+from jaxsafe.envs.wrap import TimeLimit
 from jaxsafe.learn.observations import observation_like
 from jaxsafe.learn.rollout import RolloutState, init_rollout, restart
 from jaxsafe.types import Env, PyTree, State
@@ -105,15 +106,23 @@ class GymVectorEnv(Specified, gymnasium.vector.VectorEnv):
     its own: `obs` is then the first of the new episode, `info["final_obs"]` and `info["final_info"]`
     are the last of the old one. Rewards and costs are always those of the step.
 
-    Args: as of `GymEnv`, and num_envs.
+    Args: as of `GymEnv`, and num_envs, and max_episode_steps, a shorter time limit than the environment
+        has: `make_vec` hands it over, as where it makes an environment again from its `spec`.
     """
 
     metadata = {**GymEnv.metadata, "autoreset_mode": gymnasium.vector.AutoresetMode.SAME_STEP}  # noqa: RUF012
 
     def __init__(
-        self, env: Env | str, num_envs: int = 1, render_mode: str | None = None, **options: Any
+        self,
+        env: Env | str,
+        num_envs: int = 1,
+        render_mode: str | None = None,
+        max_episode_steps: int | None = None,
+        **options: Any,
     ):
         self.env, self.num_envs, self.render_mode = built(env, options), num_envs, render_mode
+        if max_episode_steps is not None and max_episode_steps < self.env.episode_length:
+            self.env = TimeLimit(self.env, max_episode_steps)
         self.single_observation_space, self.single_action_space = spaces(self.env)
         batch = gymnasium.vector.utils.batch_space
         self.observation_space = batch(self.single_observation_space, num_envs)
