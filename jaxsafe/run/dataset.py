@@ -28,6 +28,7 @@ import contextlib
 import io
 import json
 import math
+import re
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
@@ -62,6 +63,12 @@ OMNISAFE = {  # OmniSafe's name -> ours
     "next_obs": "next_observations",
     "done": "terminals",
 }
+MINARI = {  # Minari's name of what each step of an episode has -> the field
+    "rewards": "reward",
+    "actions": "action",
+    "terminations": "terminated",
+    "truncations": "truncated",
+}
 BROKEN = (  # of files that hold something else
     OSError, ValueError, EOFError, TypeError, LookupError, RuntimeError, MemoryError, OverflowError,
     zipfile.BadZipFile, zlib.error,
@@ -93,8 +100,8 @@ def read_dataset(path: str, episode_length: int | None = None) -> DataSet:
     """
     file = found(path)
     with opened(path, file) as source:
-        if any(name.startswith("episode_") for name in source.groups):
-            return from_minari(path, source)
+        if groups := [name for name in source.groups if re.fullmatch(r"episode_\d+", name)]:
+            return from_minari(path, source, groups)
         if set(OMNISAFE) <= set(source.names):
             return from_omnisafe(path, source, episode_length)
         return from_flat(path, source)
@@ -183,51 +190,51 @@ def from_omnisafe(path: str, source: Source, episode_length: int | None) -> Data
     return data_set(**fields, terminated=done & ~late, truncated=done & late, cut=cut)
 
 
-def from_minari(path: str, source: Source) -> DataSet:
+def from_minari(path: str, source: Source, groups: list[str]) -> DataSet:
     """Observations are one more than the steps of an episode, and infos/cost too, or as many."""
-    order = sorted(
-        (g for g in source.groups if g.removeprefix("episode_").isdigit()),
-        key=lambda group: int(group.removeprefix("episode_")),
-    )
+    known = {*source.names}
     parts: dict[str, list[np.ndarray]] = {}
-    for group in order:
-        if f"{group}/infos/cost" not in source.names:
-            raise ConfigError(f"dataset={path} has no {group}/infos/cost; Minari has no other costs")
+    for group in sorted(groups, key=lambda group: int(group.removeprefix("episode_"))):
 
-        def read(name: str, axes: int, like: np.ndarray, group: str = group) -> np.ndarray:
-            if f"{group}/{name}" not in source.names:
-                raise ConfigError(f"dataset={path} has no {group}/{name}")
-            return checked(path, f"{group}/{name}", source.read(f"{group}/{name}"), axes, like)
+        def read(name: str, group: str = group) -> np.ndarray:
+            if f"{group}/{name}" not in known:
+                costs = "; Minari has no other costs" if name == "infos/cost" else ""
+                raise ConfigError(f"dataset={path} has no {group}/{name}{costs}")
+            return source.read(f"{group}/{name}")
 
-        rewards = source.read(f"{group}/rewards") if f"{group}/rewards" in source.names else np.zeros(0)
-        count = len(rewards)
-        obs = read("observations", 2, np.zeros(count + 1))
-        raw_cost = source.read(f"{group}/infos/cost")
-        cost = checked(path, f"{group}/infos/cost", raw_cost[-count:], 1, rewards)
+        raw = {name: read(name) for name in ("observations", "infos/cost", *MINARI)}
+        rewards = checked(path, f"{group}/rewards", raw["rewards"], 1, raw["rewards"])
+        if raw["infos/cost"].shape[:1] == (len(rewards) + 1,):  # that of the reset, too
+            raw["infos/cost"] = raw["infos/cost"][1:]
+        obs = checked(path, f"{group}/observations", raw.pop("observations"), 2, rewards, more=1)
+        steps = {
+            name: checked(path, f"{group}/{name}", x, 2 if name == "actions" else 1, rewards)
+            for name, x in raw.items()
+        }
         for name, x in {
             "obs": obs[:-1],
             "next_obs": obs[1:],
-            "cost": cost,
-            "reward": read("rewards", 1, rewards),
-            "action": read("actions", 2, rewards),
-            "terminated": read("terminations", 1, rewards),
-            "truncated": read("truncations", 1, rewards),
-            "cut": np.arange(count) == count - 1,
+            "cost": steps["infos/cost"],
+            **{field: steps[name] for name, field in MINARI.items()},
+            "cut": np.arange(len(rewards)) == len(rewards) - 1,
         }.items():
             parts.setdefault(name, []).append(x)
     widths = {name: {x.shape[1:] for x in several} for name, several in parts.items()}
-    if not parts or any(len(shapes) > 1 for shapes in widths.values()):
+    if any(len(shapes) > 1 for shapes in widths.values()):
         raise ConfigError(f"dataset={path}: its episodes have arrays of different widths")
     whole: Any = {name: np.concatenate(several) for name, several in parts.items()}
     return data_set(**whole)
 
 
-def checked(path: str, name: str, x: np.ndarray, axes: int, like: np.ndarray) -> np.ndarray:
-    """`x` as float32, if it is numbers of so many axes and as many as `like`."""
+def checked(
+    path: str, name: str, x: np.ndarray, axes: int, like: np.ndarray, more: int = 0
+) -> np.ndarray:
+    """`x` as float32, if it is numbers of so many axes, and as many as `like`, and `more`."""
     if x.ndim == axes and not len(x):
         raise ConfigError(f"dataset={path}: {name} is empty")
-    if x.dtype.kind not in "biuf" or x.ndim != axes or x.shape[:1] != like.shape[:1]:
-        shape = "[n, size]" if axes == 2 else "[n]"
+    expected = tuple(n + more for n in like.shape[:1])
+    if x.dtype.kind not in "biuf" or x.ndim != axes or x.shape[:1] != expected:
+        shape = f"[n{f' + {more}' * bool(more)}{', size' * (axes == 2)}]"
         raise ConfigError(
             f"dataset={path}: {name} is {x.dtype}{list(x.shape)}, expected numbers {shape}, with "
             "the same n as rewards"

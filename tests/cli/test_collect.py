@@ -326,6 +326,30 @@ def test_minaris_episodes_load(tmp_path, extra):
     assert_equal(read_dataset(str(tmp_path / "set")), data._replace(costs={}))
 
 
+@pytest.mark.parametrize(
+    "name, x, message",
+    [
+        ("rewards", None, "has no episode_0/rewards"),
+        ("rewards", 1.0, "episode_0/rewards is float64[], expected numbers [n]"),
+        ("observations", np.zeros((3, 2)), "expected numbers [n + 1, size], with the same n"),
+        ("infos/cost", None, "has no episode_0/infos/cost; Minari has no other costs"),
+        ("infos/cost", np.zeros(9), "infos/cost is float64[9], expected numbers [n], with the same n"),
+    ],
+)
+def test_what_an_episode_of_minaris_lacks_is_one_line(tmp_path, name, x, message):
+    steps = np.ones(3)
+    arrays: dict[str, Any] = dict.fromkeys(("rewards", "terminations", "truncations"), steps)
+    arrays |= {"observations": np.ones((4, 2)), "actions": np.ones((3, 1)), "infos/cost": steps}
+    arrays[name] = x
+    with h5py.File(path := tmp_path / "main_data.hdf5", "w") as file:
+        for key, array in arrays.items():
+            if array is not None:
+                file[f"episode_0/{key}"] = array
+    with pytest.raises(ConfigError) as error:
+        read_dataset(str(path))
+    assert message in str(error.value) and "\n" not in str(error.value)
+
+
 def test_without_timeouts_the_episodes_are_not_known(tmp_path):
     data, _ = made()
     write_dataset(tmp_path / "data.hdf5", data._replace(episodes=()))
