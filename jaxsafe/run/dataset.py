@@ -102,7 +102,8 @@ def read_dataset(path: str, episode_length: int | None = None) -> DataSet:
     with opened(path, file) as source:
         if groups := [name for name in source.groups if re.fullmatch(r"episode_\d+", name)]:
             return from_minari(path, source, groups)
-        if set(OMNISAFE) <= set(source.names):
+        theirs, ours = (len({*names} & {*source.names}) for names in (OMNISAFE, ARRAYS))
+        if theirs > ours:
             return from_omnisafe(path, source, episode_length)
         return from_flat(path, source)
 
@@ -174,11 +175,18 @@ def from_omnisafe(path: str, source: Source, episode_length: int | None) -> Data
     mark: its last next_obs is not the obs that follows."""
     raw = {}
     for theirs, ours in OMNISAFE.items():
+        if theirs not in source.names:
+            raise ConfigError(f"dataset={path} has OmniSafe's names, and no {theirs}")
         x = source.read(theirs)
         raw[ours] = x[:, 0] if ARRAYS[ours][1] == 1 and x.ndim == 2 and x.shape[1] == 1 else x
     sized = {name: checked(path, name, x, ARRAYS[name][1], raw["rewards"]) for name, x in raw.items()}
-    done = sized["terminals"].astype(bool)
-    follows = (sized["next_observations"][:-1] == sized["observations"][1:]).all(1)
+    done, obs, after = (sized[k] for k in ("terminals", "observations", "next_observations"))
+    if obs.shape != after.shape:
+        raise ConfigError(
+            f"dataset={path}: next_obs is {list(after.shape)}, expected {list(obs.shape)}, as obs is"
+        )
+    done = done.astype(bool)
+    follows = (after[:-1] == obs[1:]).all(1)
     cut = ~np.append(follows, True) & ~done
     last = done | cut
     begin = np.flatnonzero(np.append(True, last[:-1]))

@@ -307,6 +307,25 @@ def test_omnisafes_done_is_told_apart_by_the_length_of_the_episode(tmp_path):
     assert found.terminated.nonzero()[0].tolist() == [2, 5, 10]
 
 
+@pytest.mark.parametrize(
+    "name, x, message",
+    [
+        ("done", None, "has OmniSafe's names, and no done"),
+        ("obs", None, "has OmniSafe's names, and no obs"),
+        ("next_obs", np.zeros((4, 1)), "next_obs is [4, 1], expected [4, 3], as obs is"),
+    ],
+)
+def test_what_a_file_of_omnisafes_lacks_is_one_line(tmp_path, name, x, message):
+    arrays: dict[str, Any] = dict.fromkeys(("reward", "cost", "done"), np.zeros((4, 1)))
+    arrays |= {"obs": np.zeros((4, 3)), "next_obs": np.zeros((4, 3)), "action": np.zeros((4, 2))}
+    arrays[name] = x
+    path = str(tmp_path / "omni.npz")
+    np.savez(path, **{key: array for key, array in arrays.items() if array is not None})
+    with pytest.raises(ConfigError) as error:
+        read_dataset(path)
+    assert message in str(error.value) and "\n" not in str(error.value)
+
+
 @pytest.mark.parametrize("extra", [0, 1])
 def test_minaris_episodes_load(tmp_path, extra):
     data, _ = made("..t..T...T")
