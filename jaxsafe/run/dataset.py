@@ -260,7 +260,8 @@ def checked(
 @contextlib.contextmanager
 def opened(path: str, file: Path) -> Iterator[Source]:
     """What a file holds. Whatever is wrong with it becomes a ConfigError of one line."""
-    hdf5 = file.open("rb").read(len(HDF5)) == HDF5
+    with file.open("rb") as begin:
+        hdf5 = begin.read(len(HDF5)) == HDF5
     try:
         if hdf5:
             with h5py.File(file, "r") as arrays:

@@ -233,6 +233,7 @@ def test_episodes_are_found_and_those_that_are_cut_are_not_whole():
     np.testing.assert_allclose(data.episodes.cost[1], data.cost[3:6].sum(), rtol=1e-6)
 
 
+@pytest.mark.filterwarnings("error")  # as of a file that stays open
 @pytest.mark.parametrize("suffix", [".hdf5", ".npz"])
 def test_our_files_come_back_bit_for_bit(tmp_path, suffix):
     data, _ = made("..t..T...T")
