@@ -136,7 +136,7 @@ def arguments(factory: Callable[..., Env], name: str) -> list[inspect.Parameter]
     for p in named:
         if p.default is p.empty:
             raise ConfigError(f"{name}: argument {p.name!r} has no default, so nobody would give it")
-        if p.name == ANY_ENV:
+        if p.name in ("name", ANY_ENV):
             raise ConfigError(f"{name}: argument {p.name!r} is what every environment has: rename it")
     return [p for p in named if isinstance(p.default, PLAIN)]
 

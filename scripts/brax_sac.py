@@ -26,12 +26,12 @@ from jaxsafe.run.flags import fail
 BACKENDS = ("generalized", "spring", "positional", "mjx")
 
 
-def task(name: str = "halfcheetah", backend: str = "generalized") -> FromBrax:
+def task(env_name: str = "halfcheetah", backend: str = "generalized") -> FromBrax:
     """A task of Brax, without cost."""
     try:
-        made = brax.envs.get_environment(name, backend=backend)
+        made = brax.envs.get_environment(env_name, backend=backend)
     except KeyError as error:
-        raise ConfigError(f"Brax has no task {name}") from error
+        raise ConfigError(f"Brax has no task {env_name}") from error
     env = from_brax(made, costs=())
     env.engine = f"brax {backend}"
     return env

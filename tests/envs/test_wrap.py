@@ -194,12 +194,13 @@ def test_a_wrapper_that_cannot_be_is_one_line(hall, wrap, says):
     assert says in str(error.value) and "\n" not in str(error.value)
 
 
-def test_bounds_for_other_actions_and_an_option_called_wrap_are_refused():
+def test_bounds_for_other_actions_and_options_called_wrap_or_name_are_refused():
     with pytest.raises(ConfigError, match="3 bounds for actions with 2 components"):
         ActionScale(Corridor(), (0.0, 0.0, 0.0), 1.0)
-    envs.register("odd", lambda wrap=3: Corridor())
-    with pytest.raises(ConfigError, match="every environment has: rename"):
-        envs.env_defaults("odd")
+    for name, odd in (("wrap", lambda wrap=3: Corridor()), ("name", lambda name="a": Corridor())):
+        envs.register("odd", odd)
+        with pytest.raises(ConfigError, match=f"'{name}' is what every environment has: rename"):
+            envs.env_defaults("odd")
     del envs.ENVS["odd"]
 
 

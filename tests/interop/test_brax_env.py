@@ -23,6 +23,8 @@ from jaxsafe.config import ConfigError
 from jaxsafe.envs.check import check_env
 from jaxsafe.interop.brax import from_brax, mend_brax, to_brax, to_playground
 from jaxsafe.learn.rollout import collect, init_rollout, memoryless
+from jaxsafe.run.arguments import compose
+from jaxsafe.run.settings import make_env
 from jaxsafe.types import Shared
 
 
@@ -276,6 +278,12 @@ def test_sac_on_a_task_of_brax_takes_the_options_of_training(monkeypatch):
     }  # fmt: skip
     _, (task, algo, given) = brax_sac_with(monkeypatch, "algo=td3")
     assert (task, algo) == (("halfcheetah", "generalized"), "td3") and "preset" not in given
+
+
+def test_the_task_of_brax_is_measured_by_its_address_and_its_options(monkeypatch):
+    monkeypatch.syspath_prepend(SCRIPTS)
+    settings = compose(["env=brax_sac:task", "env.env_name=fast"])
+    assert settings.env_name == "brax_sac:task" and make_env(settings).obs_size == 2
 
 
 @pytest.mark.parametrize(
