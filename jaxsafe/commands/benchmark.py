@@ -31,7 +31,8 @@ import numpy as np
 
 from jaxsafe import algos
 from jaxsafe.commands.guard import guarded
-from jaxsafe.config import Amount, ConfigError, Devices, Iterations, Period
+from jaxsafe.commands.peers import PEERS
+from jaxsafe.config import Amount, ConfigError, Devices, Iterations, Period, nearest
 from jaxsafe.envs import SafetyGym, Velocity
 from jaxsafe.envs.wrap import innermost, raw_steps
 from jaxsafe.learn.observations import EncoderConfig
@@ -333,10 +334,18 @@ def command() -> int:
         config_of(args.algo, args.options)
     elif args.options:
         raise ConfigError(f"{args.options[0]}: expected env.OPTION=; other settings need --algo")
+    for spec in args.peer:
+        if (peer := spec.partition("=")[0]) not in PEERS:
+            raise ConfigError(f"--peer {spec}: unknown peer{nearest(peer, PEERS)}")
     for num_envs in args.num_envs if args.peer else ():
         peer_sizes(num_envs, args)
     for name in args.envs:
         task_settings(name, args)
+    try:
+        if args.json:
+            args.json.open("a").close()
+    except OSError as error:
+        raise ConfigError(f"--json {args.json}: {error.strerror}") from error
     use_compilation_cache()
     about = versions()
     print(f"{' '.join(f'{k} {v}' for k, v in about.items())}")

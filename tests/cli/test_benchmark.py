@@ -89,6 +89,23 @@ def test_settings_without_an_algorithm_are_refused(monkeypatch, capsys):
     assert "algo.tau=0.5: expected env.OPTION=; other settings need --algo" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    "option, message",
+    [
+        ("--json=nowhere/rows", "--json nowhere/rows: No such file or directory"),
+        ("--peer=carx=python", "--peer carx=python: unknown peer; did you mean 'crax'?"),
+    ],
+)
+def test_where_rows_go_and_peers_are_looked_at_before_anything_is_measured(
+    option, message, monkeypatch, capsys
+):
+    monkeypatch.setattr(benchmark, "measure", None)
+    monkeypatch.setattr(sys, "argv", ["benchmark", "point_goal1", option])
+    assert benchmark.main() == 2
+    said = capsys.readouterr()
+    assert message in said.err and said.err.count("\n") == 1 and not said.out
+
+
 def test_a_task_of_the_user_s_own_is_measured_without_physics_steps(tmp_path, monkeypatch, capsys):
     rows = tmp_path / "rows.jsonl"
     sizes = "--num-envs 3 --horizon 2 --warmup 2 --repeats 2"
