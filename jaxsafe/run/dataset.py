@@ -38,10 +38,11 @@ from typing import Any, NamedTuple
 import h5py
 import numpy as np
 
-from jaxsafe.config import ConfigError, nearest, one_line
+from jaxsafe.config import ConfigError, flat, nearest, one_line
 from jaxsafe.learn.observations import vector_of
 from jaxsafe.learn.offline import DataSet, data_set
 from jaxsafe.run import checkpoint, files
+from jaxsafe.run.plain import as_text
 
 # name in the file -> the field that it is, and how many axes it has
 ARRAYS = {
@@ -69,6 +70,7 @@ MINARI = {  # Minari's name of what each step of an episode has -> the field
     "terminations": "terminated",
     "truncations": "truncated",
 }
+OF_ENGINE = ("engine", "awake", "contact_room")  # options that leave the task what it is
 BROKEN = (  # of files that hold something else
     OSError, ValueError, EOFError, TypeError, LookupError, RuntimeError, MemoryError, OverflowError,
     zipfile.BadZipFile, zlib.error,
@@ -121,22 +123,34 @@ def read_about(path: str) -> dict[str, Any]:
     return {name: x for name, x in said.items() if isinstance(x, str | int | float)}
 
 
-def task_of(path: str) -> str | None:
-    """The environment that a data set was collected on; None if the file does not say it."""
+def task_of(path: str) -> dict[str, Any]:
+    """The name and the options of the environment that a data set was collected on, as text; empty if
+    the file does not say them."""
     try:
-        name = json.loads(read_about(path)["env"])["name"]
-    except (ConfigError, *BROKEN):  # the data may be sound all the same
-        return None
-    return name if isinstance(name, str) else None
+        said = flat(json.loads(read_about(path)["env"]))
+        named = isinstance(said["name"], str)
+        return {option: as_text(value) for option, value in said.items()} if named else {}
+    except (ConfigError, AttributeError, *BROKEN):  # the data may be sound all the same
+        return {}
 
 
-def other_task(path: str, env: str) -> str:
-    """A warning where the file of a data set says that it is of another environment; else ''."""
-    theirs = task_of(path)
-    if theirs in (None, env):
-        return ""
-    shown = "".join(x if x.isprintable() else "?" for x in theirs[:100])  # a stranger may have set it
-    return f"warning: dataset={path} is of {shown}, and env={env}; expected data of the same task"
+def other_task(path: str, env: dict[str, Any]) -> str:
+    """A warning where the file of a data set says that it is of another environment, or of another
+    option of it; else ''.
+
+    Args:
+        env: the environment's name and all its options, as `Settings.plain` has them.
+    """
+    theirs, ours = task_of(path), {option: as_text(value) for option, value in flat(env).items()}
+    for option in ("name", *sorted(ours.keys() - {"name", *OF_ENGINE})):
+        if (said := theirs.get(option, ours[option])) != ours[option]:
+            said = "".join(x if x.isprintable() else "?" for x in said[:100])  # a stranger's
+            is_of, here = ("", "env=") if option == "name" else (f"env.{option}=",) * 2
+            return (
+                f"warning: dataset={path} is of {is_of}{said}, and {here}{ours[option]}; expected "
+                "data of the same task"
+            )
+    return ""
 
 
 def from_flat(path: str, source: Source) -> DataSet:

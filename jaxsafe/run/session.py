@@ -228,7 +228,8 @@ def run_alone(session: Session, report: Reporter, finish: Finish, hooks: loop.Ho
         report.line(line)
     if line := about_replay(program, train):
         report.line(line)
-    if train.dataset is not None and (line := dataset.other_task(train.dataset, settings.env_name)):
+    env = settings.plain()["env"]
+    if train.dataset is not None and (line := dataset.other_task(train.dataset, env)):
         report.line(line)
     outcome = loop.train(program, train, session.folder, report, hooks)
     distributed.part()

@@ -267,19 +267,34 @@ def test_both_kinds_of_file_say_the_same(run, tmp_path):
 def test_data_of_another_task_is_told_by_both_names(tmp_path, suffix):
     path = str(tmp_path / f"data{suffix}")
     write_dataset(path, made()[0], about={"env": '{"name": "point_circle1\\u001b"}'})
-    assert other_task(path, "point_circle2") == (
+    assert other_task(path, {"name": "point_circle2"}) == (
         f"warning: dataset={path} is of point_circle1?, and env=point_circle2; expected data of the "
         "same task"
     )
     for unknown in ('{"name": "point_circle2"}', "{}", "[]", "text", '{"name": 3}', 3, "[" * 9999):
         write_dataset(path, made()[0], about={"env": unknown})
-        assert other_task(path, "point_circle2") == ""
+        assert other_task(path, {"name": "point_circle2"}) == ""
+
+
+def test_data_of_other_options_is_told_but_not_of_another_engine(tmp_path):
+    path, env = str(tmp_path / "data.npz"), {"name": "point_goal1", "rules": "safety_gym", "new": 1}
+    for more, option in (
+        ({}, ""),
+        ({"engine": "warp", "awake": 3, "old": 2}, ""),
+        ({"rules": "safety_gymnasium"}, "env.rules=safety_gymnasium, and env.rules=safety_gym"),
+        ({"wrap": {"frame_stack": 3}}, "env.wrap.frame_stack=3, and env.wrap.frame_stack=1"),
+    ):
+        said = {"name": "point_goal1", "rules": "safety_gym"} | more
+        write_dataset(path, made()[0], about={"env": json.dumps(said)})
+        ours = env | {"wrap": {"frame_stack": 1}, "engine": "c", "awake": 2}
+        expected = f"warning: dataset={path} is of {option}; expected data of the same task"
+        assert other_task(path, ours) == (expected if option else "")
 
 
 def test_a_strangers_npz_says_nothing(tmp_path):
     for about in (np.zeros(3), np.array("text"), np.array("[1]"), np.array([{}], object)):
         np.savez(tmp_path / "data.npz", about=about)
-        assert other_task(str(tmp_path / "data.npz"), "point_circle2") == ""
+        assert other_task(str(tmp_path / "data.npz"), {"name": "point_circle2"}) == ""
 
 
 def test_a_file_with_dsrls_keys_written_by_h5py_alone_loads(tmp_path):
