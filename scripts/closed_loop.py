@@ -53,11 +53,15 @@ def flail(env: envs.SafetyGym, obs: jax.Array, key: jax.Array) -> tuple[jax.Arra
 
 def run(name: str, variant: str, episodes: int) -> dict[str, list[float]]:
     """Sums over each of the episodes: return, cost, every cost's, successes."""
+    if episodes < 2:
+        raise ConfigError(f"--episodes {episodes}: expected at least 2, for an interval")
     engine, _, awake = variant.partition(":")
     if awake and not awake.isdigit():
         raise ConfigError(f"{variant!r}: expected engine or engine:k, as in c:3")
     options = {"awake": int(awake)} if awake else {}
     env = envs.make(name, engine=engine, **options)
+    if not isinstance(env, envs.SafetyGym) or "goal_lidar" not in env.observation_spec:
+        raise ConfigError(f"{name}: expected a task of Safety Gym with a lidar for its goal")
     policy = partial(flail if robot(env) == "doggo" else seek, env)
     reset_key, key = jax.random.split(jax.random.key(0))
     rollout = jax.jit(init_rollout, static_argnums=(0, 2, 3))(env, reset_key, episodes, False)

@@ -16,6 +16,7 @@ from jaxsafe.config import ConfigError
 
 SCRIPTS = Path(__file__).parent.parent.parent / "scripts"
 profile = runpy.run_path(str(SCRIPTS / "profile_learner.py"))
+closed_loop = runpy.run_path(str(SCRIPTS / "closed_loop.py"))
 kernels_of, products_of = profile["kernels_of"], profile["products_of"]
 
 
@@ -189,6 +190,22 @@ def test_a_peer_s_rate_is_that_of_its_settled_epochs():
     row = peers.sac_training(train, Evaluator, None, peers.Sizes(100, 50, 4))
     assert (row["slowest"], row["env_steps_per_s"], row["fastest"]) == (12.0, 14.0, 16.0)
     assert (row["num_envs"], row["replay_ratio"]) == (100, 2.0)
+
+
+@pytest.mark.parametrize(
+    "words, message",
+    [
+        ("point_goal1 --episodes 1", "--episodes 1: expected at least 2, for an interval"),
+        ("ant_velocity", "ant_velocity: expected a task of Safety Gym with a lidar for its goal"),
+        ("point_circle1", "point_circle1: expected a task of Safety Gym with a lidar for its goal"),
+    ],
+)
+def test_engines_are_not_compared_where_there_is_no_goal_or_no_interval(
+    words, message, monkeypatch, capsys
+):
+    monkeypatch.setattr(sys, "argv", ["closed_loop.py", *words.split(), "--variants", "c"])
+    assert closed_loop["main"]() == 2
+    assert capsys.readouterr().err == f"{message}\n"
 
 
 def test_the_products_of_a_program_are_counted_in_loops_branches_and_gradients():
