@@ -190,7 +190,7 @@ def steps_of_round(cfg: RoundConfig, num_envs: int, batch: int) -> int:
     Raises:
         ConfigError: `replay_ratio` asks for no whole number of them.
     """
-    transitions = cfg.replay_ratio * num_envs * cfg.learn_every
+    transitions = whole(cfg.replay_ratio * num_envs * cfg.learn_every)
     if transitions % batch:
         raise ConfigError(
             f"replay_ratio={cfg.replay_ratio}: {cfg.replay_ratio} x num_envs={num_envs} x "
@@ -200,6 +200,11 @@ def steps_of_round(cfg: RoundConfig, num_envs: int, batch: int) -> int:
     return int(transitions // batch)  # a ratio may be a fraction
 
 
+def whole(x: float) -> float:
+    """`x` without its error of rounding, if it is a whole number but for that."""
+    return round(x) if math.isclose(x, round(x), rel_tol=1e-12) else x
+
+
 def fitting(cfg: RoundConfig, num_envs: int, batch: int) -> list[str]:
     """The nearest value of each setting that makes whole gradient steps, where there is one."""
     steps, replayed = num_envs * cfg.learn_every, num_envs * cfg.replay_ratio
@@ -207,7 +212,7 @@ def fitting(cfg: RoundConfig, num_envs: int, batch: int) -> list[str]:
     ratio = least * max(1, round(cfg.replay_ratio / least))
     transitions = round(cfg.replay_ratio * steps)
     size = closest(divisors(transitions)[::-1], batch)  # of two as near, the larger one
-    every = [n for n in divisors(cfg.horizon) if replayed * n % batch == 0]
+    every = [n for n in divisors(cfg.horizon) if whole(replayed * n) % batch == 0]
     found = [f"replay_ratio={ratio}", f"batch_size={size}"]
     if every:
         found.append(f"learn_every={closest(every, cfg.learn_every)}")

@@ -356,6 +356,14 @@ def test_the_nearest_sizes_of_a_ratio_that_is_a_fraction_are_whole():
         timetable_of(cfg, None)
 
 
+@pytest.mark.parametrize("num_envs, gradient_steps", [(32, 1), (96, 3), (384, 12), (1024, 32)])
+def test_a_ratio_that_is_a_fraction_takes_whole_steps_though_its_product_is_rounded(
+    num_envs, gradient_steps
+):
+    cfg = ALGOS["seditor"].config(num_envs=num_envs)  # 51.2 x 96 x 5 is 24576.000000000004
+    assert timetable_of(cfg, None).gradient_steps == gradient_steps
+
+
 def test_the_clocks_count_environment_steps_and_gradient_steps():
     cfg = ALGOS["sac"].config(**TINY)
     assert ALGOS["sac"].make(Corridor()).clocks(cfg) == (8 * 6, 3 * (4 * 8 * 2 // 32))
