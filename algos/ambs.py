@@ -409,7 +409,7 @@ def shielded(env: Env, policy: Policy) -> Policy:
 
 def make(env: Env, axis_name: str | None = None) -> Algorithm:
     policy = shielded(env, dreaming_policy(env, shielded_behaviour))
-    learner = dreaming_learner(env, shielded_behaviour, policy)
+    learner = dreaming_learner(env, shielded_behaviour, policy, axis_name)
     counted = learner._replace(
         counted=lambda env, steps, cfg: {"violations": violated(env, steps, cfg)}
     )

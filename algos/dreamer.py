@@ -297,7 +297,8 @@ def make(
     behaviour: Behaviour = blind,
     treatment: Treatment = no_treatment,
 ) -> Algorithm:
-    return off_policy(env, dreaming_learner(env, behaviour), treatment, axis_name)
+    learner = dreaming_learner(env, behaviour, axis_name=axis_name)
+    return off_policy(env, learner, treatment, axis_name)
 
 
 # the authors' values of settings that have other defaults here

@@ -192,7 +192,8 @@ def make(
     behaviour: Behaviour = planned,
     treatment: Treatment = no_treatment,
 ) -> Algorithm:
-    learner = dreaming_learner(env, behaviour, dream_planning_policy(env, behaviour, treatment))
+    policy = dream_planning_policy(env, behaviour, treatment)
+    learner = dreaming_learner(env, behaviour, policy, axis_name)
     return off_policy(env, learner, treatment, axis_name)
 
 

@@ -12,7 +12,6 @@ import optax
 from jaxsafe.config import (
     Amount,
     Bounds,
-    ConfigError,
     Iterations,
     Norm,
     Rate,
@@ -32,7 +31,7 @@ from jaxsafe.learn.observations import EncoderConfig, features, init_features
 from jaxsafe.learn.off_policy import OffPolicyConfig, off_policy
 from jaxsafe.learn.replay import Record
 from jaxsafe.learn.row import Row
-from jaxsafe.learn.sequences import SequenceBatch, drawn_sequences, lambda_returns
+from jaxsafe.learn.sequences import SequenceBatch, check_sequences, drawn_sequences, lambda_returns
 from jaxsafe.learn.steps import Trainable, adam, descend_each, follow
 from jaxsafe.learn.treatments import LagrangianConfig, Treatment, initial_price, lagrangian
 from jaxsafe.nn.beta import Beta, beta_policy, beta_sample, init_beta
@@ -435,13 +434,9 @@ def optimisers(cfg: Any, share: jax.Array | float) -> dict[str, optax.GradientTr
     return rules
 
 
-def seditor_learner(env: Env) -> Learner:
+def seditor_learner(env: Env, axis_name: str | None = None) -> Learner:
     def init(key: jax.Array, obs_size: int, action_size: int, cfg: Any) -> Trainable:
-        if cfg.batch_size % (cfg.n_step + 1):
-            raise ConfigError(
-                f"batch_size={cfg.batch_size}: expected a multiple of n_step + 1 = {cfg.n_step + 1}, "
-                "the rows of a sequence"
-            )
+        check_sequences(cfg, axis_name)
         names = constrained_costs(cfg)
         keys = jax.random.split(key, 6)
         encoder, seen = init_features(jax.random.fold_in(key, 1), env, obs_size, cfg)
@@ -507,7 +502,7 @@ def seditor_learner(env: Env) -> Learner:
 
 
 def make(env: Env, axis_name: str | None = None) -> Algorithm:
-    return off_policy(env, seditor_learner(env), soft_lagrangian, axis_name)
+    return off_policy(env, seditor_learner(env, axis_name), soft_lagrangian, axis_name)
 
 
 # HorizonRobotics/alf @23aca49, examples/seditor_safety_gym_conf.py, without its DEBUG: 32 environments

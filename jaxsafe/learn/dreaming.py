@@ -19,7 +19,7 @@ from jaxsafe.learn.acting import Learned
 from jaxsafe.learn.constraints import Costs
 from jaxsafe.learn.learner import GradientStep, Learner
 from jaxsafe.learn.observations import blank, observation_like
-from jaxsafe.learn.sequences import SequenceBatch, drawn_sequences, lambda_returns
+from jaxsafe.learn.sequences import SequenceBatch, check_sequences, drawn_sequences, lambda_returns
 from jaxsafe.learn.steps import Trainable, descend_each, follow
 from jaxsafe.learn.world_model import (
     CHANCE,
@@ -272,18 +272,16 @@ def chosen(env: Env, learned: Learned, name: str, latent: Latent, key: jax.Array
 # ---- the learner -------------------------------------------------------------------------------
 
 
-def dreaming_learner(env: Env, behaviour: Behaviour, policy: Policy | None = None) -> Learner:
+def dreaming_learner(
+    env: Env, behaviour: Behaviour, policy: Policy | None = None, axis_name: str | None = None
+) -> Learner:
     """The learner of a behaviour.
 
     policy: what acts, if it is not the actor alone.
     """
 
     def init(key: jax.Array, obs_size: int, action_size: int, cfg: Any) -> Trainable:
-        if cfg.batch_size % (cfg.n_step + 1):
-            raise ConfigError(
-                f"batch_size={cfg.batch_size}: expected a multiple of n_step + 1 = {cfg.n_step + 1}, "
-                "the rows of a sequence"
-            )
+        check_sequences(cfg, axis_name)
         if cfg.obs_bins == 1:
             raise ConfigError("obs_bins=1: expected 2 or more, or 0 for none")
         if cfg.overshoot > cfg.n_step:

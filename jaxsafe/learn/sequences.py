@@ -5,7 +5,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxsafe.learn.batch import pmean, psum
+from jaxsafe.config import ConfigError
+from jaxsafe.learn.batch import device_count, pmean, psum
 from jaxsafe.learn.normalise import network_inputs
 from jaxsafe.learn.replay import Record, Source, draw, sequences
 from jaxsafe.learn.returns import ValuedSteps, gae
@@ -30,6 +31,17 @@ class SequenceBatch(NamedTuple):
     def mean(self, x: jax.Array) -> jax.Array:
         """The mean of `x` [T, B] over the rows: this device's share of it."""
         return (self.weight * x.mean(0)).sum()
+
+
+def check_sequences(cfg: Any, axis_name: str | None) -> None:
+    """Refuse batches that are no whole number of sequences on each device."""
+    length, devices = cfg.n_step + 1, device_count(axis_name)
+    if cfg.batch_size % (length * devices):
+        on_each = f", on each of {devices} devices" if devices > 1 else ""
+        raise ConfigError(
+            f"batch_size={cfg.batch_size}: expected a multiple of n_step + 1 = {length}, "
+            f"the rows of a sequence{on_each}"
+        )
 
 
 def drawn_sequences(

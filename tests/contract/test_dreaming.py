@@ -125,6 +125,16 @@ def test_sizes_that_do_not_fit_are_refused(settings, message):
         jax.eval_shape(lambda: algo.init(jax.random.key(0), cfg, START))
 
 
+@pytest.mark.parametrize("name", [*NAMES, "seditor"])
+def test_a_batch_that_is_no_number_of_sequences_on_each_of_two_devices_is_refused(name):
+    few = {"batch_size": 36, "n_step": 3, "replay_ratio": 9}  # 9 sequences
+    cfg = ALGOS["seditor"].config(**few) if name == "seditor" else settings_of(name, **few)
+    algo = ALGOS[name].make(Corridor(), "devices")
+    init = jax.vmap(lambda key: algo.init(key, cfg, START), axis_name="devices")
+    with pytest.raises(ConfigError, match=r"batch_size=36: .* n_step \+ 1 = 4, .* of 2 devices"):
+        jax.eval_shape(init, jax.random.split(jax.random.key(0)))
+
+
 # ---- compiled ------------------------------------------------------------------------------------
 
 
