@@ -224,6 +224,7 @@ def expected_length(
     lost = jnp.where(steps.terminated, limit - steps.length, 0).sum(dtype=jnp.float32)
     lost, taken, num_envs = psum((lost, jnp.float32(taken), steps.terminated.shape[1]), axis_name)
     lost, taken = past.lost + lost, past.taken + taken
-    length = limit / (1 + lost / taken)
-    keep = jnp.minimum(1.0, num_envs * length / taken)
+    least = jnp.maximum(taken, 1)  # without a step, as where all were bad, there is no loss either
+    length = limit / (1 + lost / least)
+    keep = jnp.minimum(1.0, num_envs * length / least)
     return length, LostTime(keep * lost, keep * taken)

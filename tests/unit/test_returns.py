@@ -8,6 +8,7 @@ import pytest
 from jaxsafe.learn.batch import batch_mean
 from jaxsafe.learn.returns import (
     Estimator,
+    LostTime,
     ValuedSteps,
     advantages,
     expected_length,
@@ -97,6 +98,14 @@ def test_the_length_by_lost_time_stays_exactly_at_the_time_limit():
     for _ in range(3):
         length, past = expected_length(past, 1000, none, 91)
         assert length == 1000
+
+
+def test_a_batch_without_a_step_leaves_the_length_as_it_was():
+    none = Failures(jnp.zeros((4, 2), bool), jnp.full((4, 2), 3))
+    length, past = expected_length(no_lost_time(), 10, none, 0)
+    assert length == 10 and past == (0, 0)
+    length, past = expected_length(LostTime(jnp.float32(8), jnp.float32(8)), 10, none, 0)
+    assert length == 5 and past == (8, 8)
 
 
 @pytest.mark.parametrize("stagger", [False, True])
