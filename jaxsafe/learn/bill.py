@@ -59,7 +59,8 @@ def settle(
     """The price after the moves that are due, what remains of the bill, and whether a move failed.
 
     J_c is what a step has cost since the last move, times the mean `length` of an episode. After an
-    iteration of more than `dual_every` steps several moves may be due; they see the same J_c.
+    iteration of more than `dual_every` steps several moves may be due; they see the same J_c. If all
+    steps were bad there is no J_c, and the moves that are due lapse.
     """
     episode_cost = bill.cost / jnp.maximum(bill.steps, 1) * length
     due = jnp.maximum(bill.age, 0) // cfg.dual_every
@@ -67,7 +68,7 @@ def settle(
     def move(_: jax.Array, dual: PyTree) -> PyTree:
         return treatment.update(dual, episode_cost, cfg, iteration)
 
-    moved = jax.lax.fori_loop(0, due, move, dual)
+    moved = jax.lax.fori_loop(0, jnp.where(bill.steps > 0, due, 0), move, dual)
     finite = all_finite(moved)
     paid = Bill(jnp.zeros_like(bill.cost), jnp.float32(0), bill.age - due * cfg.dual_every)
     emptied = (due > 0) | (bill.age <= 0)  # what is charged before `dual_starts` is dropped

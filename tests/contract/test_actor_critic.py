@@ -563,6 +563,18 @@ def test_what_steps_cost_before_the_price_may_move_is_forgotten():
         np.testing.assert_allclose(dual.lam, lam, atol=1e-3)
 
 
+def test_the_price_stays_where_no_step_says_what_an_episode_costs():
+    cfg = jax.tree.map(
+        jnp.float32, sac.SACLagConfig(cost_limit=10.0, dual_every=100, lam_init=0.35, dual_lr=0.1)
+    )
+    dual, bill = lagrangian.init(cfg), empty_bill(cfg, ())
+    for real, lam in ((False, 0.35), (False, 0.35), (True, 0.25)):
+        bill = charge(bill, jnp.full((10, 15), 0.05), jnp.full((10, 15), real), None)
+        dual, bill, _ = settle(lagrangian, dual, bill, jnp.float32(100.0), cfg, jnp.int32(0))
+        np.testing.assert_allclose(dual.lam, lam, atol=1e-3)
+    assert bill.age == 50
+
+
 @pytest.mark.parametrize("steps, multipliers", [(5, [1.5, 0.5]), (3, [0.5, 0.5])])
 def test_a_bill_is_the_cost_of_real_steps_since_the_last_move_for_each_constraint(steps, multipliers):
     """Each step costs 0.5 and 1.5 by name; resets do not count. Episodes fail after 3 of 5 steps, or
