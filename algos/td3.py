@@ -169,8 +169,8 @@ def deterministic_actor(
         if key is None:
             return action
         sigma_key, noise_key = jax.random.split(key)
-        lowest, highest = cfg.noise_min, cfg.noise_max
-        sigma = jax.random.uniform(sigma_key, (*action.shape[:-1], 1), minval=lowest, maxval=highest)
+        share = jax.random.uniform(sigma_key, (*action.shape[:-1], 1))
+        sigma = cfg.noise_min + (cfg.noise_max - cfg.noise_min) * share
         return noisy(action, sigma * jax.random.normal(noise_key, action.shape))
 
     def next_action(

@@ -465,8 +465,9 @@ def test_each_environment_has_noise_of_its_own_which_can_fall_to_none(decay, lef
     np.testing.assert_allclose(actions.std(1), share * np.array([0.1, 0.2, 0.3]), rtol=0.05)
 
 
-def test_a_sampled_action_has_the_noise_of_any_environment_and_none_leaves_its_bounds():
-    cfg = td3.TD3Config(hidden=(), layer_norm=False, noise_min=0.1, noise_max=0.3)
+@pytest.mark.parametrize("ends", [(0.1, 0.3), (0.3, 0.1)])
+def test_a_sampled_action_has_the_noise_of_any_environment_and_none_leaves_its_bounds(ends):
+    cfg = td3.TD3Config(hidden=(), layer_norm=False, noise_min=ends[0], noise_max=ends[1])
     actor: Any = ACTORS["td3"](2000)
     params = jax.tree.map(jnp.zeros_like, actor.init(jax.random.key(0), 1, 2000, cfg))  # mu(s) = 0
     obs, key = jnp.zeros((200, 1)), jax.random.key(1)
