@@ -22,6 +22,7 @@ from jaxsafe.learn.dreaming import (
 from jaxsafe.learn.off_policy import off_policy
 from jaxsafe.learn.planning import PlanConfig, cem, elites, key_of_step, moved_on, particles_of
 from jaxsafe.learn.row import Row
+from jaxsafe.learn.steps import Trainable
 from jaxsafe.learn.treatments import CappedPIDConfig, Treatment, capped_pid, no_treatment
 from jaxsafe.learn.world_model import dream_returns, read, value_of, world_of
 from jaxsafe.nn.rssm import Latent
@@ -194,7 +195,13 @@ def make(
 ) -> Algorithm:
     policy = dream_planning_policy(env, behaviour, treatment)
     learner = dreaming_learner(env, behaviour, policy, axis_name)
-    return off_policy(env, learner, treatment, axis_name)
+
+    def init(key: jax.Array, obs_size: int, action_size: int, cfg: Any) -> Trainable:
+        scores = jnp.zeros(cfg.plans)
+        elites(scores, scores, cfg)  # refuses settings that it cannot serve
+        return learner.init(key, obs_size, action_size, cfg)
+
+    return off_policy(env, learner._replace(init=init), treatment, axis_name)
 
 
 LEVER: dict[str, Any] = dreamer.LEVER | {

@@ -125,6 +125,13 @@ def test_sizes_that_do_not_fit_are_refused(settings, message):
         jax.eval_shape(lambda: algo.init(jax.random.key(0), cfg, START))
 
 
+@pytest.mark.parametrize("name", ["osrp", "osrp_lag"])
+def test_fewer_plans_than_elites_are_refused_before_anything_is_compiled(name):
+    algo, cfg = ALGOS[name].make(Corridor()), settings_of(name, plans=8, elites=9)
+    with pytest.raises(ConfigError, match="elites=9: expected at most plans=8"):
+        jax.eval_shape(lambda: algo.init(jax.random.key(0), cfg, START))
+
+
 @pytest.mark.parametrize("name", [*NAMES, "seditor"])
 def test_a_batch_that_is_no_number_of_sequences_on_each_of_two_devices_is_refused(name):
     few = {"batch_size": 36, "n_step": 3, "replay_ratio": 9}  # 9 sequences
