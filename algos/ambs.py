@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 
 from jaxsafe.algos import dreamer
 from jaxsafe.config import Bounds, ConfigError, Iterations, Share, Weight, config
@@ -484,7 +485,7 @@ def note(cfg: Any) -> str:
     m, eps, confidence = cfg.shield_rollouts, float(cfg.eps), float(cfg.confidence)
     what = "dreams" if cfg.shield == "dreams" else "copies of the simulator"
     least = overruled_from(cfg)
-    half = (least - 1 / 3) / (m + 1 / 3)  # the median of Beta(least, m - least + 1)
+    half = scipy.special.betaincinv(least, m - least + 1, 0.5)  # P(B >= least) is 1/2 there
     line = f"shield: overrules from {least} of {m} {what} with a violation"
     line += f" within {cfg.shield_horizon} steps, half the time where that has P = {half:.2g}"
     allowed = f"the policy act with probability {confidence:g} at most where P >= {float(cfg.delta):g}"
