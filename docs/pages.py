@@ -410,14 +410,16 @@ def prose(docstring: str) -> tuple[str, str]:
 
 
 def values(kind: Any) -> str:
-    """The bounds of a number, wherever it stands in the type; the words of a choice."""
+    """The bounds of a number, wherever it stands in the type; the words of a choice. Of several
+    numbers, or kinds of number, those of each."""
     if typing.get_origin(kind) is typing.Literal:
         return ", ".join(f"`{word}`" for word in typing.get_args(kind))
     if typing.get_origin(kind) is Annotated:
         bounds = typing.get_args(kind)[1]
         infinite = f"; `inf`: {bounds.inf}" if bounds.inf else ""
         return f"{bounds.low:.12g} to {bounds.high:.12g}{infinite}"
-    return next(filter(None, map(values, typing.get_args(kind))), "")
+    inside = dict.fromkeys(filter(None, map(values, typing.get_args(kind))))
+    return (" and " if typing.get_origin(kind) is tuple else " or ").join(inside)
 
 
 def settings(config: type, head: str = "algo", without: Collection[str] = ()) -> str:
