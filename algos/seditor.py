@@ -164,7 +164,7 @@ def softplus_inverse(x: jax.Array) -> jax.Array:
 
 
 def init_soft_multiplier(cfg: Any) -> SoftMultiplier:
-    raw = softplus_inverse(initial_price(cfg))
+    raw = softplus_inverse(jnp.minimum(initial_price(cfg), cfg.lam_max))
     return SoftMultiplier(raw, optax.adam(cfg.dual_lr, eps=EPS).init(raw))
 
 

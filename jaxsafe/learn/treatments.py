@@ -62,7 +62,7 @@ def initial_price(cfg: Any) -> jax.Array:
 
 
 def init_multiplier(cfg: Any) -> Multiplier:
-    lam = initial_price(cfg)
+    lam = jnp.minimum(initial_price(cfg), cfg.lam_max)
     return Multiplier(lam, optax.adam(cfg.dual_lr).init(lam))
 
 

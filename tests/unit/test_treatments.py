@@ -5,6 +5,7 @@ import pytest
 
 from jaxsafe.algos.ppo import CPPOPIDConfig, IPOConfig, PPOLagConfig, PPOPenaltyConfig
 from jaxsafe.algos.sac import SACLagConfig
+from jaxsafe.algos.seditor import SEditorConfig, soft_lagrangian
 from jaxsafe.algos.trpo import CRPOConfig
 from jaxsafe.learn.treatments import (
     barrier,
@@ -41,6 +42,13 @@ def test_a_damped_price_is_the_multiplier_and_a_share_of_the_violation():
     assert dual.lam == 1.5 > dual.multiplier.lam
     dual = damped_lagrangian.update(dual, jnp.float32(-60.0), cfg, 0)
     assert dual.lam == 0.0 < dual.multiplier.lam
+
+
+@pytest.mark.parametrize("treatment", [lagrangian, damped_lagrangian, soft_lagrangian])
+def test_a_price_is_at_most_the_highest_before_it_first_moves_too(treatment):
+    made = SEditorConfig if treatment is soft_lagrangian else SACLagConfig
+    dual = treatment.init(made(lam_init=5.0, lam_max=2.0))
+    np.testing.assert_allclose(dual.lam, 2.0, rtol=1e-6)
 
 
 def test_damping_ends_the_swing_of_a_policy_that_answers_late():
