@@ -173,12 +173,14 @@ def standing(ret: jax.Array, cost: jax.Array, cfg: Any) -> tuple[jax.Array, jax.
 
 def elites(ret: jax.Array, cost: jax.Array, cfg: Any) -> jax.Array:
     """Equal weights for the `elites` feasible plans that earn most. If fewer are feasible, for the
-    `elites` plans that cost least."""
+    `elites` plans that cost least. A plan whose scores are not finite only counts if all are such."""
     enough, feasible = standing(ret, cost, cfg)
     value = jnp.where(enough, jnp.where(feasible, ret, -jnp.inf), -cost)
     value = jnp.where(sound(ret, cost), value, -jnp.inf)
     best = jax.lax.top_k(value, cfg.elites)[1]
-    return jnp.zeros_like(ret).at[best].set(1 / cfg.elites)
+    counts = sound(ret, cost)[best]
+    counts |= ~counts.any()
+    return jnp.zeros_like(ret).at[best].set(counts / counts.sum())
 
 
 def exponential(exponent: jax.Array, counts: jax.Array) -> jax.Array:

@@ -220,6 +220,9 @@ def test_a_plan_that_is_not_finite_is_never_among_the_best():
     cfg = pets.CCEConfig(elites=2, cost_limit=1.0)
     ret, cost = RET.at[0].set(jnp.nan), jnp.zeros(5).at[1].set(jnp.nan)
     np.testing.assert_allclose(elites(ret, cost, cfg), [0, 0, 0.5, 0.5, 0])
+    many = dataclasses.replace(cfg, elites=4)  # more than are finite
+    np.testing.assert_allclose(elites(ret, cost, many), [0, 0, 1 / 3, 1 / 3, 1 / 3], rtol=1e-6)
+    np.testing.assert_allclose(elites(ret * jnp.nan, cost, many).sum(), 1)
     soft = loop.SafeLOOPConfig(elites=2, temperature=1.0, cost_limit=1.0)
     weights = by_return_within_limit(ret, cost, soft)
     assert (weights[:2] == 0).all() and jnp.isclose(weights.sum(), 1)
