@@ -41,10 +41,10 @@ from jaxsafe.envs.engines.warp.solver import REGISTERS
 GeomType = mujoco_warp.GeomType
 vec5 = wp.types.vector(length=5, dtype=float)
 MESH = (GeomType.PLANE, GeomType.MESH)  # has a formula, but it needs the mesh
-FORMULAS = {  # two boxes have one, too, which MuJoCo no longer takes
+FORMULAS = {  # MuJoCo Warp by default leaves that of two boxes, which is MuJoCo's, to another kernel
     kinds: formula
     for kinds, formula in collision_primitive._PRIMITIVE_COLLISIONS.items()
-    if kinds not in ((GeomType.BOX, GeomType.BOX), MESH)
+    if kinds != MESH
 }
 
 
