@@ -262,7 +262,7 @@ def sizes_of(model: mujoco.MjModel) -> tuple[int, int, int, int]:
 def uncovered(model: mujoco.MjModel, m: Any, d: Any) -> list[str]:
     """What the kernels are not for, in a few words each: they are for the integrators Euler and RK4,
     motors on joints and sites, linear springs and dampers, and what the solver is for."""
-    joint, trn = mujoco_warp.JointType, mujoco_warp.TrnType
+    joint, trn, off = mujoco_warp.JointType, mujoco_warp.TrnType, mujoco_warp.DisableBit
     bias_type, gain_type = mujoco_warp.BiasType, mujoco_warp.GainType
     turns = np.isin(model.jnt_type, (joint.FREE, joint.BALL))
     at = model.actuator_trnid[:, 0]
@@ -280,7 +280,7 @@ def uncovered(model: mujoco.MjModel, m: Any, d: Any) -> list[str]:
     stiff = m.jnt_stiffness.numpy()[0, turns].any()
     found = {
         "an integrator other than Euler and RK4": m.opt.integrator not in (EULER, RK4),
-        "disabled features": m.opt.disableflags & ~int(mujoco_warp.DisableBit.SENSOR),
+        "disabled features": m.opt.disableflags & ~int(off.SENSOR | off.NATIVECCD),
         "enabled features": m.opt.enableflags,
         "no collisions": not m.opt.run_collision_detection,
         "sensors of forces between bodies": m.opt.run_rne_postconstraint,

@@ -191,6 +191,8 @@ class Kernels:
     def prepare(self, worlds: int) -> Worlds:
         m = mujoco_warp.put_model(self.model)
         m.opt.warn_overflow = 0  # returned instead
+        # of two boxes MuJoCo Warp then takes MuJoCo's contacts; it looks at this flag for nothing else
+        m.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_NATIVECCD.value
         room: dict[str, int] = {}
         if self.simulation.room:
             contacts, room["njmax"] = self.simulation.room
