@@ -21,7 +21,7 @@ from jaxsafe.commands.guard import guarded
 from jaxsafe.config import ConfigError, flat
 from jaxsafe.interop.brax import FromBrax, from_brax
 from jaxsafe.run.arguments import read_values
-from jaxsafe.run.flags import fail
+from jaxsafe.run.flags import Parser
 
 BACKENDS = ("generalized", "spring", "positional", "mjx")
 
@@ -38,10 +38,7 @@ def task(env_name: str = "halfcheetah", backend: str = "generalized") -> FromBra
 
 
 def command() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.error = fail  # type: ignore[method-assign]
+    parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
         "words", nargs="*", metavar="TASK, key=value", help="of brax.envs (halfcheetah)"
     )

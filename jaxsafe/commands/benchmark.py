@@ -42,7 +42,7 @@ from jaxsafe.learn.timetable import ReplayConfig, RoundConfig, timetable_of
 from jaxsafe.run import run_folder
 from jaxsafe.run.arguments import compose
 from jaxsafe.run.devices import check_devices, device_name, use_compilation_cache
-from jaxsafe.run.flags import fail, number
+from jaxsafe.run.flags import Parser, number
 from jaxsafe.run.programs import build
 from jaxsafe.run.session import engine_of
 from jaxsafe.run.settings import Settings, TrainConfig, find_algo, make_env
@@ -273,8 +273,7 @@ def main() -> int:
 
 
 def command() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.error = fail  # type: ignore[method-assign]
+    parser = Parser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument(
         "envs",
         nargs="*",

@@ -11,7 +11,7 @@ from jaxsafe.commands.guard import guarded
 from jaxsafe.config import ConfigError, Seed, convert, nearest
 from jaxsafe.run.collect import Ingredient, Size, data_file, shares, write
 from jaxsafe.run.devices import use_compilation_cache
-from jaxsafe.run.flags import fail
+from jaxsafe.run.flags import Parser
 from jaxsafe.run.interrupts import Interrupts
 from jaxsafe.run.policies import CODE, open_run
 
@@ -34,12 +34,11 @@ def main() -> int:
 
 
 def command() -> int:
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         description="Record whole episodes of trained policies in a data set.",
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.error = fail  # type: ignore[method-assign]
     parser.add_argument(
         "words",
         nargs="+",

@@ -1,6 +1,5 @@
 """The command evaluate: fresh episodes of the policies of a run."""
 
-import argparse
 import functools
 from pathlib import Path
 
@@ -9,7 +8,7 @@ from jaxsafe.config import EpisodeCount, Seed
 from jaxsafe.learn.constraints import limits_in_words, limits_of
 from jaxsafe.report.evaluation import evaluate
 from jaxsafe.run.devices import use_compilation_cache
-from jaxsafe.run.flags import fail, number
+from jaxsafe.run.flags import Parser, number
 from jaxsafe.run.interrupts import Interrupts
 from jaxsafe.run.policies import CODE, open_run
 
@@ -20,10 +19,9 @@ def main() -> int:
 
 
 def command() -> int:
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         description="Play fresh episodes with the policies of a run, and print what they earn and cost."
     )
-    parser.error = fail  # type: ignore[method-assign]
     parser.add_argument("run", type=Path, metavar="RUN", help="a run folder")
     parser.add_argument(
         "code",

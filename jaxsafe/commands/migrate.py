@@ -9,7 +9,7 @@ from jaxsafe.commands.guard import guarded
 from jaxsafe.commands.jaxsafe import called
 from jaxsafe.interop import migrate
 from jaxsafe.interop.migrate import from_commands
-from jaxsafe.run.flags import fail
+from jaxsafe.run.flags import Parser
 
 COMMANDS = {"ambs": from_commands.ambs, "alf": from_commands.alf}
 
@@ -21,12 +21,11 @@ def main() -> int:
 
 def command() -> int:
     about = migrate.__doc__ or ""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         description=about.partition("\n")[0],
         epilog=f"{about.partition(chr(10) * 2)[2]}\n{from_commands.__doc__}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.error = fail  # type: ignore[method-assign]
     parser.add_argument(
         "source", choices=("omnisafe", "safety_gym", *COMMANDS), help="what CONFIG is from"
     )

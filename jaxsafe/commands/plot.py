@@ -27,7 +27,7 @@ from jaxsafe.report.comparison import write
 from jaxsafe.report.group import group, ordered, telling
 from jaxsafe.report.published import read_published
 from jaxsafe.report.read import or_evaluated, read
-from jaxsafe.run.flags import fail
+from jaxsafe.run.flags import Parser
 from jaxsafe.run.settings import DEFAULT, load
 
 
@@ -37,12 +37,11 @@ def main() -> int:
 
 
 def command() -> int:
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         description=(__doc__ or "").partition("\n")[0],
         epilog=(__doc__ or "").partition("\n\n")[2],
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.error = fail  # type: ignore[method-assign]
     parser.add_argument(
         "runs", nargs="+", metavar="RUNS",
         help="run folders, sweeps, or folders of them; and env=MODULE:NAME, algo=MODULE:NAME, your own "

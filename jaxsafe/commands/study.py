@@ -33,7 +33,7 @@ from jaxsafe.report.read import read_one
 from jaxsafe.report.studies import Study
 from jaxsafe.run import files, run_folder
 from jaxsafe.run.arguments import argument
-from jaxsafe.run.flags import fail, number
+from jaxsafe.run.flags import Parser, number
 from jaxsafe.run.settings import load
 
 ROOT = Path(jaxsafe.__file__).parent.parent
@@ -213,10 +213,7 @@ def main(train: Callable[[list[str], Place], int] = train) -> int:
     """The command study. `train` is what trains one run."""
 
     def study_command() -> int:
-        parser = argparse.ArgumentParser(
-            description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-        )
-        parser.error = fail  # type: ignore[method-assign]
+        parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
         parser.add_argument("study", metavar="NAME", help="a study in docs/results, or its folder")
         parser.add_argument("--list", action="store_true", help="only list which runs are done")
         parser.add_argument(

@@ -11,7 +11,7 @@ from jaxsafe.report.finish import finish
 from jaxsafe.report.sweep_summary import summarise
 from jaxsafe.run import files, sweep
 from jaxsafe.run.arguments import read_values
-from jaxsafe.run.flags import fail
+from jaxsafe.run.flags import Parser
 from jaxsafe.run.progress import Reporter
 from jaxsafe.run.sweep_plan import plan
 
@@ -30,12 +30,11 @@ def main() -> int:
 
 
 def command() -> int:
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         description="Train a grid of settings: jaxsafe sweep algo=ppo_lag algo.cost_limit=5,10,25",
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.error = fail  # type: ignore[method-assign]
     parser.add_argument("options", nargs="*", metavar="key=value[,value...]")
     parser.add_argument(
         "--summary", type=Path, metavar="SWEEP", help="only write the summary of this sweep again"

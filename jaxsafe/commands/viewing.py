@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from jaxsafe.config import ConfigError, Index, Seed
 from jaxsafe.run.devices import use_compilation_cache
-from jaxsafe.run.flags import fail, number
+from jaxsafe.run.flags import Parser, number
 from jaxsafe.run.policies import CODE, ROBOT, RunPolicy, open_run
 
 
@@ -23,8 +23,7 @@ class Targets(NamedTuple):
 
 def parser_of(description: str, what: str, more: str) -> argparse.ArgumentParser:
     """With what both scripts take."""
-    parser = argparse.ArgumentParser(description=description)
-    parser.error = fail  # type: ignore[method-assign]
+    parser = Parser(description=description)
     parser.add_argument("what", nargs="+", metavar=what, help=more)
     parser.add_argument(
         "--index",

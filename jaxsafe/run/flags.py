@@ -8,6 +8,13 @@ from typing import Any, NoReturn
 from jaxsafe.config import ConfigError, convert, kind_in_words
 
 
+class Parser(argparse.ArgumentParser):
+    """A parser whose errors are lines for the user, like all others."""
+
+    def error(self, message: str) -> NoReturn:
+        raise ConfigError(message)
+
+
 def number(kind: Any) -> Callable[[str], Any]:
     """What argparse calls for an option that is a number within the bounds of the annotated `kind`."""
 
@@ -22,8 +29,3 @@ def number(kind: Any) -> Callable[[str], Any]:
             raise argparse.ArgumentTypeError(f"{text}: expected {kind_in_words(kind)}") from error
 
     return read
-
-
-def fail(message: str) -> NoReturn:
-    """What an argparse parser does with an error here."""
-    raise ConfigError(message)

@@ -25,7 +25,7 @@ from jaxsafe import algos, envs
 from jaxsafe.config import ConfigError
 from jaxsafe.run import distributed
 from jaxsafe.run.arguments import check_grid, check_kind, choices, import_named_code, names_in, parse
-from jaxsafe.run.flags import fail
+from jaxsafe.run.flags import Parser
 from jaxsafe.run.plain import to_plain
 from jaxsafe.run.settings import (
     COST_LIMITS,
@@ -103,7 +103,7 @@ def each_job(argv: list[str], job: Job) -> None:
     except ValueError as error:
         if not str(error).startswith("Only one of --run"):  # Hydra's, of its own flags
             raise
-        fail(str(error))
+        raise ConfigError(str(error)) from None
 
 
 def as_hydra_calls(job: Job) -> Callable[[Any], None]:
@@ -133,7 +133,7 @@ def read_arguments(argv: list[str]) -> Typed:
     """Hydra's flags apart from `key=value`, with environments and algorithms that are the user's code
     imported."""
     parser = get_args_parser()
-    parser.error = fail  # type: ignore[method-assign] (the parser is Hydra's own)
+    parser.error = Parser().error  # type: ignore[method-assign] (the parser is Hydra's own)
     args, unknown = parser.parse_known_args(argv)
     if unknown:
         raise ConfigError(f"unknown flag {unknown[0]}; options are written key=value, see --help")
