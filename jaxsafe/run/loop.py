@@ -52,15 +52,9 @@ class Start(NamedTuple):
     since: int = 0
 
 
-class Outcome(NamedTuple):
-    ts: PyTree
-    iteration: int
-    interrupted: bool
-
-
 def train(
     program: Program, train_cfg: TrainConfig, folder: Path, report: Reporter, hooks: Hooks
-) -> Outcome:
+) -> bool:
     """Train to the end that `train_cfg` gives, from the newest checkpoint in `folder` if there is one.
 
     Args:
@@ -71,7 +65,7 @@ def train(
         report: where progress goes.
         hooks: what the session adds.
     Returns:
-        The train state, with its leading axis, and how far it is.
+        Whether the user stopped it before the end.
     Raises:
         checkpoint.NotSaved, OSError: the disk failed; the last good checkpoint stays.
         divergence.Diverged: no member learns any more; likewise.
@@ -89,7 +83,7 @@ def train(
         if start.iteration >= iterations:
             report.line("nothing left to train")
             Saver(folder, program, train_cfg, start).save_lost_policies(start.ts, start.iteration)
-            return Outcome(start.ts, start.iteration, False)
+            return False
         names = sorted(jax.eval_shape(program.update, start.ts, program.shared())[1])
         names += COLUMNS if hooks.evaluate else ()
         update = programs.compiled(program, start.ts)
@@ -135,11 +129,11 @@ def train(
         report.stop()
         if lost := distributed.text_from_process_0(watch.verdict):  # which alone watches
             raise Diverged(lost)
-        interrupted = iteration < iterations
-        if interrupted:
+        stopped = iteration < iterations
+        if stopped:
             done = f"{unit.at(iteration):,} {unit.name}"
             report.line(f"stopped at {done}; continue with: {hooks.resume_command}")
-    return Outcome(ts, iteration, interrupted)
+    return stopped
 
 
 def fresh(program: Program, hooks: Hooks) -> Start:

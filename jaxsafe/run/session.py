@@ -231,9 +231,9 @@ def run_alone(session: Session, report: Reporter, finish: Finish, hooks: loop.Ho
     env = settings.plain()["env"]
     if train.dataset is not None and (line := dataset.other_task(train.dataset, env)):
         report.line(line)
-    outcome = loop.train(program, train, session.folder, report, hooks)
+    stopped = loop.train(program, train, session.folder, report, hooks)
     distributed.part()
-    if outcome.interrupted:
+    if stopped:
         return 130
     if not distributed.leads():
         return 0

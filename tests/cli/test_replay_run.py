@@ -1,13 +1,16 @@
 """Runs with a replay: stopped, killed, resumed, and too large."""
 
+import gc
 import shutil
 
+import jax
 import numpy as np
 import pytest
 from shell import TOY, assert_same_run, start, typed, wait_for
 from toys import Corridor
 
 from jaxsafe.algos import ALGOS
+from jaxsafe.commands import train
 from jaxsafe.learn.planning import planning_bytes
 from jaxsafe.run import checkpoint, memory, run_folder
 from jaxsafe.run.run_folder import read_metrics
@@ -79,6 +82,20 @@ def test_resumed_without_its_replay_it_fills_it_anew_before_it_learns_on(tmp_pat
     again = (*SAC, f"run_dir={run}", "eval_episodes=0", f"total_steps={14 * STEPS}", "resume=true")
     assert typed("train", *again) == 0
     assert checkpoint.load(run / "checkpoints")[1].since == 12
+
+
+def test_the_device_has_let_go_of_the_replay_when_the_policy_is_evaluated(tmp_path, monkeypatch):
+    """The replay of a large run leaves an evaluation and a film no room beside it."""
+    left = []
+
+    def finish(*_):
+        gc.collect()
+        left.extend(x.shape for x in jax.live_arrays() if x.shape[:3] == (1, 4, 64))  # the ring's
+
+    monkeypatch.setattr(train, "finish", finish)
+    args = (*SAC, f"total_steps={2 * STEPS}", f"run_dir={tmp_path / 'run'}")
+    assert typed("train", *args) == 0
+    assert not left
 
 
 def test_a_kept_replay_that_is_missing_is_one_line(tmp_path, capsys):
