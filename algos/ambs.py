@@ -420,22 +420,21 @@ def make(env: Env, axis_name: str | None = None) -> Algorithm:
 # ---- what is guaranteed ------------------------------------------------------------------------
 
 
-def required_rollouts(
-    eps: float, confidence: float, *, one_sided: bool = False, learned: bool = False
-) -> int:
-    """The dreams after which an estimated probability is off by `eps` at most, but for a probability of
-    `confidence`. This is of one decision, and of the latent in which its dreams begin.
+def required_rollouts(eps: float, confidence: float, learned: bool = False) -> int:
+    """The dreams after which an estimated probability is too low by `eps` at most, but for a
+    probability of `confidence`. This is of one decision, and of the latent in which its dreams begin.
 
-        m >= ln(2 / confidence) / (2 eps^2)
+        m >= ln(1 / confidence) / (2 eps^2)
+
+    Where too high an estimate counts, too, it takes those of `confidence / 2`.
 
     Args:
-        one_sided: only too low an estimate counts: 1 in place of 2.
         learned: half of `eps` is left for the model, whose probabilities of the next state may be off
             by eps / T: the sum of their absolute differences, which is twice what many call total
             variation. m is 4 times as large.
     """
     share = 0.5 if learned else 1.0
-    return math.ceil(math.log((1 if one_sided else 2) / confidence) / (2 * (share * eps) ** 2))
+    return math.ceil(math.log(1 / confidence) / (2 * (share * eps) ** 2))
 
 
 def overruled_from(cfg: Any) -> int:
@@ -496,8 +495,8 @@ def note(cfg: Any) -> str:
             unknown += "; and verdict=summed takes means for violations, for which none of this holds"
     if cfg.rule == "binomial":
         return f"{line}; lets {allowed}, if the model is exact{unknown}"
-    exact = required_rollouts(eps, confidence, one_sided=True)
-    off = required_rollouts(eps, confidence, one_sided=True, learned=True)
+    exact = required_rollouts(eps, confidence)
+    off = required_rollouts(eps, confidence, learned=True)
     enough = "enough" if m >= exact else "too few"
     return (
         f"{line}. To let {allowed} takes {exact} with an exact model ({m} are {enough}), and {off} "

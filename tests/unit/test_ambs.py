@@ -54,14 +54,14 @@ def newborn() -> tuple[Algorithm, Any]:
     [(0.1, 0.05, 185), (0.1, 0.01, 265), (0.09, 0.01, 328), (0.05, 0.01, 1060), (0.02, 0.05, 4612),
      (0.01, 0.05, 18445)],
 )  # fmt: skip
-def test_the_dreams_that_an_estimate_takes(eps, confidence, rollouts):
-    assert ambs.required_rollouts(eps, confidence) == rollouts
+def test_the_dreams_that_an_estimate_takes_to_be_off_on_neither_side(eps, confidence, rollouts):
+    assert ambs.required_rollouts(eps, confidence / 2) == rollouts
 
 
 def test_one_side_takes_fewer_dreams_and_a_learned_model_four_times_as_many():
-    assert ambs.required_rollouts(0.09, 0.01, one_sided=True) == 285
-    assert ambs.required_rollouts(0.09, 0.01, learned=True) == 1309
-    assert ambs.required_rollouts(0.09, 0.01, one_sided=True, learned=True) == 1138
+    assert ambs.required_rollouts(0.09, 0.01) == 285
+    assert ambs.required_rollouts(0.09, 0.01 / 2, learned=True) == 1309
+    assert ambs.required_rollouts(0.09, 0.01, learned=True) == 1138
     line = ambs.note(CFG)
     assert "from 6 of 512 dreams" in line and "half the time where that has P = 0.011" in line
     assert "285 with an exact model (512 are enough)" in line
@@ -540,7 +540,7 @@ def test_on_a_known_chain_it_overrules_where_the_bound_says(monkeypatch, verdict
     """With as many dreams as an error of eps takes: always above delta, and never below delta - 2 eps.
     On average over shields the probability is the exact one, within five deviations of all dreams."""
     chain, known = Chain(), {"shield_steps": 15, "shield_horizon": 15, "delta": 0.8}
-    rollouts = ambs.required_rollouts(CFG.eps, CFG.confidence)
+    rollouts = ambs.required_rollouts(CFG.eps, CFG.confidence / 2)
     cfg = dataclasses.replace(CFG, verdict=verdict, shield_rollouts=rollouts, **known)
     overruled = []
     for state, found in enumerate(estimates(monkeypatch, chain, cfg)):
@@ -558,7 +558,7 @@ def test_a_wrong_model_misleads_by_no_more_than_half_of_eps(monkeypatch):
     for the error of as many dreams as that takes."""
     steps, eps, confidence = 15, 0.18, 0.01
     known = {"shield_steps": steps, "shield_horizon": steps, "verdict": "drawn", "eps": eps}
-    rollouts = ambs.required_rollouts(eps, confidence, learned=True)
+    rollouts = ambs.required_rollouts(eps, confidence / 2, learned=True)
     cfg = dataclasses.replace(CFG, shield_rollouts=rollouts, **known)
     alpha = eps / steps  # |P' - P| summed over next states: `up` is off by half of that
     truth, model = Chain(0.0), Chain(alpha / 2)
