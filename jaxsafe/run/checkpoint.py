@@ -17,7 +17,7 @@ import os
 import re
 import shutil
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -48,6 +48,15 @@ class NoRoom(CheckpointError):
 
 class NotSaved(RuntimeError):
     """What could not be written, as on a full disk. The message is one line for the user."""
+
+
+@contextlib.contextmanager
+def writing_to(folder: Path) -> Iterator[None]:
+    """What the disk refuses becomes NotSaved."""
+    try:
+        yield
+    except OSError as error:
+        raise NotSaved(f"cannot write to {folder}: {error.strerror}") from error
 
 
 class Progress(NamedTuple):

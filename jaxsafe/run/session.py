@@ -207,10 +207,8 @@ def held(folder: Path) -> contextlib.AbstractContextManager[None]:
         checkpoint.NotSaved: the disk failed.
         ConfigError: as there.
     """
-    try:
+    with checkpoint.writing_to(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise checkpoint.NotSaved(f"cannot write to {folder}: {error.strerror}") from error
     return files.held(folder)
 
 
@@ -278,12 +276,10 @@ def write_head(session: Session) -> None:
         checkpoint.NotSaved: the disk failed.
     """
     folder, train = session.folder, session.settings.train
-    try:
+    with checkpoint.writing_to(folder):
         run_folder.write_config(folder, session.settings.plain())
         data = None if train.dataset is None else dataset.sha256(train.dataset)
         run_folder.append_versions(folder, device_name(), engine_of(session.env), data)
-    except OSError as error:
-        raise checkpoint.NotSaved(f"cannot write to {folder}: {error.strerror}") from error
 
 
 def about_cpu(settings: Settings) -> str:

@@ -58,8 +58,6 @@ def read_folder(folder: Path) -> Saved:
 def write_folder(sweep: Sweep, parallel: dict[str, int]) -> None:
     asked = {name: compared_settings(settings) for name, settings in sweep.groups.items()}
     saved = Saved(sweep.swept, parallel, asked)
-    try:
+    with checkpoint.writing_to(sweep.folder):
         sweep.folder.mkdir(parents=True, exist_ok=True)
         files.write(sweep.folder / "sweep.yaml", yaml.safe_dump(saved._asdict(), sort_keys=False))
-    except OSError as error:
-        raise checkpoint.NotSaved(f"cannot write to {sweep.folder}: {error.strerror}") from error
