@@ -11,7 +11,7 @@ import numpy as np
 from compiling import FAST
 
 from jaxsafe.envs import SafetyGym, make
-from jaxsafe.envs.safety_gym.task import in_parts
+from jaxsafe.envs.engines import Engine
 from jaxsafe.types import State
 
 ROBOT_AT_ORIGIN = {
@@ -42,6 +42,42 @@ class Task:
         sizes = {k: int(np.prod(shape)) for k, shape in spec.items()}
         start = sum(sizes[k] for k in list(spec)[: list(spec).index(name)])
         return np.asarray(state.obs[:, start : start + sizes[name]])
+
+
+def in_parts(env: SafetyGym, **options: Any) -> tuple[Callable, Callable]:
+    """`reset` and `step` over a batch, each compiled in two parts around the physics.
+
+    JAX keeps no program with a host callback in its compilation cache, and engine c is one. It keeps
+    these parts, so that a second process that needs them starts at once.
+
+    Args:
+        options: of `jax.jit`.
+    """
+
+    def compiled(f: Callable) -> Callable:
+        return jax.jit(jax.vmap(f), **options)
+
+    begin, begun, drive, judge = map(compiled, (env.begin, env.begun, env.drive, env.judge))
+    run, forward = physics_of(env._engine, **options)
+
+    def reset(keys: jax.Array) -> State:
+        world, ctrl = begin(keys)
+        return begun(world, ctrl, *forward(world.bodies, ctrl))
+
+    def step(state: State, action: jax.Array) -> State:
+        given = drive(state.physics, action)
+        return judge(state, given, *run(state.physics.bodies, given.ctrl, given.substeps))
+
+    return reset, step
+
+
+def physics_of(engine: Engine, **options: Any) -> tuple[Callable, Callable]:
+    """`engine.run` and `engine.forward` over a batch; a callback alone is not compiled."""
+    both = jax.vmap(engine.run), jax.vmap(engine.forward)
+    if engine.name == "c":
+        return both
+    run, forward = (jax.jit(f, **options) for f in both)
+    return run, forward
 
 
 @functools.cache

@@ -18,7 +18,7 @@ from jaxsafe.envs.engines import Physics, Readings
 from jaxsafe.envs.safety_gym import scene as scenes
 from jaxsafe.envs.safety_gym.arena import World
 from jaxsafe.envs.safety_gym.config import SafetyGymConfig, config_from_plain
-from jaxsafe.envs.safety_gym.task import Drive, SafetyGym, physics_of
+from jaxsafe.envs.safety_gym.task import Drive, SafetyGym
 from jaxsafe.types import State
 
 # Velocities and poses of a well-conditioned step agree this well (m and rad, per s).
@@ -234,7 +234,7 @@ def replay(env: Replay, recording: Recording, before: World) -> State:
     goal = f32(recording["state.goal_pos"][rows][:, :2])
     button = i32(np.maximum(recording["state.goal_button"][rows], 0))
 
-    # in parts, as `in_parts` has them
+    # in parts around the physics: JAX's compilation cache keeps no program with a host callback
     @jax.jit
     @jax.vmap
     def drive(world: World, action: jax.Array) -> Drive:
@@ -248,7 +248,8 @@ def replay(env: Replay, recording: Recording, before: World) -> State:
         after = env.after(world, given, drive, moved, readings)
         return after.replace(physics=after.physics.replace(key=world.key))
 
-    run, _ = physics_of(env._engine)
+    run = jax.vmap(env._engine.run)
+    run = run if env.engine == "c" else jax.jit(run)  # a callback alone is not compiled
 
     def step(world: World, action: jax.Array, given: NextGoal) -> State:
         driven = drive(world, action)

@@ -22,7 +22,7 @@ import numpy as np
 
 from jaxsafe.config import ConfigError
 from jaxsafe.envs import engines
-from jaxsafe.envs.engines import Engine, Physics, Readings
+from jaxsafe.envs.engines import Physics, Readings
 from jaxsafe.envs.safety_gym import costs as constraints
 from jaxsafe.envs.safety_gym import layout as layouts
 from jaxsafe.envs.safety_gym import observe, rewards, sight, sleeping
@@ -274,39 +274,3 @@ class SafetyGym:
         dist_goal, dist_box, box_goal = self.arena.distances(new)
         new = new.replace(last_dist_goal=dist_goal, last_dist_box=dist_box, last_box_goal=box_goal)
         return jax.tree.map(lambda a, b: jnp.where(wanted, a, b), new, world)
-
-
-def in_parts(env: SafetyGym, **options: Any) -> tuple[Callable, Callable]:
-    """`reset` and `step` over a batch, each compiled in two parts around the physics.
-
-    JAX keeps no program with a host callback in its compilation cache, and engine c is one. It keeps
-    these parts, so that a second process that needs them starts at once.
-
-    Args:
-        options: of `jax.jit`.
-    """
-
-    def compiled(f: Callable) -> Callable:
-        return jax.jit(jax.vmap(f), **options)
-
-    begin, begun, drive, judge = map(compiled, (env.begin, env.begun, env.drive, env.judge))
-    run, forward = physics_of(env._engine, **options)
-
-    def reset(keys: jax.Array) -> State:
-        world, ctrl = begin(keys)
-        return begun(world, ctrl, *forward(world.bodies, ctrl))
-
-    def step(state: State, action: jax.Array) -> State:
-        given = drive(state.physics, action)
-        return judge(state, given, *run(state.physics.bodies, given.ctrl, given.substeps))
-
-    return reset, step
-
-
-def physics_of(engine: Engine, **options: Any) -> tuple[Callable, Callable]:
-    """`engine.run` and `engine.forward` over a batch; a callback alone is not compiled."""
-    both = jax.vmap(engine.run), jax.vmap(engine.forward)
-    if engine.name == "c":
-        return both
-    run, forward = (jax.jit(f, **options) for f in both)
-    return run, forward

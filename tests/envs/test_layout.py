@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from compiling import BUSY, FAST
 from scipy.stats import chisquare, ks_2samp, kstest
-from tasks import ROBOT_AT_ORIGIN, change, put, task, with_qpos
+from tasks import ROBOT_AT_ORIGIN, change, in_parts, put, task, with_qpos
 
 from jaxsafe import envs
 from jaxsafe.config import ConfigError
@@ -19,7 +19,6 @@ from jaxsafe.envs import registry
 from jaxsafe.envs.safety_gym import layout as layouts
 from jaxsafe.envs.safety_gym.arena import World
 from jaxsafe.envs.safety_gym.config import config_from_plain, defaults
-from jaxsafe.envs.safety_gym.task import in_parts
 
 DATA = Path(__file__).parent.parent / "data"
 RECORDED = ("point_goal2", "car_push2", "doggo_button2")

@@ -10,13 +10,12 @@ import mujoco
 import numpy as np
 import pytest
 from compiling import FAST
-from tasks import ROBOT_AT_ORIGIN, change, task
+from tasks import ROBOT_AT_ORIGIN, change, in_parts, task
 
 from jaxsafe import envs
 from jaxsafe.config import ConfigError
 from jaxsafe.envs import SafetyGym, SafetyGymConfig
 from jaxsafe.envs.safety_gym.scene import built_in
-from jaxsafe.envs.safety_gym.task import in_parts
 
 native: Any = mujoco  # its functions are not known to type checkers
 

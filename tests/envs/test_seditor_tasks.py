@@ -9,14 +9,13 @@ import mujoco
 import numpy as np
 import pytest
 from compiling import FAST
-from tasks import Task, change, put, with_qpos
+from tasks import Task, change, in_parts, put, with_qpos
 
 from jaxsafe import envs
 from jaxsafe.envs.safety_gym import layout as layouts
 from jaxsafe.envs.safety_gym import suite
 from jaxsafe.envs.safety_gym.config import config_from_plain, defaults
 from jaxsafe.envs.safety_gym.scene import GROUP
-from jaxsafe.envs.safety_gym.task import in_parts
 from jaxsafe.envs.view.stage import Stage
 from jaxsafe.envs.wrap import innermost
 

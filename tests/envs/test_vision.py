@@ -11,11 +11,11 @@ import mujoco
 import numpy as np
 import pytest
 from compiling import FAST
+from tasks import in_parts
 
 from jaxsafe import envs
 from jaxsafe.config import ConfigError
 from jaxsafe.envs.safety_gym.sight import drawn_model
-from jaxsafe.envs.safety_gym.task import in_parts
 from jaxsafe.envs.view.render import GAP, Renderer
 from jaxsafe.envs.vision.eye import make_eye
 from jaxsafe.envs.vision.poses import kinematics
