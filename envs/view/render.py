@@ -219,9 +219,11 @@ def run_episode(player: Player, key: jax.Array, length: int) -> tuple[State, dic
     return jax.device_get(jax.jit(episode)())
 
 
-def write_video(frames: Sequence[np.ndarray], path: str | Path, fps: float = FPS) -> None:
-    """Write an .mp4 (H.264), or a .gif of every third frame, to a path that is not there or is to be
-    written over.
+def write_video(frames: Sequence[np.ndarray], path: str | Path) -> None:
+    """Write an .mp4 (H.264) of `FPS` frames a second, or a .gif of every third frame.
+
+    Args:
+        path: not there, or to be written over.
 
     Raises:
         ConfigError: another ending.
@@ -231,9 +233,9 @@ def write_video(frames: Sequence[np.ndarray], path: str | Path, fps: float = FPS
         raise ConfigError(f"{path}: expected a name that ends in .mp4 or .gif")
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix == ".gif":
-        imageio.mimwrite(path, list(frames[::3]), duration=3000 / fps, loop=0)  # type: ignore[arg-type]
+        imageio.mimwrite(path, list(frames[::3]), duration=3000 / FPS, loop=0)  # type: ignore[arg-type]
     else:
         # ffmpeg is spawned instead of forked, of which JAX warns
         os.environ.setdefault("IMAGEIO_FFMPEG_NO_PREVENT_SIGINT", "1")
         options: dict[str, Any] = {"codec": "libx264", "quality": 7, "macro_block_size": 2}
-        imageio.mimwrite(path, list(frames), fps=fps, **options)
+        imageio.mimwrite(path, list(frames), fps=FPS, **options)

@@ -157,14 +157,14 @@ def laprop(lr: jax.Array | float, cfg: Any) -> optax.GradientTransformation:
     return optax.chain(clip_by_share(cfg.clip), optax.flatten(steps))  # as one array: a small program
 
 
-def clip_by_share(share: jax.Array | float, least: float = 1e-3) -> optax.GradientTransformation:
-    """Shortens the gradient of each array to `share` times the array's length, which counts as `least`
-    at least."""
+def clip_by_share(share: jax.Array | float) -> optax.GradientTransformation:
+    """Shortens the gradient of each array to `share` times the array's length, which counts as 1e-3 at
+    least."""
 
     def clip(grads: PyTree, params: PyTree) -> PyTree:
         def one(grad: jax.Array, param: jax.Array) -> jax.Array:
             length = jnp.sqrt(jnp.sum(grad**2))
-            longest = share * jnp.maximum(least, jnp.sqrt(jnp.sum(param**2)))
+            longest = share * jnp.maximum(1e-3, jnp.sqrt(jnp.sum(param**2)))
             return grad * jnp.minimum(1.0, longest / jnp.maximum(length, 1e-30))
 
         return jax.tree.map(one, grads, params)

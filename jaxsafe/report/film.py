@@ -46,7 +46,7 @@ def film(policies: list[RunPolicy], path: Path, seed: int, labels: list[str] | N
         raise NoVideo(one_line(error)) from error
     path.parent.mkdir(parents=True, exist_ok=True)
     with files.replacing(path) as part:
-        render.write_video(render.side_by_side(films), part, fps=30)
+        render.write_video(render.side_by_side(films), part)
 
 
 def check_one_task(folders: list[Path], policies: list[RunPolicy]) -> None:

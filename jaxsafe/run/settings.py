@@ -450,10 +450,10 @@ def having(kind: str, option: str) -> list[str]:
     return [name for name, options in groups.items() if option in {**options, **flat(options)}]
 
 
-def some_of(names: list[str], most: int = 3) -> str:
-    """'a, b, c and 4 more', or all where no more than `most` + 1 are."""
-    if len(names) > most + 1:
-        return f"{', '.join(names[:most])} and {len(names) - most} more"
+def some_of(names: list[str]) -> str:
+    """'a, b, c and 4 more', or all where no more than 4 are."""
+    if len(names) > 4:
+        return f"{', '.join(names[:3])} and {len(names) - 3} more"
     *others, last = names
     return f"{', '.join(others)} and {last}" if others else last
 
@@ -517,8 +517,9 @@ def settings_in(algo: dict[str, Any], kind: type) -> list[dict[str, Any]]:
 # ---- in words ----------------------------------------------------------------------------------
 
 
-def unusual_in_words(settings: Settings, most: int = 4) -> str:
-    """The settings of environment and algorithm that are not the defaults, the most unusual first."""
+def unusual_in_words(settings: Settings) -> str:
+    """Up to four settings of environment and algorithm that are not the defaults, the most unusual
+    first, and how many others there are."""
     names = {"env": {"name": settings.env_name}, "algo": {"name": settings.algo_name}}
     chosen = {"preset": settings.train.preset, "compat": settings.train.compat}
     usual = flat(settings_from_options({**names, **chosen}, settings.extras).plain())
@@ -534,6 +535,6 @@ def unusual_in_words(settings: Settings, most: int = 4) -> str:
         return abs(math.log(abs(here / there))) if math.isfinite(here) else math.inf
 
     ranked = sorted(other, key=oddness, reverse=True)
-    told = [f"{k}={as_text(other[k][0])} (default {as_text(other[k][1])})" for k in ranked[:most]]
-    more = [f"and {len(ranked) - most} more"] if len(ranked) > most else []
+    told = [f"{k}={as_text(other[k][0])} (default {as_text(other[k][1])})" for k in ranked[:4]]
+    more = [f"and {len(ranked) - 4} more"] if len(ranked) > 4 else []
     return f"unusual: {', '.join([*told, *more])}" if told else "all its settings are the defaults"

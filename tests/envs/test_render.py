@@ -214,7 +214,7 @@ def test_an_episode_is_drawn_at_most_at_30_frames_a_second_and_until_it_terminat
 def test_films_can_be_read_back(tmp_path, ending):
     frames = [np.full((48, 64, 3), 40 * i, np.uint8) for i in range(6)]
     path = tmp_path / "new" / f"film.{ending}"
-    render.write_video(frames, path, fps=30)
+    render.write_video(frames, path)
     film = np.stack([np.asarray(frame)[..., :3] for frame in imageio.v2.mimread(path)])
     assert film.shape == (6 if ending == "mp4" else 2, 48, 64, 3)
     assert abs(int(film[0].mean()) - 0) < 12 and film[-1].mean() > film[0].mean() + 60
