@@ -271,8 +271,7 @@ def read_manifest(path: Path) -> Manifest:
         leaves = {
             k: (str(dtype), tuple(int(n) for n in shape)) for k, (dtype, shape) in raw["leaves"].items()
         }
-        at = Progress(*(int(raw.get(name, 0)) for name in Progress._fields))  # 0.1 had no updates
-        since = int(raw.get("since", 0))  # likewise: there was no replay
+        at, since = Progress(*(int(raw[name]) for name in Progress._fields)), int(raw["since"])
         manifest = Manifest(at, {k: str(v) for k, v in raw["files"].items()}, leaves, since)
     if min(*at, since) < 0:
         raise ConfigError(f"{file}: expected an iteration and steps of at least 0")

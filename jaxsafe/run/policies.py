@@ -123,7 +123,8 @@ def member_policies(settings: Settings, env: Env, folder: Path) -> tuple[Algorit
 
 
 def policy_folder(folder: Path) -> Path:
-    """Where the policies of a run lie: in policy/ or, in older runs, in the checkpoints."""
+    """Where the policies of a run lie: in policy/ or, of one that was killed between its first
+    checkpoint and them, in the checkpoints."""
     alone = files.inside(folder, "policy")
     return alone if checkpoint.checkpoints(alone) else files.inside(folder, "checkpoints")
 
