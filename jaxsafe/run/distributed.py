@@ -59,7 +59,8 @@ class Position(NamedTuple):
 def position_from_options(
     coordinator: str | None, num_processes: int | None, process_index: int | None, devices: int
 ) -> Position | None:
-    """From the options or, without any and with several devices, from SLURM; None: a lone process.
+    """From the options, within the bounds of TrainConfig, or, without any and with several devices,
+    from SLURM; None: a lone process.
 
     Raises:
         ConfigError: options are missing, or out of range.
@@ -79,9 +80,7 @@ def position_from_options(
     host, _, port = coordinator.rpartition(":")
     if not host or not port.isdigit() or not 0 < int(port) < 2**16:
         raise ConfigError(f"coordinator={coordinator}: expected host:port, the host that of process 0")
-    if num_processes < 1:
-        raise ConfigError(f"num_processes={num_processes}: expected at least 1")
-    if not 0 <= process_index < num_processes:
+    if process_index >= num_processes:
         raise ConfigError(f"process_index={process_index}: expected 0 to {num_processes - 1}")
     return Position(host.strip("[]"), int(port), num_processes, process_index)
 
