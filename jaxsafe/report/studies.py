@@ -538,9 +538,10 @@ def run_table(
     study: Study, runs: Sequence[SettingRun], known: Mapping[tuple[str, str], Published]
 ) -> str:
     """A row a run: what it reached in training and after it, and what it was made with."""
-    origins = {row["run"]: row for row in study_files.read(study.folder).rows}
+    origins: dict[str, dict[str, str]] = {}
     states: dict[str, set[str]] = {}
     for row in study_files.read(study.folder).rows:
+        origins[row["run"]] = row
         states.setdefault(row["run"], set()).add(row["state"])
     named = {Path(run.config["run_dir"]).name: run for run in runs}
     header = ["run", "seeds", "return, last 10%", "cost, last 10%", "final policy"]
