@@ -27,16 +27,18 @@ from jaxsafe.envs.vision.rays import SHAPES, Vector
 
 # (qpos [nq], mocap_pos [nmocap, 3], mocap_quat [nmocap, 4]) -> uint8 [height, width, 3]
 Eye = Callable[[jax.Array, jax.Array, jax.Array], jax.Array]
+GREY = (0.5, 0.5, 0.5, 1.0)  # of a geom that has no colour of its own: it has its material's
 BANDS = 4  # parts in which a picture is drawn, one after the other: fewer need more memory
 
 
 class Thing(NamedTuple):
-    """A geom as it is compiled."""
+    """A geom as it is compiled. glow: what shines on it besides the lights, in all of its colours."""
 
     kind: int
     size: tuple[float, float, float]
     rgb: tuple[float, float, float]
     alpha: float
+    glow: float
     checker: surface.Checker | None
 
 
@@ -118,11 +120,14 @@ def thing_of(model: mujoco.MjModel, geom: int) -> Thing:
     kind, name = int(model.geom_type[geom]), model.geom(geom).name or geom
     if kind not in SHAPES:
         raise ValueError(f"geom {name}: expected a plane, sphere, capsule, cylinder or box")
-    material = model.geom_matid[geom]
-    rgba = model.geom_rgba[geom] if material < 0 else model.mat_rgba[material]
+    material, rgba, glow = model.geom_matid[geom], model.geom_rgba[geom], 0.0
+    if material >= 0:
+        rgba = model.mat_rgba[material] if (rgba == GREY).all() else rgba
+        glow = float(model.mat_emission[material])
     red, green, blue, alpha = rgba.tolist()
     x, y, z = model.geom_size[geom].tolist()
-    return Thing(kind, (x, y, z), (red, green, blue), alpha, surface.checker_of(model, geom))
+    checker = surface.checker_of(model, geom)
+    return Thing(kind, (x, y, z), (red, green, blue), alpha, glow, checker)
 
 
 def camera_of(model: mujoco.MjModel, name: str) -> Callable[[Pose], Pose]:
@@ -191,7 +196,7 @@ def painted(
     origin, direction = vector(view.origins[geom]), ray(axes, u, v)
     lamps = [vector(axes[:, 2]), *(vector(light) for light in view.towards[geom])]
     t, normal = SHAPES[thing.kind](thing.size, origin, direction)
-    colour = surface.lit(thing.rgb, drawing.lights, normal, lamps)
+    colour = surface.lit(thing.rgb, thing.glow, drawing.lights, normal, lamps)
     if thing.checker is None:
         return t, colour
     seen = jnp.where(jnp.isfinite(t), t, 0.0)

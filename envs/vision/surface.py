@@ -44,14 +44,20 @@ def lights_of(model: mujoco.MjModel) -> Lights:
 
 
 def lit(
-    rgb: tuple[float, float, float], lights: Lights, normal: Vector, towards: list[Vector]
+    rgb: tuple[float, float, float],
+    glow: float,
+    lights: Lights,
+    normal: Vector,
+    towards: list[Vector],
 ) -> Colour:
-    """A surface of colour `rgb` under the lights that stand `towards`, in the frame of `normal`."""
+    """A surface of colour `rgb` under its own `glow` and the lights that stand `towards`, in the frame
+    of `normal`."""
     shares = [jnp.maximum(dot(normal, light), 0.0) for light in towards]
 
     def channel(k: int) -> jax.Array:
         falling = zip(lights.diffuse[:, k].tolist(), shares, strict=True)
-        light = float(lights.ambient[k]) + sum(strength * share for strength, share in falling)
+        light = glow + float(lights.ambient[k])
+        light += sum(strength * share for strength, share in falling)
         return jnp.clip(rgb[k] * light, 0.0, 1.0)
 
     return channel(0), channel(1), channel(2)

@@ -202,6 +202,27 @@ def test_what_cannot_be_drawn_is_refused_in_one_line(tmp_path):
         seeing("point_goal1", vision_size=(0, 40))
 
 
+def middle(asset: str, geom: str, light: str = "") -> list[int]:
+    """The colour of a sphere where it faces the camera, whose light is half of full there."""
+    spec = native.MjSpec.from_string(
+        f"<mujoco><asset>{asset}</asset><worldbody>{light}<geom size='.5' {geom}/>"
+        "<camera name='c' pos='0 -2 0' xyaxes='1 0 0 0 0 1'/></worldbody></mujoco>"
+    )
+    spec.visual.headlight.ambient[:] = 0.1
+    spec.visual.headlight.diffuse[:] = 0.4
+    spec.visual.headlight.specular[:] = 0
+    eye = make_eye(spec.compile(), "c", (5, 5))
+    return jax.jit(eye)(jnp.zeros(0), jnp.zeros((0, 3)), jnp.zeros((0, 4)))[2, 2].tolist()
+
+
+def test_a_geom_has_its_own_colour_before_its_material_s_and_the_material_s_glow():
+    red = "<material name='m' rgba='1 0 0 1' emission='{}'/>"
+    assert middle("", "rgba='0 1 0 1'") == [0, 128, 0]
+    assert middle(red.format(0), "material='m'") == [128, 0, 0]
+    assert middle(red.format(0), "material='m' rgba='0 1 0 1'") == [0, 128, 0]
+    assert middle(red.format(0.3), "material='m'") == [204, 0, 0]
+
+
 def test_a_light_or_a_texture_of_another_kind_is_refused():
     scene = "<mujoco><asset>{}</asset><worldbody>{}<camera name='c'/></worldbody></mujoco>"
     for asset, body, reason in [
