@@ -28,17 +28,17 @@ class Lights(NamedTuple):
 
 
 def lights_of(model: mujoco.MjModel) -> Lights:
-    """Raises ValueError for lights that are near, and for highlights."""
-    own = model.vis.headlight
+    """Those that are on. Raises ValueError for lights that are near, and for highlights."""
+    own, on = model.vis.headlight, model.light_active.astype(bool)
     directional = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
-    if (model.light_type != directional).any() or (model.light_bodyid != 0).any():
+    if (model.light_type[on] != directional).any() or (model.light_bodyid[on] != 0).any():
         raise ValueError("expected directional lights that belong to the world")
-    if np.any(own.specular) or model.light_specular.any():
+    if np.any(own.specular) or model.light_specular[on].any():
         raise ValueError("expected lights without highlights: specular 0")
-    towards = -model.light_dir / np.linalg.norm(model.light_dir, axis=1, keepdims=True)
+    towards = -model.light_dir[on] / np.linalg.norm(model.light_dir[on], axis=1, keepdims=True)
     return Lights(
-        own.ambient + model.light_ambient.sum(0),
-        np.concatenate([own.diffuse[None], model.light_diffuse]),
+        own.ambient + model.light_ambient[on].sum(0),
+        np.concatenate([own.diffuse[None], model.light_diffuse[on]]),
         towards,
     )
 

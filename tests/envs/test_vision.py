@@ -223,6 +223,12 @@ def test_a_geom_has_its_own_colour_before_its_material_s_and_the_material_s_glow
     assert middle(red.format(0.3), "material='m'") == [204, 0, 0]
 
 
+def test_a_light_that_is_off_does_not_shine():
+    light = "<light type='directional' dir='0 1 0' diffuse='.3 .3 .3' specular='0 0 0' active='{}'/>"
+    assert middle("", "rgba='0 1 0 1'", light.format("true")) == [0, 204, 0]  # 0.1 + 0.4 + 0.3
+    assert middle("", "rgba='0 1 0 1'", light.format("false")) == [0, 128, 0]
+
+
 def test_a_light_or_a_texture_of_another_kind_is_refused():
     scene = "<mujoco><asset>{}</asset><worldbody>{}<camera name='c'/></worldbody></mujoco>"
     for asset, body, reason in [
