@@ -134,6 +134,9 @@ def camera_of(model: mujoco.MjModel, name: str) -> Callable[[Pose], Pose]:
     """Where a camera is, of the poses of all bodies: on a body or, as one that tracks it, beside."""
     index = model.camera(name).id
     body, mode = model.cam_bodyid[index], model.cam_mode[index]
+    perspective = model.cam_projection[index] == mujoco.mjtProjection.mjPROJ_PERSPECTIVE
+    if not perspective or model.cam_sensorsize[index].any():
+        raise ValueError(f"camera {name}: expected a perspective one with fovy, without sensorsize")
     if mode == mujoco.mjtCamLight.mjCAMLIGHT_TRACK:
         offset = jnp.asarray(model.cam_pos0[index], jnp.float32)
         axes = jnp.asarray(model.cam_mat0[index].reshape(3, 3), jnp.float32)

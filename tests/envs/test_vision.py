@@ -245,3 +245,20 @@ def test_a_light_or_a_texture_of_another_kind_is_refused():
         spec.visual.headlight.specular[:] = 0
         with pytest.raises(ValueError, match=reason):
             make_eye(spec.compile(), "c", (4, 4))
+
+
+@pytest.mark.parametrize(
+    "attributes, reason",
+    [
+        ("mode='targetbody' target='t'", "expected one that is fixed to its body"),
+        ("projection='orthographic'", "expected a perspective one with fovy"),
+        ("sensorsize='.03 .02' focal='.03 .03' resolution='60 40'", "without sensorsize"),
+    ],
+)
+def test_a_camera_of_another_kind_is_refused(attributes, reason):
+    spec = native.MjSpec.from_string(
+        f"<mujoco><worldbody><body name='t'/><camera name='c' {attributes}/></worldbody></mujoco>"
+    )
+    spec.visual.headlight.specular[:] = 0
+    with pytest.raises(ValueError, match=f"camera c: .*{reason}"):
+        make_eye(spec.compile(), "c", (4, 4))
