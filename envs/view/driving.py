@@ -65,18 +65,17 @@ def robot_of(env: SafetyGym) -> str:
     return path.stem
 
 
-def drive(env: SafetyGym, forward: float, turn: float, step: int) -> np.ndarray:
+def drive(env: SafetyGym, forward: float, turn: float, seconds: float) -> np.ndarray:
     """The action [A] that goes forward (1) or back (-1) and turns left (1) or right (-1).
 
     Point takes both as they are; Car's wheels get their sum and difference. Doggo walks: a
-    gait of its twelve torques, at this step of the episode; while it turns it does not go.
+    gait of its twelve torques, at this time of the episode; while it turns it does not go.
     """
     robot = robot_of(env)
     if robot == "point":
         return np.array([forward, turn])
     if robot == "car":
         return np.clip([forward + turn, forward - turn], -1, 1)
-    seconds = step * env.step_seconds
     if turn:
         return gait(TURN, seconds, right=turn < 0)
     if forward:

@@ -94,7 +94,7 @@ class Playback:
         """One step; after the last of an episode, the next begins."""
         with self._lock:
             forward, turn = pushed(self.held)
-            action = np.float32(drive(self.env, forward, turn, self.steps))
+            action = np.float32(drive(self.env, forward, turn, self.steps * self.seconds))
             driven = np.bool_(forward or turn)
             self.state, self._carry, self.said = jax.device_get(
                 self._step(self.state, self._carry, action, driven)

@@ -66,11 +66,23 @@ def driven(env: envs.SafetyGym, ask: tuple[int, int], steps: int) -> tuple[float
     place = body.xpos.copy()
     for step in range(steps):
         before = body.xmat.reshape(3, 3).copy()
-        data.ctrl[:] = drive(env, *ask, step=step)
+        data.ctrl[:] = drive(env, *ask, seconds=step * env.step_seconds)
         mujoco.mj_step(model, data, env.config.frameskip_binom_n)  # type: ignore[attr-defined]
         turned += float(np.arctan2(*(before.T @ body.xmat.reshape(3, 3))[[1, 0], 0]))
     front = FRONT[robot_of(env)]
     return float((body.xpos - place) @ (np.cos(front), np.sin(front), 0)), turned
+
+
+def test_a_gait_keeps_its_pace_where_actions_are_repeated(monkeypatch):
+    times = []
+    monkeypatch.setattr(
+        playback, "drive", lambda env, go, turn, seconds: times.append(seconds) or np.zeros(2)
+    )
+    env = envs.make("point_goal0", engine="c", wrap={"action_repeat": 5})  # of 0.02 s each
+    played = playback.Playback(env)
+    for _ in range(3):
+        played.step()
+    np.testing.assert_allclose(times, [0.0, 0.1, 0.2])
 
 
 def test_no_keys_drive_a_robot_of_ones_own(tmp_path):
