@@ -178,9 +178,10 @@ def lidar_angles(cfg: SafetyGymConfig) -> np.ndarray:
 
 
 def split(obs: Any, spec: dict[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
-    """Components of an observation by name, each flat; what follows them is left out."""
+    """Components of an observation by name, each flat; what follows them, as older frames, is left
+    out."""
     if isinstance(obs, dict) and "vector" not in obs:
-        return {name: np.asarray(value).reshape(-1) for name, value in obs.items()}
+        return {name: np.asarray(obs[name])[..., : k[-1]].reshape(-1) for name, k in spec.items()}
     ends = np.cumsum([int(np.prod(shape)) for shape in spec.values()], dtype=int)
     return dict(zip(spec, np.split(np.asarray(vector_of(obs)), ends), strict=False))
 

@@ -192,6 +192,18 @@ def test_what_an_algorithm_appends_to_an_observation_is_not_drawn():
         np.testing.assert_array_equal(parts["velocimeter"], [3, 4])
 
 
+def test_of_stacked_components_the_newest_is_drawn():
+    env, state = reset("point_goal1", observation_flatten=False)
+    older = jax.tree.map(jnp.zeros_like, state.obs)
+    stacked = jax.tree.map(lambda *x: jnp.concatenate(x, -1), state.obs, older)
+    newest, both = (split(obs, env.observation_spec) for obs in (state.obs, stacked))
+    assert newest.keys() == both.keys() == env.observation_spec.keys()
+    for name, value in newest.items():
+        np.testing.assert_array_equal(both[name], value)
+    places = [geom.pos.tolist() for geom in marks(env, state)]
+    assert [geom.pos.tolist() for geom in marks(env, state.replace(obs=stacked))] == places
+
+
 def test_an_unknown_camera_is_named_with_the_nearest():
     env, _ = reset("point_goal0")
     with pytest.raises(ConfigError, match=r"'fixedfur'.*fixedfar"):
