@@ -62,16 +62,20 @@ def mocap_poses(arena: Arena, world: World) -> tuple[jax.Array, jax.Array]:
     guides = engines.mocap_at(physics.mocap_pos, scene.orbit, time, jnp)
     # gremlins start at their circles' centres
     positions = [jnp.where(physics.substeps > 0, guides, physics.mocap_pos)]
-    for mark in marks_of(arena):
-        place = {
-            "circle": lambda: jnp.zeros((1, 2)),
-            "hazard": lambda: arena.positions(world, "hazards"),
-            "goal": lambda: arena.goal_position(world)[None, :2],
-        }[mark.kind]()
-        positions.append(jnp.pad(place, ((0, 0), (0, 1)), constant_values=mark.height))
+    positions += [places(arena, world, mark) for mark in marks_of(arena)]
     position = jnp.concatenate(positions)
     upright = jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0]), (len(position) - len(physics.mocap_quat), 1))
     return position, jnp.concatenate([physics.mocap_quat, upright])
+
+
+def places(arena: Arena, world: World, mark: Mark) -> jax.Array:
+    """Where the centres of a mark are, float [count, 3] (m)."""
+    xy = {
+        "circle": lambda: jnp.zeros((1, 2)),
+        "hazard": lambda: arena.positions(world, "hazards"),
+        "goal": lambda: arena.goal_position(world)[None, :2],
+    }[mark.kind]()
+    return jnp.pad(xy, ((0, 0), (0, 1)), constant_values=mark.height)
 
 
 def make_sight(arena: Arena) -> Callable[[World], jax.Array]:

@@ -16,6 +16,7 @@ from jaxsafe.config import ConfigError
 from jaxsafe.envs import engines
 from jaxsafe.envs.racing.task import CarRacing
 from jaxsafe.envs.safety_gym import scene as scenes
+from jaxsafe.envs.safety_gym import sight
 from jaxsafe.envs.safety_gym.arena import World
 from jaxsafe.envs.safety_gym.config import SafetyGymConfig
 from jaxsafe.envs.safety_gym.task import SafetyGym
@@ -57,20 +58,16 @@ class Stage:
     def mark(self, geoms: mujoco.MjvScene, state: State) -> None:
         """Add to `geoms` what is no body: goal, hazards, circle, halo, and the light of a cost."""
         env, cfg, world = self.env, self.env.config, state.physics
-        if cfg.task in ("goal", "push"):
-            size = (cfg.goal_size, cfg.goal_size / 2, 0)
-            self._add(geoms, "goal", CYLINDER, size, env.goal_position(world), colour("goal"))
-        if cfg.task == "button":  # more opaque than the original's 0.1, which is hardly seen
+        seen = sight.marks_of(env.arena)
+        for mark in seen:
+            for place in sight.places(env.arena, world, mark):
+                self._add(geoms, mark.kind, CYLINDER, (*mark.size, 0), place, colour(mark.kind))
+        # more opaque than the original's 0.1, which is hardly seen; where SEditor's goal stands, none
+        if cfg.task == "button" and "goal" not in [mark.kind for mark in seen]:
             radius = 2 * cfg.buttons_size
             size = (radius, min(radius, 0.3), 0)
             rgba = (*colour("button")[:3], 0.35)
             self._add(geoms, "goal", CYLINDER, size, env.goal_position(world), rgba)
-        if cfg.task == "circle":
-            size = (cfg.circle_radius, 0.01, 0)
-            self._add(geoms, "circle", CYLINDER, size, (0, 0, 0.02), colour("circle"))
-        for xy in env.positions(world, "hazards"):
-            size = (cfg.hazards_size, 0.01, 0)
-            self._add(geoms, "hazard", CYLINDER, size, (*xy, 0.02), colour("hazard"))
         if cfg.render_lidar_markers:
             self._mark_halo(geoms, state.obs)
         if state.cost > 0:

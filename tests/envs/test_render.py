@@ -150,6 +150,19 @@ def test_halo_and_cost_light_have_the_places_and_colours_of_the_original():
     np.testing.assert_allclose(light.pos, [0, 0, 0.1], atol=1e-7)
 
 
+def test_seditor_s_goal_and_hazards_are_drawn_as_high_as_they_are():
+    """0.4 m, from the floor up. The goal stands at the button to press, which needs no other mark."""
+    env, state = reset("seditor_point_button1", wrap={"frame_stack": 1}, render_lidar_markers=False)
+    *hazards, goal = marks(env, state)
+    for geom in (*hazards, goal):
+        assert geom.size[2] == geom.pos[2] == np.float32(0.2)
+    np.testing.assert_allclose(
+        [hazard.pos[:2] for hazard in hazards], env.positions(state.physics, "hazards")
+    )
+    np.testing.assert_allclose(goal.pos[:2], env.goal_position(state.physics)[:2])
+    np.testing.assert_allclose(goal.rgba, [0, 1, 0, 0.25])
+
+
 def test_panels_stand_side_by_side_and_a_short_film_waits_at_its_end():
     long = [np.full((4, 6, 3), i, np.uint8) for i in range(3)]
     short = [np.full((4, 6, 3), 100 + i, np.uint8) for i in range(2)]
