@@ -59,8 +59,8 @@ class Pendulum(WithoutModel):
         velocity += 0.05 * push
         reward = -((angle - self.goal) ** 2)
         angle += 0.05 * velocity
+        unsafe = jnp.abs(angle) > self.threshold  # before it may come round on the other side
         angle = (angle + jnp.pi) % (2 * jnp.pi) - jnp.pi
-        unsafe = jnp.abs(angle) > self.threshold
         return arrived(jnp.stack([angle, jnp.clip(velocity, -8.0, 8.0)]), reward, unsafe)
 
 

@@ -71,6 +71,15 @@ def test_a_step_is_unsafe_where_the_barrier_is_above_1_and_ends_the_episode(name
     assert env.barrier(env.reset(jax.random.key(1)).obs) < 0.1
 
 
+def test_a_pendulum_that_swings_past_the_bottom_is_unsafe():
+    """From 2.95 rad at 7 rad/s to 3.32 rad, which is -2.97 rad from upright."""
+    env = envs.make("pendulum_upright", threshold=3.0)
+    state = env.reset(jax.random.key(0)).replace(physics=jnp.array([2.95, 7.0]))
+    after = env.step(state, jnp.ones(1))
+    assert after.obs[0] == pytest.approx(-2.968, abs=0.01)
+    assert after.cost == 1 and after.terminated
+
+
 def test_the_mean_pole_stays_up_and_the_start_is_never_random():
     """Without a push it leans to the side of its centre, 1/600 rad, and falls that way."""
     env = envs.make("pendulum_move")
