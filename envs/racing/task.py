@@ -144,7 +144,8 @@ class CarRacing(WithoutModel):
     # Its parts -------------------------------------------------------------------------------------
 
     def random_obstacles(self, track: Track, key: jax.Array) -> Obstacles:
-        """One in the first half of each stretch of `obstacle_every` tiles but the first."""
+        """One in the first half of each stretch of `obstacle_every` tiles but the first. None stands
+        beside the start."""
         every = max(1, self.obstacle_every)
         most = MOST_TILES // every if self.obstacle_every else 0
         tile_key, side_key, width_key = jax.random.split(key, 3)
@@ -152,8 +153,9 @@ class CarRacing(WithoutModel):
         within = jax.random.randint(tile_key, (most,), 0, max(1, every // 2))
         side = jax.random.rademacher(side_key, (most,), jnp.float32)
         width = jnp.maximum(0.1, jnp.abs(1 + jax.random.normal(width_key, (most,)))) * HALF_WIDTH / 4
-        there = stretch < track.count // every
-        return Obstacles(stretch * every + within, side * HALF_WIDTH / 2, jnp.where(there, width, -1.0))
+        tile = stretch * every + within
+        there = (stretch < track.count // every) & (tile > 1) & (tile < track.count - 1)
+        return Obstacles(tile, side * HALF_WIDTH / 2, jnp.where(there, width, -1.0))
 
     def observe(self, world: World, tile: jax.Array) -> PyTree:
         car, track, obstacles = world.car, world.track, world.obstacles

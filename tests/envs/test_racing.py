@@ -175,6 +175,15 @@ def test_obstacles_stand_on_a_tenth_of_the_tiles_apart_and_off_the_start():
     assert width.min() >= 0.1 - 1e-6 and abs(width.mean() - 1.167) < 0.05  # of |N(1, 1)|
 
 
+def test_no_episode_begins_on_an_obstacle():
+    """With one on every tile, too, but that of the start and the two beside it."""
+    _, reset, _ = compiled(1, obstacle_every=1)
+    state = reset(jax.random.split(jax.random.key(0), 64))
+    assert not state.physics.touched.any() and not state.cost.any()
+    there = (state.physics.obstacles.half_width > 0).sum(1)
+    np.testing.assert_array_equal(there, state.physics.track.count - 3)
+
+
 # ---- rewards and costs -------------------------------------------------------------------------
 
 
