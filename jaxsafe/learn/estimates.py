@@ -175,7 +175,8 @@ def estimate_batch(
 
 def by_step(x: jax.Array) -> jax.Array:
     """[T * N, ...] of [T, N, ...]."""
-    return x.reshape(-1, *x.shape[2:])
+    steps, envs, *rest = x.shape  # a vector beside a picture may be empty, so that -1 would not tell
+    return x.reshape(steps * envs, *rest)
 
 
 def by_env(x: jax.Array) -> jax.Array:

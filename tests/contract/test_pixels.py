@@ -30,7 +30,7 @@ from jaxsafe.learn.sequences import SequenceBatch
 from jaxsafe.nn.beta import beta_policy
 from jaxsafe.nn.critics import q_values
 from jaxsafe.run.dataset import read_dataset, write_dataset
-from jaxsafe.types import Policy, Shared
+from jaxsafe.types import Policy, Shared, State
 
 REPLAY: dict[str, Any] = {
     "num_envs": 32,
@@ -97,6 +97,29 @@ def test_an_on_policy_update_keeps_the_structure(name, options):
     after, _ = jax.eval_shape(algo.update, before, START)
     chex.assert_trees_all_equal_shapes_and_dtypes(before, after)
     assert before.normaliser.mean.shape == (1,)  # of the vector
+
+
+@dataclasses.dataclass(frozen=True)
+class PictureAlone(Patch):
+    """Its vector is empty."""
+
+    obs_size: int = 0
+
+    def step(self, state: State, action: jax.Array) -> State:
+        return super().step(dataclasses.replace(state, obs=state.obs | {"vector": jnp.ones(1)}), action)
+
+    def _state(self, *args: Any) -> State:
+        state = super()._state(*args)
+        return dataclasses.replace(state, obs=state.obs | {"vector": jnp.zeros(0)})
+
+
+@pytest.mark.parametrize("name, options", [*ON_POLICY, ("sac_lag", REPLAY)])
+def test_algorithms_learn_from_pictures_alone(name, options):
+    sizes = {} if options is REPLAY else TINY | {"encoder": "cnn"}
+    algo, cfg = ALGOS[name].make(PictureAlone()), ALGOS[name].config(**sizes, **options)
+    before = jax.eval_shape(lambda: algo.init(jax.random.key(0), cfg, START))
+    after, _ = jax.eval_shape(algo.update, before, START)
+    chex.assert_trees_all_equal_shapes_and_dtypes(before, after)
 
 
 def test_bc_imitates_from_pictures_of_a_file(tmp_path):
