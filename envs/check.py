@@ -29,13 +29,15 @@ def check_env(env: Any, name: str) -> Env:
             "an environment of Brax or Playground goes through jaxsafe.interop.brax.from_brax"
         )
     for member in SIZES:
-        size = getattr(env, member)
-        if not isinstance(size, int) or size < 1:
-            raise ConfigError(f"{name}: {member} is {size!r}, expected a whole number above 0")
+        size, least = getattr(env, member), 0 if member == "obs_size" else 1
+        if not isinstance(size, int) or size < least:
+            raise ConfigError(f"{name}: {member} is {size!r}, expected a whole number from {least} on")
     if isinstance(env.cost_names, str):
         raise ConfigError(f"{name}: cost_names is {env.cost_names!r}, expected a tuple of names")
     first = jax.eval_shape(env.reset, jax.random.key(0))
     check_state(first, env, f"{name}.reset")
+    if env.obs_size == 0 and not isinstance(first.obs, dict):
+        raise ConfigError(f"{name}: obs_size is 0 and there is no picture, expected something to see")
     action = jax.ShapeDtypeStruct((env.action_size,), jnp.float32)
     after = jax.eval_shape(env.step, first, action)
     check_state(after, env, f"{name}.step")

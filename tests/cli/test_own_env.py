@@ -162,6 +162,31 @@ def test_a_member_that_is_missing_or_odd_is_one_line():
     assert check_env(Ticker(), "clock") == Ticker()
 
 
+class Dark(Corridor):
+    """Shows nothing."""
+
+    def _state(self, x):
+        return dataclasses.replace(super()._state(x), obs=self.shown())
+
+    def shown(self) -> Any:
+        return jnp.zeros(0)
+
+
+class Pictured(Dark):
+    """Shows a picture alone."""
+
+    def shown(self) -> Any:
+        return {"vector": jnp.zeros(0), "vision": jnp.zeros((8, 8, 3), jnp.uint8)}
+
+
+def test_an_observation_is_something_if_only_a_picture():
+    with pytest.raises(ConfigError, match="odd: obs_size is 0 and there is no picture"):
+        check_env(Dark(obs_size=0), "odd")
+    with pytest.raises(ConfigError, match="obs_size is -1, expected a whole number from 0 on"):
+        check_env(Dark(obs_size=-1), "odd")
+    assert check_env(Pictured(obs_size=0), "seen").obs_size == 0
+
+
 @pytest.mark.parametrize(
     "end, found",
     [
