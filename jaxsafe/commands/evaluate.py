@@ -26,6 +26,7 @@ def command() -> int:
     parser.add_argument(
         "code",
         nargs="*",
+        default=(),  # without one argparse says that it is required
         metavar=", ".join(CODE),
         help="your own environment, algorithm or robot, if the run has one",
     )
