@@ -8,7 +8,7 @@ import inspect
 from collections.abc import Callable
 from typing import Any, Literal
 
-from jaxsafe.config import ConfigError, convert, from_dict, import_object, nearest, shown
+from jaxsafe.config import ConfigError, UnnamedCode, convert, from_dict, import_object, nearest, shown
 from jaxsafe.envs import pendulum
 from jaxsafe.envs.check import check_env
 from jaxsafe.envs.engines.choose import ENGINES
@@ -95,10 +95,7 @@ def canonical(name: str) -> str:
     if name in ALIASES:
         return ALIASES[name]
     if ":" in name:
-        raise ConfigError(
-            f"{name} is code, which is not imported because a file names it; if you trust it, add "
-            f"env={name}"
-        )
+        raise UnnamedCode("env", name)
     raise ConfigError(f"unknown environment {name!r}{nearest(name, [*ENVS, *ALIASES])}")
 
 

@@ -23,6 +23,16 @@ class ConfigError(ValueError):
     """A setting that cannot be used. The message is one line for the user."""
 
 
+class UnnamedCode(ConfigError):
+    """Code of the user's that a file names and the user has not named."""
+
+    def __init__(self, kind: str, name: str):
+        super().__init__(
+            f"{name} is code, which is not imported because a file names it; if you trust it, add "
+            f"{kind}={name}"
+        )
+
+
 def one_line(error: BaseException) -> str:
     """The first line of what an error says, or its kind if it says nothing."""
     lines = (line.strip() for line in str(error).splitlines())

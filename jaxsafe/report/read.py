@@ -11,7 +11,7 @@ import numpy as np
 
 import jaxsafe
 from jaxsafe.algos import ALGOS
-from jaxsafe.config import ConfigError, flat
+from jaxsafe.config import ConfigError, UnnamedCode, flat
 from jaxsafe.envs import ENVS
 from jaxsafe.learn.constraints import cost_title, limits_of
 from jaxsafe.report import scores, study_files
@@ -125,6 +125,8 @@ def read_one(folder: Path, extras: Extras = NO_EXTRAS) -> list[SettingRun]:
     plain = run_folder.read_config(folder)
     try:
         saved = settings_from_config(plain, extras)
+    except UnnamedCode as error:
+        raise ConfigError(f"{folder}: {error}") from error
     except ConfigError as error:
         by = run_folder.trained_by(folder)
         raise ConfigError(

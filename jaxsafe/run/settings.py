@@ -24,6 +24,7 @@ from jaxsafe.config import (
     Period,
     RunSteps,
     Seed,
+    UnnamedCode,
     check_values,
     convert,
     flat,
@@ -339,10 +340,7 @@ def find_algo(name: str, extras: Extras = NO_EXTRAS) -> Row:
     if convert(name, str, "algo") in known:
         return known[name]
     if ":" in name:
-        raise ConfigError(
-            f"{name} is code, which is not imported because a file names it; if you trust it, add "
-            f"algo={name}"
-        )
+        raise UnnamedCode("algo", name)
     raise ConfigError(f"unknown algo {name!r}{nearest(name, known)}")
 
 
