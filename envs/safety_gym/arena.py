@@ -52,6 +52,18 @@ class Arena:
         """What the robot seeks: 'goal', 'buttons' or nothing."""
         return {"goal": "goal", "push": "goal", "button": "buttons"}.get(self.config.task)
 
+    @property
+    def goal_mark(self) -> tuple[float, float]:
+        """Radius and half height of the goal's cylinder (m); a radius of 0: none is there.
+
+        By SEditor's rules one stands at the button to press, too, as wide as that.
+        """
+        cfg = self.config
+        half = cfg.half_height(cfg.goal_size / 2)
+        if self.goal_kind == "buttons":
+            return (cfg.buttons_size if cfg.rules == "seditor" else 0.0), half
+        return (cfg.goal_size if self.goal_kind == "goal" else 0.0), half
+
     def at_rest(self, xy: jax.Array, headings: jax.Array, key: jax.Array) -> World:
         """Everything at rest at positions [n, 2] (m) with headings [n] (rad), before the first goal."""
         cfg, scene = self.config, self.scene
@@ -126,9 +138,11 @@ class Arena:
         """Position [3] of the goal, or of the button to press; the origin where there is neither."""
         cfg = self.config
         if self.goal_kind == "goal":
-            return jnp.append(self.positions(world, "goal")[0], cfg.goal_size / 2 + 0.01)
+            height = cfg.half_height(cfg.goal_size / 2) + 0.01
+            return jnp.append(self.positions(world, "goal")[0], height)
         if self.goal_kind == "buttons":
-            return jnp.append(self.positions(world, "buttons")[world.goal_button], cfg.buttons_size)
+            height = cfg.half_height(cfg.buttons_size)
+            return jnp.append(self.positions(world, "buttons")[world.goal_button], height)
         return jnp.zeros(3)
 
     def distances(self, world: World) -> tuple[jax.Array, jax.Array, jax.Array]:

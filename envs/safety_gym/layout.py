@@ -103,11 +103,11 @@ def placement(cfg: SafetyGymConfig) -> Placement:
     Raises:
         ConfigError: an object whose rectangles vanish when shrunk by its keepout.
     """
-    theirs = cfg.rules == "safety_gymnasium"  # there a mark of the goal lies among the buttons, too
+    mark = cfg.rules != "safety_gym"  # elsewhere a mark of the goal is placed among buttons, too
     counts = {kind: getattr(cfg, f"{kind}_num") for kind in KINDS}
     counts |= {
         "robot": 1,
-        "goal": cfg.task in ("goal", "push") or (theirs and cfg.task == "button"),
+        "goal": cfg.task in ("goal", "push") or (mark and cfg.task == "button"),
         "box": cfg.task == "push",
     }
     kinds = [kind for kind in ORDER[cfg.rules] for _ in range(counts[kind])]

@@ -151,8 +151,10 @@ def lidars(
         if cfg.lidar_type == "natural":
             group = scenes.GROUP[name if name in scenes.GROUP else name[:-1]]
             shapes = shapes_of(arena, world, readings)
-            source = position.at[2].set(RAY_HEIGHT) if cfg.rules == "seditor" else position
-            lidar = sensing.natural_lidar(shapes, source, rotation, cfg.lidar_num_bins, group, slack)
+            source, turn = position, rotation
+            if cfg.rules == "seditor":  # level, also where the robot tilts
+                source, turn = position.at[2].set(RAY_HEIGHT), rotation.at[2].set(0.0)
+            lidar = sensing.natural_lidar(shapes, source, turn, cfg.lidar_num_bins, group, slack)
         else:
             law = (cfg.lidar_max_dist, cfg.lidar_exp_gain, cfg.lidar_alias)
             lidar = sensing.pseudo_lidar(targets, position, rotation, cfg.lidar_num_bins, *law)
@@ -175,14 +177,13 @@ def shapes_of(arena: Arena, world: World, readings: Readings) -> sensing.Shapes:
     position, rotation = (readings.fields[name][others] for name in ("geom_xpos", "geom_xmat"))
     cylinder, box = int(mujoco.mjtGeom.mjGEOM_CYLINDER), int(mujoco.mjtGeom.mjGEOM_BOX)
     extra: list[tuple] = []  # type, size, group, position, rotation
-    tall = cfg.rules == "seditor"  # the goal and hazards, too; and a goal stands at the button to press
-    if arena.goal_kind == "goal" or (arena.goal_kind and tall):
-        place, half = arena.goal_position(world), cfg.half_height(cfg.goal_size / 2)
-        place = place.at[2].set(half) if tall else place
-        extra.append((cylinder, (cfg.goal_size, half, 0), scenes.GROUP["goal"], place, jnp.eye(3)))
+    radius, half = arena.goal_mark
+    if radius:
+        place = arena.goal_position(world).at[2].set(half + 0.01)
+        extra.append((cylinder, (radius, half, 0), scenes.GROUP["goal"], place, jnp.eye(3)))
     for xy in arena.positions(world, "hazards"):
         half = cfg.half_height(0.01)
-        place = jnp.append(xy, half if tall else 0.02)
+        place = jnp.append(xy, half + 0.01)
         extra.append((cylinder, (cfg.hazards_size, half, 0), scenes.GROUP["hazard"], place, jnp.eye(3)))
     if cfg.gremlins_num:
         physics, timestep = world.bodies, model.opt.timestep

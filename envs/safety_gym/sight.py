@@ -29,14 +29,17 @@ class Mark(NamedTuple):
 
 
 def marks_of(arena: Arena) -> list[Mark]:
-    cfg, tall = arena.config, arena.config.rules == "seditor"
-    half, flat = cfg.half_height(cfg.goal_size / 2), cfg.half_height(0.01)
-    marks = [Mark("circle", int(cfg.task == "circle"), (cfg.circle_radius, 0.01), 0.02)]
-    marks += [Mark("hazard", cfg.hazards_num, (cfg.hazards_size, flat), flat if tall else 0.02)]
-    # SEditor's goal stands at the button to press, too
-    there = arena.goal_kind == "goal" or (tall and bool(arena.goal_kind))
-    marks += [Mark("goal", int(there), (cfg.goal_size, half), half if tall else half + 0.01)]
-    return [mark for mark in marks if mark.count]
+    cfg, flat = arena.config, arena.config.half_height(0.01)
+    radius, half = arena.goal_mark
+    return [
+        mark
+        for mark in (
+            Mark("circle", int(cfg.task == "circle"), (cfg.circle_radius, 0.01), 0.02),
+            Mark("hazard", cfg.hazards_num, (cfg.hazards_size, flat), flat + 0.01),
+            Mark("goal", int(radius > 0), (radius, half), half + 0.01),
+        )
+        if mark.count
+    ]
 
 
 def drawn_model(arena: Arena) -> mujoco.MjModel:

@@ -173,7 +173,8 @@ FORK: Options = {
     "lidar_max_dist": None,
     "placements_margin": 0.3,
     "robot_keepout": 0.15,
-    "goal_keepout": 0.3,
+    "goal_keepout": 0.4,
+    "hazards_keepout": 0.18,
     "vases_keepout": 0.1,
     "vases_velocity_cost": 0.0,
     "pillars_keepout": 0.2,
@@ -182,14 +183,20 @@ FORK: Options = {
     "buttons_keepout": 0.1,
     "buttons_resampling_delay": 20,
 }
-FORK_PUSH: Options = {"box_size": 0.1, "hazards_size": 0.2, "constrain_pillars": True}
+FORK_GOAL = FORK | {"goal_keepout": 0.3}
+FORK_PUSH = FORK | {
+    "box_size": 0.1,
+    "box_keepout": 0.1,
+    "hazards_size": 0.2,
+    "constrain_pillars": True,
+}
 SEDITOR: dict[str, Options] = {
-    "goal1": TASKS["goal1"] | FORK | {"hazards_num": 5},
-    "goal2": TASKS["goal2"] | FORK | {"hazards_num": 8, "vases_num": 8},
+    "goal1": TASKS["goal1"] | FORK_GOAL | {"hazards_num": 5},
+    "goal2": TASKS["goal2"] | FORK_GOAL | {"hazards_num": 8, "vases_num": 8},
     "button1": TASKS["button1"] | FORK | {"gremlins_num": 3},
     "button2": TASKS["button2"] | FORK | {"gremlins_num": 5} | extents(2.0),
-    "push1": TASKS["push1"] | FORK | FORK_PUSH,
-    "push2": TASKS["push2"] | FORK | FORK_PUSH,
+    "push1": TASKS["push1"] | FORK_PUSH,
+    "push2": TASKS["push2"] | FORK_PUSH,
 }
 
 

@@ -151,11 +151,12 @@ def test_halo_and_cost_light_have_the_places_and_colours_of_the_original():
 
 
 def test_seditor_s_goal_and_hazards_are_drawn_as_high_as_they_are():
-    """0.4 m, from the floor up. The goal stands at the button to press, which needs no other mark."""
+    """0.4 m, from a centimetre up. The goal stands at the button to press, as wide as that."""
     env, state = reset("seditor_point_button1", wrap={"frame_stack": 1}, render_lidar_markers=False)
     *hazards, goal = marks(env, state)
     for geom in (*hazards, goal):
-        assert geom.size[2] == geom.pos[2] == np.float32(0.2)
+        np.testing.assert_allclose((geom.size[2], geom.pos[2]), (0.2, 0.21), atol=1e-7)
+    assert goal.size[0] == np.float32(env.config.buttons_size)
     np.testing.assert_allclose(
         [hazard.pos[:2] for hazard in hazards], env.positions(state.physics, "hazards")
     )
