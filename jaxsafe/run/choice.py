@@ -60,6 +60,10 @@ def choose_env(env: Any) -> tuple[dict[str, Any], dict[str, EnvEntry]]:
         for name in env:
             load("env", name)
         return {"env": list(env)}, {}
+    if isinstance(env, type):
+        raise ConfigError(
+            f"env: {env.__name__} is a class; expected an environment, as {env.__name__}() makes one"
+        )
     inner = innermost(env)
     gym = isinstance(inner, SafetyGym | Velocity)
     fields = to_plain(plain_fields(env))

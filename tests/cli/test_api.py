@@ -181,6 +181,7 @@ def test_a_value_of_python_is_the_plain_value_that_it_stands_for(value, expected
         ((None, None, {"num_processes": 2}), "several processes are for the command line"),
         ((Corridor(), None, {"env.dt": 0.1}), "env.dt=0.1: this Corridor has another value"),
         ((object(),), "object (object) is no Env"),
+        ((Corridor,), "Corridor is a class; expected an environment, as Corridor() makes one"),
         (("nowhere:Corridor",), "no module 'nowhere'"),
         ((None, object()), "expected a name or an object with a config class and make"),
     ],
