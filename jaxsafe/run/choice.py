@@ -16,7 +16,7 @@ from jaxsafe.envs.engines import default_engine
 from jaxsafe.envs.wrap import Wrapper, innermost, wrap_config_of
 from jaxsafe.run.plain import to_plain
 from jaxsafe.run.progress import Reporter
-from jaxsafe.run.settings import DEFAULT, EnvEntry, Extras, TrainConfig, find_env, load, nested
+from jaxsafe.run.settings import DEFAULT, EnvEntry, Extras, TrainConfig, find_env, having, load, nested
 from jaxsafe.types import Algorithm, Env
 
 RUN_OPTIONS = [f.name for f in dataclasses.fields(TrainConfig)]
@@ -144,6 +144,8 @@ def full_names(choice: Chosen, options: dict[str, Any], *more: str) -> dict[str,
         if head in DEFAULT or name in (*RUN_OPTIONS, *more):
             return name
         if head not in fields:
+            if having("env", name):
+                raise ConfigError(f"unknown option {name}; did you mean 'env.{name}'?")
             raise ConfigError(f"unknown option {name}{nearest(name, [*RUN_OPTIONS, *more, *fields])}")
         return f"algo.{name}"
 

@@ -171,6 +171,7 @@ def test_a_value_of_python_is_the_plain_value_that_it_stands_for(value, expected
         ((None, None, {"cost_limt": 3}), "unknown option cost_limt; did you mean 'cost_limit'?"),
         ((None, None, {"total_step": 5}), "did you mean 'total_steps'?"),
         ((None, "cpo", {"epochs": 5}), "unknown option algo.epochs of cpo"),
+        ((None, None, {"hazards_num": 5}), "did you mean 'env.hazards_num'?"),
         ((None, None, {"env.hazard_num": 5}), "did you mean 'hazards_num'?"),
         ((None, None, {"total_steps": -1}), "expected a whole number between 1 and"),
         ((None, None, {"cost_limit": "wide"}), "expected a number"),
