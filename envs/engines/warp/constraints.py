@@ -236,8 +236,13 @@ def pillar_contacts(m: Geoms, out: Found, world: int, pair: wp.vec2i):
 
 
 @functools.cache
-def constraints_kernel(kinds: tuple[tuple[GeomType, GeomType], ...], near_by: tuple[int, ...]) -> Any:
-    """For pairs with these formulas. near_by: what MuJoCo Warp's test of nearness is made for."""
+def constraints_kernel(
+    kinds: tuple[tuple[GeomType, GeomType], ...], pillars: bool, near_by: tuple[int, ...]
+) -> Any:
+    """For pairs with these formulas, and with pillars or without.
+
+    near_by: what MuJoCo Warp's test of nearness is made for.
+    """
     formulas = [FORMULAS[kind] for kind in kinds]
     near = collision_driver._broadphase_filter(*near_by)
 
@@ -248,9 +253,10 @@ def constraints_kernel(kinds: tuple[tuple[GeomType, GeomType], ...], near_by: tu
             limit(joints, world, joints.limited[i - m.pairs.shape[0]])
             return
         pair, ids = m.pairs[i], m.pairids[i]
-        if i >= m.upright:
-            pillar_contacts(m, out, world, pair)
-            return
+        if wp.static(pillars):  # noqa: SIM102: else the branch is compiled
+            if i >= m.upright:
+                pillar_contacts(m, out, world, pair)
+                return
         if ids[1] < 0 and not near(
             m.geom_aabb, m.geom_rbound, m.geom_margin, m.geom_gap, m.pair_margin, m.pair_gap,
             m.geom_xpos, m.geom_xmat, pair[0], pair[1], ids[0], world,
@@ -355,6 +361,7 @@ def adopt(
     near_by = (m.geom_aabb, m.geom_rbound, m.geom_margin, m.geom_gap, m.pair_margin, m.pair_gap)
     kernel = constraints_kernel(
         tuple(pair for pair in FORMULAS if pair in set(kinds)),
+        bool(pillars.any()),
         (int(m.opt.broadphase_filter), *(x.shape[0] for x in near_by)),
     )
 
