@@ -253,7 +253,7 @@ def constraints_kernel(
             limit(joints, world, joints.limited[i - m.pairs.shape[0]])
             return
         pair, ids = m.pairs[i], m.pairids[i]
-        if wp.static(pillars):  # noqa: SIM102: else the branch is compiled
+        if wp.static(pillars):  # noqa: SIM102, or it would be compiled for all
             if i >= m.upright:
                 pillar_contacts(m, out, world, pair)
                 return
