@@ -1,4 +1,4 @@
-"""A physics step of engine `warp` in four kernels, and one or two for each kind of convex collision.
+"""A physics step of engine `warp` in four kernels, and a few of MuJoCo Warp's for what they leave out.
 
     dynamics      from positions and velocities to the forces without constraints: dynamics.cu
     constraints   where geoms touch, and limits of joints: constraints.py
