@@ -296,7 +296,7 @@ CUBES = """
 
 
 def test_two_boxes_touch_where_mujocos_do():
-    """At the same points. MuJoCo Warp by default finds another number of them for 44 of these 200 pairs."""
+    """At the same points. For 44 of these 200 pairs MuJoCo Warp by default finds another number."""
     from mujoco.mjx.third_party import mujoco_warp
 
     from jaxsafe.envs.engines.warp import constraints
