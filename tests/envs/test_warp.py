@@ -112,12 +112,16 @@ def compiled(xml: str):
     return mujoco.MjSpec.from_string(xml).compile()
 
 
-@pytest.fixture(params=[1, 32])
+@pytest.fixture(params=[1, 16, 32])
 def lanes(request, monkeypatch):
-    """One lane, as on a CPU, or those of a GPU's warp, which take turns."""
+    """One lane, as on a CPU, or half or all of those of a GPU's warp, which take turns."""
     import warp as wp
 
-    monkeypatch.setattr(wp.config, "enable_cpu_blocks", request.param == 32)
+    from jaxsafe.envs.engines.warp import solver
+
+    monkeypatch.setattr(wp.config, "enable_cpu_blocks", request.param > 1)
+    if request.param == 16:
+        monkeypatch.setattr(solver, "shape_of", lambda nv, d: (16, 1))
     return request.param
 
 
@@ -197,13 +201,18 @@ def simulated(name: str, worlds: int, **options):
         ("ant_velocity", 0),
     ],
 )
-def test_a_physics_step_takes_few_kernels(name, theirs, monkeypatch):
-    """Of few worlds their number sets the pace: four of ours, and MuJoCo Warp's, which are recorded."""
+@pytest.mark.parametrize("many", [False, True])
+def test_a_physics_step_takes_few_kernels(name, theirs, many, monkeypatch):
+    """Of few worlds their number sets the pace: it is one. With many, or where MuJoCo Warp's are among
+    them, it is four of ours for each pass, and MuJoCo Warp's, which are recorded."""
     import warp as wp
     from mujoco.mjx.third_party import mujoco_warp
 
     from jaxsafe.envs.engines.warp import dynamics
 
+    if many:
+        monkeypatch.setattr(dynamics.solver, "MANY", 0)
+    together = not theirs and not many
     if name.endswith("velocity"):
         model = envs.make(name, engine="warp").model
         m, d = mujoco_warp.put_model(model), mujoco_warp.make_data(model, nworld=2)
@@ -223,12 +232,17 @@ def test_a_physics_step_takes_few_kernels(name, theirs, monkeypatch):
     for name in ("launch", "launch_tiled"):
         monkeypatch.setattr(wp, name, counted(getattr(wp, name)))
     dynamics.step(m, d)
-    assert len(launched) == (4 if d.dynamics.euler else 16), launched
+    passes = 1 if d.dynamics.euler else 4
+    assert len(launched) == (1 if together else 4 * passes), launched
     recorded = [x for x in (d.dynamics.plain_rows, d.dynamics.constraints.others) if x]
     assert sum(len(x.launches) + len(x.zeros) for x in recorded) == theirs
     launched.clear()
     dynamics.forward(m, d)  # and one for all sensors
-    assert len(launched) == 4 + bool(model.nsensor), launched
+    assert len(launched) == (1 if together else 4) + bool(model.nsensor), launched
+    if together:
+        launched.clear()
+        dynamics.forward(m, d, 5)
+        assert len(launched) == 1 + bool(model.nsensor), launched
 
 
 SENSED = """

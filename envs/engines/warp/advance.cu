@@ -1,15 +1,16 @@
 // A step from the accelerations of a forward pass: the body of a function in dynamics.py, after lanes.cu.
-// DAMPED and EULER are constants, p, stage, world and lane its arguments.
+// DAMPED and EULER are constants, p, stage, world and thread its arguments.
 //
 // EULER: a semi-implicit step; if DAMPED the forces of dampers are taken at its end.
 // Else stage 0 to 3 is one of the four of Runge and Kutta. Each of the first three goes from the start to
 // where the next forward pass looks; the last goes from the start to the end, by the mean of all.
 
 #if defined(__CUDA_ARCH__)
-__shared__ float M[DAMPED ? NV * N : 1], v[NV];
+__shared__ float masses[WORLDS][DAMPED ? NV * N : 1], rates[WORLDS][NV];
 #else
-static float M[DAMPED ? NV * N : 1], v[NV];
+static float masses[WORLDS][DAMPED ? NV * N : 1], rates[WORLDS][NV];
 #endif
+float *M = masses[place_in_block], *v = rates[place_in_block];
 
 const bool first = stage == 0, last = EULER || stage == 3;
 const float weight = first || last ? 1.0f / 6.0f : 1.0f / 3.0f;

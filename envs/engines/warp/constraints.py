@@ -24,7 +24,6 @@ from mujoco.mjx.third_party.mujoco_warp._src import (
     collision_core,
     collision_driver,
     collision_primitive,
-    collision_primitive_core,
     constraint,
 )
 from mujoco.mjx.third_party.mujoco_warp._src.collision_core import (
@@ -37,52 +36,11 @@ from mujoco.mjx.third_party.mujoco_warp._src.math import make_frame
 from jaxsafe.envs.engines.warp.pillars import touch, upright_pairs
 from jaxsafe.envs.engines.warp.recording import Recording
 from jaxsafe.envs.engines.warp.solver import REGISTERS
+from jaxsafe.envs.engines.warp.touching import FORMULAS, NONE, Touch
 
 GeomType = mujoco_warp.GeomType
 vec5 = wp.types.vector(length=5, dtype=float)
 MESH = (GeomType.PLANE, GeomType.MESH)  # has a formula, but it needs the mesh
-FORMULAS = {  # MuJoCo Warp by default leaves that of two boxes, which is MuJoCo's, to another kernel
-    kinds: formula
-    for kinds, formula in collision_primitive._PRIMITIVE_COLLISIONS.items()
-    if kinds != MESH
-}
-
-
-@wp.func
-def plane_capsule(
-    normal: wp.vec3,
-    plane_pos: wp.vec3,
-    pos: wp.vec3,
-    axis: wp.vec3,
-    radius: float,
-    half_length: float,
-) -> tuple[wp.vec2, collision_primitive_core.mat23f, wp.mat33]:
-    """Contacts of a capsule's two ends, with the frame of MuJoCo in C.
-
-    There the first tangent is the capsule's axis, however little of it lies in the plane. MuJoCo Warp
-    takes a fixed tangent once the axis is within 30 degrees of the normal; with pyramidal friction
-    cones the tangents matter, and Doggo's legs are mostly that upright.
-    """
-    tangent = wp.normalize(axis - normal * wp.dot(normal, axis))
-    if wp.length(tangent) < 0.5:
-        tangent = wp.vec3(1.0, 0.0, 0.0)
-    other = wp.cross(normal, tangent)
-    frame = wp.mat33(
-        normal[0], normal[1], normal[2],
-        tangent[0], tangent[1], tangent[2],
-        other[0], other[1], other[2],
-    )  # fmt: skip
-    end1, end2 = pos + axis * half_length, pos - axis * half_length
-    dist1 = wp.dot(end1 - plane_pos, normal) - radius
-    dist2 = wp.dot(end2 - plane_pos, normal) - radius
-    at1 = end1 - normal * (radius + 0.5 * dist1)
-    at2 = end2 - normal * (radius + 0.5 * dist2)
-    at = collision_primitive_core.mat23f(at1[0], at1[1], at1[2], at2[0], at2[1], at2[2])
-    return wp.vec2(dist1, dist2), at, frame
-
-
-# for all users of MuJoCo Warp in the process, before it compiles the kernels that name the function
-collision_primitive.plane_capsule = plane_capsule
 
 
 @wp.struct
@@ -91,9 +49,8 @@ class Geoms:
 
     pairs: wp.array[wp.vec2i]  # those with a formula, then others, then boxes with pillars
     pairids: wp.array[wp.vec2i]  # which <pair> and which collision sensor each is of
-    others: int  # where those without a formula begin
+    kinds: wp.array[int]  # the place of their formula in FORMULAS, or NONE
     upright: int  # where those with pillars begin
-    geom_type: wp.array[int]
     geom_size: wp.array2d[wp.vec3]
     geom_condim: wp.array[int]
     geom_priority: wp.array[int]
@@ -143,6 +100,52 @@ class Found:
     near_world: wp.array[int]
     near_count: wp.array[int]
     room: int
+
+
+@wp.struct
+class Lists:
+    """Of each world its own list of contacts, [worlds, room]; `count` is [worlds, 1]."""
+
+    dist: wp.array2d[float]
+    pos: wp.array2d[wp.vec3]
+    frame: wp.array2d[wp.mat33]
+    includemargin: wp.array2d[float]
+    friction: wp.array2d[vec5]
+    solref: wp.array2d[wp.vec2]
+    solreffriction: wp.array2d[wp.vec2]
+    solimp: wp.array2d[vec5]
+    dim: wp.array2d[int]
+    geom: wp.array2d[wp.vec2i]
+    efc_address: wp.array3d[int]
+    worldid: wp.array2d[int]
+    type: wp.array2d[int]
+    geomcollisionid: wp.array2d[int]
+    adhesion: wp.array2d[float]
+    count: wp.array2d[int]
+
+
+@wp.func
+def own(lists: Lists, world: int) -> Found:
+    """The list of one world."""
+    mine = Found()
+    mine.dist = lists.dist[world]
+    mine.pos = lists.pos[world]
+    mine.frame = lists.frame[world]
+    mine.includemargin = lists.includemargin[world]
+    mine.friction = lists.friction[world]
+    mine.solref = lists.solref[world]
+    mine.solreffriction = lists.solreffriction[world]
+    mine.solimp = lists.solimp[world]
+    mine.dim = lists.dim[world]
+    mine.geom = lists.geom[world]
+    mine.efc_address = lists.efc_address[world]
+    mine.worldid = lists.worldid[world]
+    mine.type = lists.type[world]
+    mine.geomcollisionid = lists.geomcollisionid[world]
+    mine.adhesion = lists.adhesion[world]
+    mine.count = lists.count[world]
+    mine.room = lists.dist.shape[1]
+    return mine
 
 
 @wp.struct
@@ -202,93 +205,107 @@ def geom_at(m: Geoms, world: int, geom: int) -> collision_core.Geom:
 
 
 @wp.func
-def pillar_contacts(m: Geoms, out: Found, world: int, pair: wp.vec2i):
-    """Contacts of a pillar and a box, in this order, see pillars.py."""
-    pillar, box = geom_at(m, world, pair[0]), geom_at(m, world, pair[1])
+def pillar_box(pillar: collision_core.Geom, box: collision_core.Geom) -> Touch:
+    """See pillars.py."""
+    found = Touch()
     far = pillar.size[0] + wp.length(box.size)
     away = wp.vec2(pillar.pos[0] - box.pos[0], pillar.pos[1] - box.pos[1])
     if wp.length_sq(away) > far * far:
-        return
+        return found
     tall = pillar.size[1] + wp.dot(wp.abs(box.rot[2]), box.size)
     if wp.abs(pillar.pos[2] - box.pos[2]) > tall:
-        return
+        return found
     dists, heights, n, flat = touch(pillar.pos, pillar.size[0], box.pos, box.rot, box.size)
     deepest = wp.where(dists[0] < dists[1], 0, 1)
     if dists[deepest] >= 0.0:
-        return
-    condim, friction, solref, solreffriction, solimp, adhesion = contact_material_params(
-        m.geom_condim, m.geom_priority, m.geom_solmix, m.geom_solref, m.geom_solimp, m.geom_friction,
-        m.geom_adhesion, m.pair_dim, m.pair_solref, m.pair_solreffriction, m.pair_solimp,
-        m.pair_adhesion, m.pair_friction, pair, -1, world,
-    )  # fmt: skip
-    frame = make_frame(-n)
-    for k in range(wp.where(flat, 2, 1)):
+        return found
+    found.count = wp.where(flat, 2, 1)
+    for k in range(2):
         end = wp.where(dists[k] < 0.0, k, deepest)  # of a side that leans MuJoCo has one end twice
         back = pillar.size[0] + 0.5 * dists[end]
-        pos = wp.vec3(pillar.pos[0] - back * n[0], pillar.pos[1] - back * n[1], heights[end])
-        write_contact(
-            out.room, k, dists[end], pos, frame, 0.0, 0.0, condim, friction, solref, solreffriction,
-            solimp, adhesion, pair, wp.vec2i(-1, -1), world, out.dist, out.pos, out.frame,
-            out.includemargin, out.friction, out.solref, out.solreffriction, out.solimp, out.dim,
-            out.geom, out.efc_address, out.worldid, out.type, out.geomcollisionid, out.adhesion,
-            out.count,
-        )  # fmt: skip
+        found.dist[k] = dists[end]
+        found.pos[k] = wp.vec3(pillar.pos[0] - back * n[0], pillar.pos[1] - back * n[1], heights[end])
+    found.frame = make_frame(-n)
+    found.frame_of_others = found.frame
+    return found
 
 
 @functools.cache
-def constraints_kernel(
-    kinds: tuple[tuple[GeomType, GeomType], ...], pillars: bool, near_by: tuple[int, ...]
-) -> Any:
-    """For pairs with these formulas, and with pillars or without.
+def constraint_function(kinds: tuple[int, ...], pillars: bool, near_by: tuple[int, ...]) -> Any:
+    """What looks at a pair of geoms, or a joint.
 
-    near_by: what MuJoCo Warp's test of nearness is made for.
+    Args:
+        kinds: places in FORMULAS.
+        near_by: what MuJoCo Warp's test of nearness is made for.
     """
-    formulas = [FORMULAS[kind] for kind in kinds]
+    formulas, known = list(FORMULAS.values()), sum(1 << kind for kind in kinds)
     near = collision_driver._broadphase_filter(*near_by)
 
-    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=REGISTERS)
-    def kernel(m: Geoms, joints: Joints, out: Found):
-        i, world = wp.tid()
-        if i >= m.pairs.shape[0]:
-            limit(joints, world, joints.limited[i - m.pairs.shape[0]])
-            return
-        pair, ids = m.pairs[i], m.pairids[i]
+    @wp.func
+    def touch_of(
+        i: int, world: int, m: Geoms, out: Found, pair: wp.vec2i, ids: wp.vec2i, margin: float,
+        gap: float,
+    ) -> Touch:  # fmt: skip
+        one, other = geom_at(m, world, pair[0]), geom_at(m, world, pair[1])
         if wp.static(pillars):  # noqa: SIM102, or it would be compiled for all
-            if i >= m.upright:
-                pillar_contacts(m, out, world, pair)
-                return
+            if i >= m.upright:  # pillars come first in these pairs
+                return pillar_box(one, other)
         if ids[1] < 0 and not near(
             m.geom_aabb, m.geom_rbound, m.geom_margin, m.geom_gap, m.pair_margin, m.pair_gap,
             m.geom_xpos, m.geom_xmat, pair[0], pair[1], ids[0], world,
         ):  # fmt: skip
-            return
-        if i >= m.others:
+            return Touch()
+        kind = m.kinds[i]
+        if (known >> kind) & 1 == 0:  # also tells Warp apart what it compiles for other kinds
             place = wp.atomic_add(out.near_count, 0, 1)
             if place < out.room:
                 out.near_pair[place] = pair
                 out.near_pairid[place] = ids
                 out.near_world[place] = world
+            return Touch()
+        for k in range(wp.static(len(kinds))):
+            if kind == wp.static(kinds[k]):
+                return wp.static(formulas[kinds[k]])(one, other, margin, gap)
+        return Touch()
+
+    @wp.func
+    def look(i: int, world: int, m: Geoms, joints: Joints, out: Found):
+        if i >= m.pairs.shape[0]:
+            limit(joints, world, joints.limited[i - m.pairs.shape[0]])
             return
+        pair, ids = m.pairs[i], m.pairids[i]
         margin, gap = contact_margin_gap(
             m.geom_margin, m.geom_gap, m.pair_margin, m.pair_gap, pair, ids[0], world
         )
+        found = touch_of(i, world, m, out, pair, ids, margin, gap)
+        if found.count == 0:
+            return
         condim, friction, solref, solreffriction, solimp, adhesion = contact_material_params(
             m.geom_condim, m.geom_priority, m.geom_solmix, m.geom_solref, m.geom_solimp,
             m.geom_friction, m.geom_adhesion, m.pair_dim, m.pair_solref, m.pair_solreffriction,
             m.pair_solimp, m.pair_adhesion, m.pair_friction, pair, ids[0], world,
         )  # fmt: skip
-        one, other = geom_at(m, world, pair[0]), geom_at(m, world, pair[1])
-        for k in range(wp.static(len(formulas))):
-            if m.geom_type[pair[0]] == wp.static(int(kinds[k][0])) and (
-                m.geom_type[pair[1]] == wp.static(int(kinds[k][1]))
-            ):
-                wp.static(formulas[k])(
-                    out.room, one, other, world, margin, gap, condim, friction, solref, solreffriction,
-                    solimp, adhesion, pair, ids, out.dist, out.pos, out.frame, out.includemargin,
-                    out.friction, out.solref, out.solreffriction, out.solimp, out.dim, out.geom,
-                    out.efc_address, out.worldid, out.type, out.geomcollisionid, out.adhesion,
-                    out.count,
-                )  # fmt: skip
+        for k in range(found.count):
+            frame = found.frame
+            if k > 0:
+                frame = found.frame_of_others
+            write_contact(
+                out.room, k, found.dist[k], found.pos[k], frame, margin, gap, condim, friction, solref,
+                solreffriction, solimp, adhesion, pair, ids, world, out.dist, out.pos, out.frame,
+                out.includemargin, out.friction, out.solref, out.solreffriction, out.solimp, out.dim,
+                out.geom, out.efc_address, out.worldid, out.type, out.geomcollisionid, out.adhesion,
+                out.count,
+            )  # fmt: skip
+
+    return look
+
+
+@functools.cache
+def constraints_kernel(look: Any) -> Any:
+    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=REGISTERS)
+    def kernel(m: Geoms, joints: Joints, out: Found):
+        i, world = wp.tid()
+        look(i, world, m, joints, out)
 
     return kernel
 
@@ -297,17 +314,36 @@ def constraints_kernel(
 class Constraints:
     """Of the worlds of one `Data`."""
 
-    kernel: Any
+    look: Any  # a function of one pair or joint
     geoms: Any
     joints: Any
     found: Any
     others: Recording  # MuJoCo Warp's kernels for the near pairs without a formula
 
+    @property
+    def looks(self) -> int:
+        """How many pairs and joints a world has."""
+        return len(self.geoms.pairs) + len(self.joints.limited)
+
+    @property
+    def by_formula(self) -> bool:
+        """Whether no pair needs MuJoCo Warp's kernels."""
+        return not self.others.launches
+
+    def by_world(self, worlds: int) -> Any:
+        """The lists of contacts, a part of them for each world."""
+        lists = Lists()
+        for name in Lists.vars.keys() - {"count"}:
+            x = getattr(self.found, name)
+            setattr(lists, name, x.reshape((worlds, -1, *x.shape[1:])))
+        lists.count = wp.zeros((worlds, 1), dtype=int, device=self.found.dist.device)
+        return lists
+
     def find(self, worlds: int) -> None:
         """All contacts, and the rows of limits. What counts them has to be 0 before."""
         wp.launch(
-            self.kernel,
-            (len(self.geoms.pairs) + len(self.joints.limited), worlds),
+            constraints_kernel(self.look),
+            (self.looks, worlds),
             inputs=[self.geoms, self.joints],
             outputs=[self.found],
         )
@@ -332,9 +368,11 @@ def adopt(
     kind = model.geom_type
     pairs = np.where((kind[pairs[:, 0]] > kind[pairs[:, 1]])[:, None], pairs[:, ::-1], pairs)
     kinds = [(GeomType(kind[a]), GeomType(kind[b])) for a, b in pairs]
+    place = {of: k for k, of in enumerate(FORMULAS)}
+    places = np.array([place.get(of, NONE) for of in kinds], int)
     # neither a pair with settings of its own nor a sensor's
     pillars = upright_pairs(model, pairs, upright) & (ids == -1).all(1)
-    others = np.array([pair not in FORMULAS for pair in kinds], bool) & ~pillars
+    others = (places == NONE) & ~pillars
     order = np.argsort(others + 2 * pillars, kind="stable")
     has = {pair for pair, without in zip(kinds, others, strict=True) if without}
 
@@ -352,15 +390,15 @@ def adopt(
     joints.room = d.njmax
     geoms.pairs = wp.array(pairs[order], dtype=wp.vec2i, device=device)
     geoms.pairids = wp.array(ids[order], dtype=wp.vec2i, device=device)
-    geoms.others = int((~others & ~pillars).sum())
-    geoms.upright = geoms.others + int(others.sum())
+    geoms.upright = int((~pillars).sum())
     near = collision_core.create_collision_context(d.naconmax)
     found.count, found.room, found.near_count = d.nacon, d.naconmax, d.ncollision
     found.near_pair, found.near_pairid = near.collision_pair, near.collision_pairid
     found.near_world = near.collision_worldid
     near_by = (m.geom_aabb, m.geom_rbound, m.geom_margin, m.geom_gap, m.pair_margin, m.pair_gap)
-    kernel = constraints_kernel(
-        tuple(pair for pair in FORMULAS if pair in set(kinds)),
+    geoms.kinds = wp.array(places[order], dtype=int, device=device)
+    look = constraint_function(
+        tuple(sorted(set(places.tolist()) - {NONE})),
         bool(pillars.any()),
         (int(m.opt.broadphase_filter), *(x.shape[0] for x in near_by)),
     )
@@ -370,4 +408,4 @@ def adopt(
         if MESH in has:
             collision_primitive.primitive_narrowphase(m, d, near, [MESH])
 
-    return Constraints(kernel, geoms, joints, found, Recording(narrow))
+    return Constraints(look, geoms, joints, found, Recording(narrow))

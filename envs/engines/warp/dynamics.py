@@ -7,8 +7,12 @@
 
 With a few thousand worlds or fewer the number of kernels sets the pace. MuJoCo Warp takes some 50 of a
 few microseconds each for the first alone, for robots of 4 to 30 bodies. Here 8, 16 or 32 threads share
-a world and keep what they compute in shared memory. Equalities, dry friction, limits of ball joints and
-collisions of meshes and of convex shapes without a formula are MuJoCo Warp's. Sensors are `sensors.py`.
+a world and keep what they compute in shared memory. Where an H200 holds all worlds at a time, and all
+contacts have formulas, the passes of several steps are one kernel. With more worlds kernels apart are
+faster: together they are longer than what a multiprocessor keeps of a program.
+
+Equalities, dry friction, limits of ball joints and collisions of meshes and of convex shapes without a
+formula are MuJoCo Warp's. Sensors are `sensors.py`.
 
 Of `Data` only what later kernels and this project read is written: no `qacc_smooth`, no parts of
 `qfrc_smooth`, no inertial frames, cameras, lights or energy. A pass whose sensors read more is MuJoCo
@@ -36,8 +40,9 @@ import warp as wp
 from mujoco.mjx.third_party import mujoco_warp
 
 from jaxsafe.envs.engines.warp import constraints, sensors, solver
+from jaxsafe.envs.engines.warp.constraints import Geoms, Joints, Lists, own
 from jaxsafe.envs.engines.warp.recording import Recording
-from jaxsafe.envs.engines.warp.solver import REGISTERS, THREADS, Problem, threads
+from jaxsafe.envs.engines.warp.solver import REGISTERS, THREADS, Listing, Problem, enlist, threads
 
 EULER, RK4 = mujoco_warp.IntegratorType.EULER, mujoco_warp.IntegratorType.RK4
 SHARED_MEMORY = 47 * 1024  # bytes of a block; Warp takes one more KiB
@@ -65,6 +70,7 @@ OF_LIMITS = [
 ]
 UNWRITTEN = {"qfrc_actuator", "cfrc_ext"}  # fields that are not written
 STAY = wp.constant(-1)  # no stage of the integrator
+NO_CONTACTS = wp.constant(int(mujoco_warp.OverflowType.NARROWPHASE))
 
 
 @wp.struct
@@ -174,17 +180,22 @@ def shared_size(bodies: int, joints: int, dofs: int, actuators: int) -> int:
 
 
 @functools.cache
-def dynamics_kernel(
-    bodies: int, joints: int, dofs: int, actuators: int, fluid: bool, lanes: int, worlds: int
-) -> Any:
-    sizes = (
+def dynamics_function(sizes: tuple[int, ...], fluid: bool, lanes: int, worlds: int) -> Any:
+    bodies, joints, dofs, actuators = sizes
+    constants = (
         f"BODIES = {bodies}, JOINTS = {joints}, DOFS = {dofs}, ACTUATORS = {actuators}, "
-        f"FLUID = {int(fluid)}, LANES = {lanes}, WORLDS = {worlds}, "
-        f"SHARED = {shared_size(bodies, joints, dofs, actuators)}"
+        f"FLUID = {int(fluid)}, LANES = {lanes}, WORLDS = {worlds}, SHARED = {shared_size(*sizes)}"
     )
 
-    @wp.func_native(f"constexpr int {sizes};\n{ENUMS}{DYNAMICS}")
+    @wp.func_native(f"constexpr int {constants};\n{ENUMS}{DYNAMICS}")
     def dynamics(p: System, for_sensors: bool, block: int, thread: int): ...
+
+    return dynamics
+
+
+@functools.cache
+def dynamics_kernel(sizes: tuple[int, ...], fluid: bool, lanes: int, worlds: int) -> Any:
+    dynamics = dynamics_function(sizes, fluid, lanes, worlds)
 
     @wp.kernel(module="unique", enable_backward=False)
     def kernel(p: System, for_sensors: bool):
@@ -195,20 +206,113 @@ def dynamics_kernel(
 
 
 @functools.cache
-def end_kernel(nv: int, room: int, damped: bool, euler: bool, lanes: int) -> Any:
-    """Of a pass: the solver, and unless `stage` is STAY a stage of the integrator."""
-    sizes = f"NV = {nv}, DAMPED = {int(damped)}, EULER = {int(euler)}, LANES = {lanes}"
-    newton = solver.newton_function(nv, room, lanes)
+def advance_function(nv: int, damped: bool, euler: bool, lanes: int, worlds: int) -> Any:
+    constants = (
+        f"NV = {nv}, DAMPED = {int(damped)}, EULER = {int(euler)}, LANES = {lanes}, WORLDS = {worlds}"
+    )
 
-    @wp.func_native(f"constexpr int {sizes};\n{ENUMS}{LANES}{ADVANCE}")
-    def advance(p: System, stage: int, world: int, lane: int): ...
+    @wp.func_native(f"constexpr int {constants};\n{ENUMS}{LANES}{ADVANCE}")
+    def advance(p: System, stage: int, world: int, thread: int): ...
+
+    return advance
+
+
+@functools.cache
+def end_kernel(nv: int, room: int, damped: bool, euler: bool, lanes: int, worlds: int) -> Any:
+    """Of a pass: the solver, and unless `stage` is STAY a stage of the integrator."""
+    newton = solver.newton_function(nv, room, lanes, worlds)
+    advance = advance_function(nv, damped, euler, lanes, worlds)
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=REGISTERS)
     def kernel(problem: Problem, p: System, stage: int):
-        world, lane = wp.tid()
-        newton(problem, world, lane)
+        block, thread = wp.tid()
+        world = block * worlds + thread // lanes
+        if world >= p.qpos.shape[0]:
+            return
+        newton(problem, world, thread)
         if stage != STAY:
-            advance(p, stage, world, lane)
+            advance(p, stage, world, thread)
+
+    return kernel
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+__syncwarp();
+#else
+WP_TILE_SYNC();
+#endif
+""")
+def sync(): ...
+
+
+@wp.struct
+class Guides:
+    """Mocap bodies that go round, see `Simulation.orbits`."""
+
+    base: wp.array2d[wp.vec3]
+    orbits: wp.array[float]
+    done: wp.array2d[float]
+    substeps: wp.array2d[float]
+    timestep: float
+    mocap_pos: wp.array2d[wp.vec3]
+
+
+@wp.func
+def go_round(p: Guides, k: int, world: int, body: int):
+    """Where they are at substep k, as `simulation.mocap_at` has them."""
+    if float(k) < p.substeps[world, 0]:
+        time = (p.done[world, 0] + float(k)) * p.timestep
+        circle = wp.vec3(wp.sin(time), wp.cos(time), 0.0)
+        p.mocap_pos[world, body] = p.base[world, body] + p.orbits[body] * circle
+
+
+@functools.cache
+def passes_kernel(dynamics: Any, look: Any, newton: Any, advance: Any, lanes: int, worlds: int) -> Any:
+    """All passes of a world, one after the other."""
+
+    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=REGISTERS)
+    def kernel(
+        problem: Problem,
+        p: System,
+        geoms: Geoms,
+        joints: Joints,
+        lists: Lists,
+        listing: Listing,
+        guides: Guides,
+        looks: int,
+        steps: int,
+        stages: int,  # of a step
+        passes: int,  # those of the steps, and maybe one more that stays
+    ):
+        block, thread = wp.tid()
+        world, lane = block * worlds + thread // lanes, thread % lanes
+        if world >= p.qpos.shape[0]:
+            return
+        mine, room = own(lists, world), lists.dist.shape[1]
+        for k in range(passes):
+            moves = k < steps * stages
+            if moves and k % stages == 0:
+                for body in range(lane, guides.orbits.shape[0], lanes):
+                    go_round(guides, k // stages, world, body)
+            if lane == 0:
+                mine.count[0] = 0
+            sync()
+            dynamics(p, not moves, block, thread)
+            sync()
+            for i in range(lane, looks, lanes):
+                look(i, world, geoms, joints, mine)
+            sync()
+            contacts = wp.min(mine.count[0], room)
+            for i in range(lane, contacts, lanes):
+                enlist(listing, world * room + i, world)
+            if lane == 0 and mine.count[0] > room:
+                p.overflow[world] = p.overflow[world] | NO_CONTACTS
+            sync()
+            newton(problem, world, thread)
+            if moves:
+                advance(p, k % stages, world, thread)
+            sync()
 
     return kernel
 
@@ -226,6 +330,7 @@ class Plan:
     readable: bool  # whether its sensors, and the fields asked for, need nothing else
     constraints: constraints.Constraints | None  # None: contacts are MuJoCo Warp's
     sensors: sensors.Reader | None  # None: they are MuJoCo Warp's
+    lists: Any  # of contacts, one for each world, where all passes are one kernel, else None
 
 
 def tree(model: mujoco.MjModel) -> dict[str, np.ndarray]:
@@ -336,6 +441,11 @@ def adopt(
     others = bool(others or np.isin(model.sensor_type, OF_LIMITS).any())
     found = constraints.adopt(model, m, d, upright, limits=not others)
     theirs = others or (found is None and m.jnt_limited_slide_hinge_adr.size > 0)
+    lists = None
+    if found and found.by_formula and not theirs and d.nworld <= solver.MANY:
+        widen(d)
+        found = constraints.adopt(model, m, d, upright, limits=not others)
+        lists = found.by_world(d.nworld) if found else None
     d.dynamics = Plan(
         system=p,
         sizes=sizes_of(model),
@@ -346,8 +456,19 @@ def adopt(
         readable=bool(np.isin(model.sensor_type, READABLE).all()) and UNWRITTEN.isdisjoint(fields),
         constraints=found,
         sensors=sensors.adopt(model, m, d, p.body_deepest),
+        lists=lists,
     )
     return True
+
+
+def widen(d: Any) -> None:
+    """Make room for as many contacts as the solver takes, in every world."""
+    d.naconmax = d.nworld * d.newton.listed.shape[1]
+    for field in dataclasses.fields(d.contact):
+        x = getattr(d.contact, field.name)
+        shape = (d.naconmax, *x.shape[1:])
+        setattr(d.contact, field.name, wp.zeros(shape, dtype=x.dtype, device=x.device))
+    d.newton.soft = wp.zeros(d.naconmax, dtype=wp.vec3, device=d.qacc.device)
 
 
 def lanes_of(sizes: tuple[int, ...]) -> int:
@@ -358,10 +479,28 @@ def lanes_of(sizes: tuple[int, ...]) -> int:
     return lanes
 
 
-def forward(m: Any, d: Any) -> None:
-    """In place of MuJoCo Warp's, for data that was adopted."""
+def at_once(m: Any, d: Any) -> bool:
+    """Whether steps and a forward pass are one kernel."""
     plan = getattr(d, "dynamics", None)
     see = not m.opt.disableflags & mujoco_warp.DisableBit.SENSOR
+    return bool(plan and plan.lists and (not see or (plan.readable and plan.sensors)))
+
+
+def forward(m: Any, d: Any, steps: int = 0, guides: Any = None) -> None:
+    """In place of MuJoCo Warp's, for data that was adopted.
+
+    Args:
+        steps: before it, if they are `at_once`.
+        guides: mocap bodies that go round meanwhile, `Guides`.
+    """
+    plan = getattr(d, "dynamics", None)
+    see = not m.opt.disableflags & mujoco_warp.DisableBit.SENSOR
+    if at_once(m, d):
+        passes(m, d, steps, stay=True, guides=guides)
+        if see:
+            plan.sensors.read(d.nworld)
+        return
+    assert steps == 0
     if plan is None or (see and not plan.readable):
         mujoco_warp.forward(m, d)
         return
@@ -381,12 +520,49 @@ def forward(m: Any, d: Any) -> None:
 
 def step(m: Any, d: Any) -> None:
     """In place of MuJoCo Warp's, for data that was adopted. Sensors are not read."""
-    if getattr(d, "dynamics", None) is None:
+    plan = getattr(d, "dynamics", None)
+    if plan is None:
         mujoco_warp.step(m, d)
+        return
+    if plan.lists:
+        passes(m, d, 1)
         return
     for stage in range(1 if d.dynamics.euler else 4):
         until_solved(m, d, False)
         end(m, d, stage)
+
+
+def passes(m: Any, d: Any, steps: int, stay: bool = False, guides: Any = None) -> None:
+    """Steps, and if asked a pass that stays, in one kernel."""
+    plan, (lanes, worlds) = d.dynamics, solver.shape_of(m.nv, d)
+    stages, room = 1 if plan.euler else 4, d.newton.listed.shape[1]
+    find = plan.constraints
+    kernel = passes_kernel(
+        dynamics_function(plan.sizes, plan.fluid, lanes, worlds),
+        find.look,
+        solver.newton_function(m.nv, room, lanes, worlds),
+        advance_function(m.nv, plan.damped, plan.euler, lanes, worlds),
+        lanes,
+        worlds,
+    )
+    wp.launch_tiled(
+        kernel,
+        dim=-(-d.nworld // worlds),
+        inputs=[
+            solver.problem(m, d),
+            plan.system,
+            find.geoms,
+            find.joints,
+            plan.lists,
+            solver.listing(m, d),
+            guides or Guides(),
+            find.looks,
+            steps,
+            stages,
+            steps * stages + stay,
+        ],
+        block_dim=lanes * worlds,
+    )
 
 
 def until_solved(m: Any, d: Any, for_sensors: bool) -> None:
@@ -395,7 +571,7 @@ def until_solved(m: Any, d: Any, for_sensors: bool) -> None:
     lanes = min(threads(d), lanes_of(plan.sizes))
     worlds = threads(d) // lanes  # of a block
     wp.launch_tiled(
-        dynamics_kernel(*plan.sizes, plan.fluid, lanes, worlds),
+        dynamics_kernel(plan.sizes, plan.fluid, lanes, worlds),
         dim=-(-d.nworld // worlds),
         inputs=[plan.system, for_sensors],
         block_dim=threads(d),
@@ -411,10 +587,10 @@ def until_solved(m: Any, d: Any, for_sensors: bool) -> None:
 
 def end(m: Any, d: Any, stage: int) -> None:
     """The solver, and a stage of the integrator, as advance.cu counts them, or STAY."""
-    plan, lanes = d.dynamics, threads(d)
+    plan, (lanes, worlds) = d.dynamics, solver.shape_of(m.nv, d)
     wp.launch_tiled(
-        end_kernel(m.nv, d.newton.listed.shape[1], plan.damped, plan.euler, lanes),
-        dim=d.nworld,
+        end_kernel(m.nv, d.newton.listed.shape[1], plan.damped, plan.euler, lanes, worlds),
+        dim=-(-d.nworld // worlds),
         inputs=[solver.problem(m, d), plan.system, stage],
-        block_dim=lanes,
+        block_dim=lanes * worlds,
     )

@@ -26,7 +26,8 @@ from mujoco.mjx.third_party.mujoco_warp._src import constraint, solver
 from jaxsafe.envs.engines.batching import batched
 from jaxsafe.envs.engines.rows import STATE, columns, pack, unpack, widths
 from jaxsafe.envs.engines.simulation import Engine, Physics, PhysicsCall, Simulation
-from jaxsafe.envs.engines.warp.dynamics import adopt, forward, step, uncovered
+from jaxsafe.envs.engines.warp import dynamics
+from jaxsafe.envs.engines.warp.dynamics import Guides, adopt, forward, step, uncovered
 from jaxsafe.envs.engines.warp.solver import make_constraint, solve
 
 wp.config.log_level = wp.LOG_WARNING  # a line for every kernel otherwise
@@ -37,21 +38,9 @@ constraint.make_constraint, solver.solve = make_constraint, solve
 
 
 @wp.kernel
-def go_round(
-    base: wp.array2d[wp.vec3],
-    orbits: wp.array[float],
-    done: wp.array2d[float],
-    substeps: wp.array2d[float],
-    timestep: float,
-    k: int,
-    mocap_pos: wp.array2d[wp.vec3],
-):
-    """Mocap bodies at substep k, as `simulation.mocap_at` has them."""
+def go_round(guides: Guides, k: int):
     world, body = wp.tid()
-    if float(k) < substeps[world, 0]:
-        time = (done[world, 0] + float(k)) * timestep
-        circle = wp.vec3(wp.sin(time), wp.cos(time), 0.0)
-        mocap_pos[world, body] = base[world, body] + orbits[body] * circle
+    dynamics.go_round(guides, k, world, body)
 
 
 @wp.kernel
@@ -240,16 +229,15 @@ class Kernels:
         done, taken = (w.into[:, columns(self.inputs)[name]] for name in CLOCK)
         width = (data.nworld, len(w.given) + 1)
         wp.launch(unpack_rows, width, inputs=[w.into, w.given], outputs=[data.overflow])
-        base = wp.clone(data.mocap_pos) if self.orbits.any() else None
-        for k in range(substeps):
-            if base is not None:
-                clock = [done, taken, self.model.opt.timestep, k]
-                wp.launch(
-                    go_round,
-                    dim=base.shape,
-                    inputs=[base, w.orbits, *clock],
-                    outputs=[data.mocap_pos],
-                )
+        guides = Guides()
+        if self.orbits.any():
+            guides.base, guides.mocap_pos = wp.clone(data.mocap_pos), data.mocap_pos
+            guides.orbits, guides.timestep = w.orbits, self.model.opt.timestep
+            guides.done, guides.substeps = done, taken
+        at_once = dynamics.at_once(w.model, data) and not self.simulation.varied
+        for k in range(0 if at_once else substeps):
+            if self.orbits.any():
+                wp.launch(go_round, data.mocap_pos.shape, inputs=[guides, k])
             before = {}
             if self.simulation.varied:
                 before = {name: wp.clone(getattr(data, name)) for name in STATE}
@@ -257,7 +245,7 @@ class Kernels:
             for name, old in before.items():
                 new = getattr(data, name)
                 wp.launch(hold, new.shape, inputs=[taken, k, old], outputs=[new])
-        forward(w.model, data)
+        forward(w.model, data, substeps if at_once else 0, guides)
         wp.launch(
             pack_rows,
             w.out.shape,

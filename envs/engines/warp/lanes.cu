@@ -1,10 +1,13 @@
-// What the lanes of a world share, for newton.cu and advance.cu. NV and LANES are constants, world and
-// lane arguments. The lanes work together: each has a degree of freedom, or none and then zeros. On a
-// GPU they are a warp, on a CPU there is one, or in tests 32 that take turns.
+// What the lanes of a world share, for newton.cu and advance.cu. NV, LANES and WORLDS (of a block) are
+// constants, world and thread arguments. The lanes work together: each has a degree of freedom, or none
+// and then zeros. On a GPU they are a warp or a part of one, on a CPU there is one, or in tests several
+// that take turns.
 
+const int lane = thread % LANES, place_in_block = thread / LANES;
 #if defined(__CUDA_ARCH__)
-auto sync = [] { __syncwarp(); };
-auto from = [](int other, float a) { return __shfl_sync(~0u, a, other); };
+const unsigned mates = (LANES == 32 ? ~0u : (1u << LANES % 32) - 1u) << place_in_block * LANES;
+auto sync = [=] { __syncwarp(mates); };
+auto from = [=](int other, float a) { return __shfl_sync(mates, a, other, LANES); };
 auto plus = [](float a, float b) { return __fadd_rn(a, b); };  // not fused: all lanes find the same
 #else
 static float mail[LANES];

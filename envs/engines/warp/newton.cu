@@ -1,20 +1,29 @@
 // MuJoCo's Newton solver for one world: the body of a function in solver.py, which says what is
-// solved and how, after lanes.cu. NV, ROOM (for contacts), LANES and SCRATCH are constants there, p,
-// world and lane its arguments. Each lane has a degree of freedom, and every 32nd row and contact.
+// solved and how, after lanes.cu. NV, ROOM (for contacts), LANES, WORLDS and SCRATCH are constants there,
+// p, world and thread its arguments. Each lane has a degree of freedom, and every LANESth row and contact.
 //
 // In C++ because indexing Warp's arrays took most of the instructions: this is five times as fast.
 
 constexpr int CHUNK = 32;  // contacts whose A and force are added up at a time
 constexpr int WRENCH = 21, SUMS = 28;  // of a pair: lower triangle of A = C' S C, force, 1 unused
 
+// the numbers of a contact: three axes, its arm from the pair's first contact, ..., its residual a in each
+// direction, and the change of that along the step
+constexpr int ARM = 9, FRICTION = 12, STIFFNESS = 17, SIDES = 18, OFF = 19, RATE = 25;
+// and integers: which rows push, as bits, its pair, its place among all contacts, its bodies, those of the
+// contact that was listed there
+constexpr int PUSHES = 31, PAIR = 32, PLACE = 33, KEY = 34, UNSORTED = 35, FIELDS = 36;
+// those of a pair: E [6][N], sums [SUMS], its twist [6], and the place of its first contact
+constexpr int TOTALS = 6 * N, TWIST = TOTALS + SUMS, LEAD = TWIST + 6, PARTS = LEAD + 2;
+
 #if defined(__CUDA_ARCH__)
-__shared__ float part[CHUNK * (SUMS + 1)];
+__shared__ float parts[WORLDS][CHUNK * (SUMS + 1)];
 #else
-static float part[CHUNK * (SUMS + 1)];
+static float parts[WORLDS][CHUNK * (SUMS + 1)];
 #endif
+float* part = parts[place_in_block];
 
 constexpr float ROUNDING = 8 * 1.1920929e-07f;  // of a sum of float32, relative to its largest terms
-constexpr int ARM = 9, FRICTION = 12, STIFFNESS = 17, SIDES = 18, FIELDS = 19;  // of `touch`
 
 struct alignas(16) Quad { float at[4]; };  // floats that are read together
 auto dot = [](const float* a, const float* b) {
@@ -44,22 +53,14 @@ const int wide = p.J.strides[1] / sizeof(float);  // columns of J in memory
 float *residual = row_of(p.residual), *slope = row_of(p.slope), *curvature = row_of(p.curvature);
 float* force = row_of(p.force);
 
-// what the lanes share; a column of `touch`, `off` and `rate` is a contact
-float* E = row_of(p.scratch);  // [pair][6][N]
-float* M = E + 6 * N * ROOM;  // [NV][N]
+// what the lanes share
+float* M = row_of(p.scratch);  // [NV][N]
 float* v = M + NV * N;  // [N], a vector to multiply with
-float* sums = v + N;  // [pair][SUMS]
-float* twist = sums + SUMS * ROOM;  // [pair][6]
-float* touch = twist + 6 * ROOM;  // [FIELDS][ROOM]: axes, arm from the pair's first contact, ...
-float* off = touch + FIELDS * ROOM;  // [6][ROOM], its residual a in each direction
-float* rate = off + 6 * ROOM;  // [6][ROOM], change of it along the step
-int* contact = (int*)(rate + 6 * ROOM);  // [ROOM], those of a pair side by side
-int* key = contact + ROOM;  // [ROOM], which bodies
-int* pair = key + ROOM;  // [ROOM]
-int* lead = pair + ROOM;  // [pair] its first contact
-int* pushes = lead + ROOM;  // [ROOM], which rows push, as bits
-int* unsorted = pushes + ROOM;  // [ROOM], the keys as contacts are listed
-static_assert((6 * N + SUMS + 6 + FIELDS + 6 + 6 + 6) * ROOM + (NV + 1) * N == SCRATCH, "scratch");
+float* touch = v + N;  // [ROOM][FIELDS], the contacts, those of a pair side by side
+float* joined = touch + FIELDS * ROOM;  // [ROOM][PARTS], the pairs
+static_assert((FIELDS + PARTS) * ROOM + (NV + 1) * N == SCRATCH, "scratch");
+auto whole = [&](int c, int field) -> int& { return ((int*)touch)[c * FIELDS + field]; };
+auto lead = [&](int q) -> int& { return ((int*)joined)[q * PARTS + LEAD]; };
 
 // contacts in the order of their bodies
 auto bodies_of = [&](int i) {
@@ -70,28 +71,34 @@ const int* listed = row_of(p.listed);
 #pragma unroll 1
 for (int c = lane; c < contacts; c += LANES) {
     const auto bodies = bodies_of(listed[c]);
-    unsorted[c] = bodies[0] * p.body_rootid.shape[0] + bodies[1];
+    whole(c, UNSORTED) = bodies[0] * p.body_rootid.shape[0] + bodies[1];
 }
 sync();
 #pragma unroll 1
 for (int c = lane; c < contacts; c += LANES) {
+    const int own = whole(c, UNSORTED);
     int before = 0;
     #pragma unroll 1
-    for (int e = 0; e < contacts; ++e)
-        before += unsorted[e] < unsorted[c] || (unsorted[e] == unsorted[c] && e < c);
-    contact[before] = listed[c];
-    key[before] = unsorted[c];
+    for (int e = 0; e < contacts; ++e) {
+        const int other = whole(e, UNSORTED);
+        before += other < own || (other == own && e < c);
+    }
+    whole(before, PLACE) = listed[c];
+    whole(before, KEY) = own;
 }
 sync();
-int pairs = 0;
+int pairs = 0, last = -1;
 #pragma unroll 1
 for (int c = 0; c < contacts; ++c) {
-    const bool first = c == 0 || key[c] != key[c - 1];
+    const int key = whole(c, KEY);
+    const bool first = key != last;
+    last = key;
     pairs += first;
-    if (c % LANES == lane) pair[c] = pairs - 1;
+    if (c % LANES == lane) whole(c, PAIR) = pairs - 1;
     if (!first) continue;
-    const int i = contact[c];
-    if (lane == 0) lead[pairs - 1] = i;
+    const int i = whole(c, PLACE);
+    float* E = joined + (pairs - 1) * PARTS;
+    if (lane == 0) lead(pairs - 1) = i;
     // what the degrees of freedom do to the pair
     const auto bodies = bodies_of(i);
     const int* moves1 = at_row(p.body_isdofancestor, bodies[0]);
@@ -107,8 +114,8 @@ for (int c = 0; c < contacts; ++c) {
         }
         #pragma unroll
         for (int k = 0; k < 3; ++k) {
-            E[(6 * (pairs - 1) + k) * N + j] = turn[k];
-            E[(6 * (pairs - 1) + k + 3) * N + j] = move[k];
+            E[k * N + j] = turn[k];
+            E[(k + 3) * N + j] = move[k];
         }
     }
 }
@@ -146,16 +153,23 @@ auto by_mass = [&](float* Ma) {  // M v
 };
 auto twists = [&] {  // E v
     #pragma unroll 1
-    for (int row = lane; row < 6 * pairs; row += LANES) twist[row] = dot(E + row * N, v);
+    for (int row = lane; row < 6 * pairs; row += LANES) {
+        float* of = joined + row / 6 * PARTS;
+        of[TWIST + row % 6] = dot(of + row % 6 * N, v);
+    }
     sync();
 };
+auto read = [&](int c, float* f) {  // the first 32 numbers of a contact
+    #pragma unroll
+    for (int q = 0; q < 8; ++q) *(Quad*)(f + 4 * q) = ((const Quad*)(touch + c * FIELDS))[q];
+};
 auto slip = [&](int c, float* a) {  // a pair's twist in a contact's directions
-    const float *t = twist + 6 * pair[c], *f = touch + c;
-    const wp::vec3 turn(t[0], t[1], t[2]), arm(f[ARM * ROOM], f[(ARM + 1) * ROOM], f[(ARM + 2) * ROOM]);
+    const float *f = touch + c * FIELDS, *t = joined + whole(c, PAIR) * PARTS + TWIST;
+    const wp::vec3 turn(t[0], t[1], t[2]), arm(f[ARM], f[ARM + 1], f[ARM + 2]);
     const wp::vec3 move = wp::vec3(t[3], t[4], t[5]) + wp::cross(turn, arm);
     #pragma unroll
     for (int k = 0; k < 3; ++k) {
-        const wp::vec3 axis(f[3 * k * ROOM], f[(3 * k + 1) * ROOM], f[(3 * k + 2) * ROOM]);
+        const wp::vec3 axis(f[3 * k], f[3 * k + 1], f[3 * k + 2]);
         a[k] = wp::dot(axis, move);
         a[k + 3] = wp::dot(axis, turn);
     }
@@ -171,23 +185,21 @@ for (int row = lane; row < plain; row += LANES) {
 }
 #pragma unroll 1
 for (int c = lane; c < contacts; c += LANES) {
-    const int i = contact[c];
-    float* f = touch + c;
-    const wp::vec3 arm = p.pos.data[i] - p.pos.data[lead[pair[c]]];
+    const int i = whole(c, PLACE);
+    float* f = touch + c * FIELDS;
+    const wp::vec3 arm = p.pos.data[i] - p.pos.data[lead(whole(c, PAIR))];
     for (int k = 0; k < 3; ++k) {
-        for (int j = 0; j < 3; ++j) f[(3 * k + j) * ROOM] = p.frame.data[i].data[k][j];
-        f[(ARM + k) * ROOM] = arm[k];
+        for (int j = 0; j < 3; ++j) f[3 * k + j] = p.frame.data[i].data[k][j];
+        f[ARM + k] = arm[k];
     }
     // a contact without friction: two rows, each half as stiff, both along the normal
     const int dim = p.dim.data[i];
-    for (int k = 0; k < 5; ++k) f[(FRICTION + k) * ROOM] = dim == 1 ? 0.0f : p.friction.data[i][k];
-    f[STIFFNESS * ROOM] = p.soft.data[i][0] * (dim == 1 ? 0.5f : 1.0f);
-    f[SIDES * ROOM] = wp::max(1, dim - 1);
-    float a[6];
-    slip(c, a);
-    for (int k = 0; k < 6; ++k) off[k * ROOM + c] = a[k];
-    off[c] += p.soft.data[i][1];
-    pushes[c] = 0;
+    for (int k = 0; k < 5; ++k) f[FRICTION + k] = dim == 1 ? 0.0f : p.friction.data[i][k];
+    f[STIFFNESS] = p.soft.data[i][0] * (dim == 1 ? 0.5f : 1.0f);
+    f[SIDES] = wp::max(1, dim - 1);
+    slip(c, f + OFF);
+    f[OFF] += p.soft.data[i][1];
+    whole(c, PUSHES) = 0;
 }
 float velocity[OWN];
 for (int s = 0; s < OWN; ++s)
@@ -198,9 +210,10 @@ twists();
 for (int c = lane; c < contacts; c += LANES) {
     float a[6];
     slip(c, a);
+    const float damping = p.soft.data[whole(c, PLACE)][2];
     for (int k = 0; k < 6; ++k) {
-        off[k * ROOM + c] += p.soft.data[contact[c]][2] * a[k];
-        rate[k * ROOM + c] = 0.0f;
+        touch[c * FIELDS + OFF + k] += damping * a[k];
+        touch[c * FIELDS + RATE + k] = 0.0f;
     }
 }
 
@@ -234,27 +247,28 @@ while (steps <= p.iterations) {  // always; with `true` the compiler needs eight
     for (int start = 0; start < contacts; start += CHUNK) {
         const int end = wp::min(start + CHUNK, contacts);
         for (int c = start + lane; c < end; c += LANES) {
-            const float* f = touch + c;
-            const float stiffness = f[STIFFNESS * ROOM];
-            const int sides = f[SIDES * ROOM];
+            alignas(16) float f[32];
+            read(c, f);
+            const float stiffness = f[STIFFNESS];
+            const int sides = f[SIDES];
             float a[6];
             #pragma unroll
-            for (int k = 0; k < 6; ++k) a[k] = off[k * ROOM + c] += alpha * rate[k * ROOM + c];
+            for (int k = 0; k < 6; ++k) touch[c * FIELDS + OFF + k] = a[k] = f[OFF + k] + alpha * f[RATE + k];
             // S, the curvature of the pyramid of rows a_0 +- friction_k a_k: its first row and diagonal
             float first[6] = {}, diagonal[6] = {};
             int pushing = 0;
             #pragma unroll
             for (int k = 1; k < 6; ++k) {
                 if (k > sides) continue;
-                const float friction = f[(FRICTION + k - 1) * ROOM], side = friction * a[k];
+                const float friction = f[FRICTION + k - 1], side = friction * a[k];
                 const bool more = a[0] + side < 0.0f, less = a[0] - side < 0.0f;
                 pushing |= (more | less << 1) << 2 * k;
                 first[0] += stiffness * (more + less);
                 first[k] = stiffness * friction * (more - less);
                 diagonal[k] = stiffness * friction * friction * (more + less);
             }
-            changes += pushing != pushes[c];
-            pushes[c] = pushing;
+            changes += pushing != whole(c, PUSHES);
+            whole(c, PUSHES) = pushing;
             // C: what each direction, slip along the axes and turns about them, is of the pair's twist
             float C[6][6], SC[6][6] = {}, Sa[6];
             #pragma unroll
@@ -262,9 +276,8 @@ while (steps <= p.iterations) {  // always; with `true` the compiler needs eight
                 #pragma unroll
                 for (int i = 0; i < 3; ++i) {
                     const int j = (i + 1) % 3, l = (i + 2) % 3;
-                    C[k][i + 3] = C[k + 3][i] = f[(3 * k + i) * ROOM];
-                    C[k][i] = f[(ARM + j) * ROOM] * f[(3 * k + l) * ROOM]
-                        - f[(ARM + l) * ROOM] * f[(3 * k + j) * ROOM];
+                    C[k][i + 3] = C[k + 3][i] = f[3 * k + i];
+                    C[k][i] = f[ARM + j] * f[3 * k + l] - f[ARM + l] * f[3 * k + j];
                     C[k + 3][i + 3] = 0.0f;
                 }
             Sa[0] = first[0] * a[0];
@@ -300,8 +313,9 @@ while (steps <= p.iterations) {  // always; with `true` the compiler needs eight
         for (int e = lane; e < SUMS - 1; e += LANES)
             for (int c = start; c < end; ++c) {
                 total[e / LANES] += part[(c - start) * (SUMS + 1) + e];
-                if (c + 1 < contacts && pair[c + 1] == pair[c]) continue;
-                sums[pair[c] * SUMS + e] = total[e / LANES];
+                const int pair = whole(c, PAIR);
+                if (c + 1 < contacts && whole(c + 1, PAIR) == pair) continue;
+                joined[pair * PARTS + TOTALS + e] = total[e / LANES];
                 total[e / LANES] = 0.0f;
             }
         sync();
@@ -329,11 +343,11 @@ while (steps <= p.iterations) {  // always; with `true` the compiler needs eight
         }
         #pragma unroll 1
         for (int q = 0; q < pairs; ++q) {
-            const float* rows = E + q * 6 * N;
+            const float *rows = joined + q * PARTS, *sums = rows + TOTALS;
             alignas(16) float A[SUMS];
             float own[6];
             #pragma unroll
-            for (int e = 0; e < SUMS; e += 4) *(Quad*)(A + e) = *(const Quad*)(sums + q * SUMS + e);
+            for (int e = 0; e < SUMS; e += 4) *(Quad*)(A + e) = *(const Quad*)(sums + e);
             #pragma unroll
             for (int k = 0; k < 6; ++k) {
                 own[k] = rows[k * N + j];
@@ -368,10 +382,7 @@ while (steps <= p.iterations) {  // always; with `true` the compiler needs eight
     for (int row = lane; row < plain; row += LANES) slope[row] = dot(J + row * wide, v);
     #pragma unroll 1
     for (int c = lane; c < contacts; c += LANES) {
-        float a[6];
-        slip(c, a);
-        #pragma unroll
-        for (int k = 0; k < 6; ++k) rate[k * ROOM + c] = a[k];
+        slip(c, touch + c * FIELDS + RATE);
     }
     // of the smooth cost along d: slope at 0, curvature; and |d|^2
     float rise0 = 0.0f, bent0 = 0.0f, length = 0.0f;
@@ -400,15 +411,16 @@ while (steps <= p.iterations) {  // always; with `true` the compiler needs eight
         }
         #pragma unroll 1
         for (int c = lane; c < contacts; c += LANES) {
-            const float* f = touch + c;
-            const float stiffness = f[STIFFNESS * ROOM], change = rate[c], at = off[c] + alpha * change;
-            const int sides = f[SIDES * ROOM];
+            alignas(16) float f[32];
+            read(c, f);
+            const float stiffness = f[STIFFNESS], change = f[RATE], at = f[OFF] + alpha * change;
+            const int sides = f[SIDES];
             #pragma unroll
             for (int k = 1; k < 6; ++k) {
                 if (k > sides) continue;
-                const float friction = f[(FRICTION + k - 1) * ROOM];
-                const float along = friction * rate[k * ROOM + c];
-                const float side = friction * off[k * ROOM + c] + alpha * along;
+                const float friction = f[FRICTION + k - 1];
+                const float along = friction * f[RATE + k];
+                const float side = friction * f[OFF + k] + alpha * along;
                 #pragma unroll
                 for (int sign = -1; sign < 2; sign += 2) {
                     const float depth = wp::min(0.0f, at + sign * side), way = change + sign * along;
@@ -446,13 +458,13 @@ for (int s = 0; s < OWN; ++s) {
 }
 #pragma unroll 1
 for (int c = lane; c < contacts; c += LANES) {
-    const int i = contact[c], first = at_row(p.address, i)[0];
-    const float* f = touch + c;
-    const int sides = f[SIDES * ROOM];
+    const int i = whole(c, PLACE), first = at_row(p.address, i)[0];
+    const float* f = touch + c * FIELDS;
+    const int sides = f[SIDES];
     for (int k = 1; k <= sides; ++k) {
-        const float side = f[(FRICTION + k - 1) * ROOM] * off[k * ROOM + c];
-        const float more = -f[STIFFNESS * ROOM] * wp::min(0.0f, off[c] + side);
-        const float less = -f[STIFFNESS * ROOM] * wp::min(0.0f, off[c] - side);
+        const float side = f[FRICTION + k - 1] * f[OFF + k];
+        const float more = -f[STIFFNESS] * wp::min(0.0f, f[OFF] + side);
+        const float less = -f[STIFFNESS] * wp::min(0.0f, f[OFF] - side);
         force[first + 2 * k - 2] = p.dim.data[i] == 1 ? more + less : more;
         if (p.dim.data[i] > 1) force[first + 2 * k - 1] = less;
     }

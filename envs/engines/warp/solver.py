@@ -39,6 +39,8 @@ from mujoco.mjx.third_party.mujoco_warp._src import constraint, types
 
 THREADS = 32  # of a block: a warp
 REGISTERS = 128  # of a thread, for 16 blocks a multiprocessor
+HALF = 16
+MANY = 2048  # worlds: of more an H200 does not hold all at a time, if each is a block
 MOST = 32  # degrees of freedom: beyond them MuJoCo Warp's J is sparse
 
 theirs = mujoco_warp.solve
@@ -47,55 +49,66 @@ vec5 = wp.types.vector(length=5, dtype=float)
 SOURCE = "".join(Path(__file__).with_name(name).read_text() for name in ("lanes.cu", "newton.cu"))
 
 
-@wp.kernel(enable_backward=False)
-def assign(
-    disableflags: int,
-    timestep: wp.array[float],
-    impratio_invsqrt: wp.array[float],
-    body_invweight0: wp.array2d[wp.vec2],
-    geom_bodyid: wp.array[int],
-    nacon: wp.array[int],
-    kind: wp.array[int],
-    geom: wp.array[wp.vec2i],
-    dim: wp.array[int],
-    dist: wp.array[float],
-    margin: wp.array[float],
-    friction: wp.array[vec5],
-    solref: wp.array[wp.vec2],
-    solimp: wp.array[vec5],
-    world_of: wp.array[int],
-    room: int,  # for rows
-    nefc: wp.array[int],
-    address: wp.array2d[int],
-    count: wp.array[int],
-    listed: wp.array2d[int],
-    soft: wp.array[wp.vec3],
-):
-    """Give each contact its rows, each world the list of its contacts, and say how soft they are:
-    stiffness D of a row, its part of -aref from the depth, and damping, all as in MuJoCo."""
-    i = wp.tid()
-    if i >= nacon[0]:
+@wp.struct
+class Listing:
+    """Contacts as they were found, and where they are listed."""
+
+    disableflags: int
+    timestep: wp.array[float]
+    impratio_invsqrt: wp.array[float]
+    body_invweight0: wp.array2d[wp.vec2]
+    geom_bodyid: wp.array[int]
+    type: wp.array[int]
+    geom: wp.array[wp.vec2i]
+    dim: wp.array[int]
+    dist: wp.array[float]
+    includemargin: wp.array[float]
+    friction: wp.array[vec5]
+    solref: wp.array[wp.vec2]
+    solimp: wp.array[vec5]
+    worldid: wp.array[int]
+    room: int  # for rows
+    nefc: wp.array[int]
+    efc_address: wp.array2d[int]
+    count: wp.array[int]
+    listed: wp.array2d[int]
+    soft: wp.array[wp.vec3]
+
+
+@wp.func
+def enlist(p: Listing, i: int, world: int):
+    """Give a contact its rows, its world's list the contact, and say how soft it is: stiffness D of a
+    row, its part of -aref from the depth, and damping, all as in MuJoCo."""
+    constrains = (p.type[i] & wp.static(int(types.ContactType.CONSTRAINT))) != 0
+    depth = p.dist[i] - p.includemargin[i]
+    if not constrains or depth >= 0.0:
         return
-    if (kind[i] & wp.static(int(types.ContactType.CONSTRAINT))) == 0 or dist[i] >= margin[i]:
-        return
-    world = world_of[i]
-    rows = wp.max(1, 2 * (dim[i] - 1))
-    first = wp.atomic_add(nefc, world, rows)
-    fits = first + rows <= room
+    rows = wp.max(1, 2 * (p.dim[i] - 1))
+    first = wp.atomic_add(p.nefc, world, rows)
+    fits = first + rows <= p.room
     if fits:
-        listed[world, wp.atomic_add(count, world, 1)] = i
+        p.listed[world, wp.atomic_add(p.count, world, 1)] = i
     for r in range(rows):
-        address[i, r] = wp.where(fits, first + r, -1)
-    depth = dist[i] - margin[i]
-    kbi = constraint._contact_kbimp(disableflags, timestep[0], solref[i], solimp[i], depth, False)
-    of = world % body_invweight0.shape[0]
+        p.efc_address[i, r] = wp.where(fits, first + r, -1)
+    kbi = constraint._contact_kbimp(
+        p.disableflags, p.timestep[0], p.solref[i], p.solimp[i], depth, False
+    )
+    of = world % p.body_invweight0.shape[0]
     weight = 0.0
     for k in range(2):
-        weight += body_invweight0[of, geom_bodyid[geom[i][k]]][0]
-    if dim[i] > 1:
-        ratio = friction[i][0] * friction[i][0]
-        weight = (weight + ratio * weight) * 2.0 * ratio * impratio_invsqrt[0] * impratio_invsqrt[0]
-    soft[i] = wp.vec3(constraint._efc_D(weight, kbi[2]), kbi[0] * kbi[2] * depth, kbi[1])
+        weight += p.body_invweight0[of, p.geom_bodyid[p.geom[i][k]]][0]
+    if p.dim[i] > 1:
+        ratio = p.friction[i][0] * p.friction[i][0]
+        weight = (weight + ratio * weight) * 2.0 * ratio * p.impratio_invsqrt[0] * p.impratio_invsqrt[0]
+    p.soft[i] = wp.vec3(constraint._efc_D(weight, kbi[2]), kbi[0] * kbi[2] * depth, kbi[1])
+
+
+@wp.kernel(enable_backward=False)
+def assign(p: Listing, nacon: wp.array[int]):
+    """`enlist` the contacts of all worlds."""
+    i = wp.tid()
+    if i < nacon[0]:
+        enlist(p, i, p.worldid[i])
 
 
 @wp.struct
@@ -155,27 +168,41 @@ def threads(d: Any) -> int:
 def scratch_size(nv: int, room: int) -> int:
     """Floats of a world in `scratch`, which newton.cu divides up and holds to this."""
     width = -(-nv // 4) * 4
-    of_contact, of_pair = 19 + 6 + 6 + 6, 6 * width + 28 + 6
+    of_contact, of_pair = 36, 6 * width + 36
     return room * (of_contact + of_pair) + (nv + 1) * width
 
 
-def newton_function(nv: int, room: int, lanes: int) -> Any:
-    sizes = f"NV = {nv}, ROOM = {room}, LANES = {lanes}, SCRATCH = {scratch_size(nv, room)}"
+def shape_of(nv: int, d: Any) -> tuple[int, int]:
+    """Threads of a world, and worlds of a block."""
+    lanes = threads(d)
+    if d.nworld > MANY and nv <= HALF:
+        lanes = min(lanes, HALF)
+    return (
+        lanes,
+        THREADS // lanes if d.qacc.device.is_cuda else 1,
+    )  # on a CPU all of a block wait for all
 
-    @wp.func_native(f"constexpr int {sizes};\n{SOURCE}")
-    def newton(p: Problem, world: int, lane: int): ...
+
+@functools.cache
+def newton_function(nv: int, room: int, lanes: int, worlds: int) -> Any:
+    sizes = f"NV = {nv}, ROOM = {room}, LANES = {lanes}, WORLDS = {worlds}"
+
+    @wp.func_native(f"constexpr int {sizes}, SCRATCH = {scratch_size(nv, room)};\n{SOURCE}")
+    def newton(p: Problem, world: int, thread: int): ...
 
     return newton
 
 
 @functools.cache
-def newton_kernel(nv: int, room: int, lanes: int) -> Any:
-    newton = newton_function(nv, room, lanes)
+def newton_kernel(nv: int, room: int, lanes: int, worlds: int) -> Any:
+    newton = newton_function(nv, room, lanes, worlds)
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=REGISTERS)
     def kernel(p: Problem):
-        world, lane = wp.tid()
-        newton(p, world, lane)
+        block, thread = wp.tid()
+        world = block * worlds + thread // lanes
+        if world < p.qacc.shape[0]:
+            newton(p, world, thread)
 
     return kernel
 
@@ -264,33 +291,20 @@ def plain_rows(m: Any, d: Any) -> None:
 
 def list_contacts(m: Any, d: Any) -> None:
     """After the plain rows, to lists that are empty."""
-    work = d.newton
     if m.opt.disableflags & (mujoco_warp.DisableBit.CONTACT | mujoco_warp.DisableBit.CONSTRAINT):
         return
-    contact = d.contact
-    wp.launch(
-        assign,
-        dim=d.naconmax,
-        inputs=[
-            m.opt.disableflags,
-            m.opt.timestep,
-            m.opt.impratio_invsqrt,
-            m.body_invweight0,
-            m.geom_bodyid,
-            d.nacon,
-            contact.type,
-            contact.geom,
-            contact.dim,
-            contact.dist,
-            contact.includemargin,
-            contact.friction,
-            contact.solref,
-            contact.solimp,
-            contact.worldid,
-            d.njmax,
-        ],
-        outputs=[d.nefc, contact.efc_address, work.count, work.listed, work.soft],
-    )
+    wp.launch(assign, d.naconmax, inputs=[listing(m, d), d.nacon])
+
+
+def listing(m: Any, d: Any) -> Any:
+    """For `enlist`: the options of `m` as they are now, and the arrays of `d`, which was adopted."""
+    p = Listing()
+    for name in Listing.vars:
+        for owner in (m, m.opt, d, d.contact, d.newton):
+            if hasattr(owner, name):
+                setattr(p, name, getattr(owner, name))
+    p.room = d.njmax
+    return p
 
 
 def solve(m: Any, d: Any) -> None:
@@ -299,9 +313,10 @@ def solve(m: Any, d: Any) -> None:
     if work is None:
         theirs(m, d)
         return
-    lanes = threads(d)
-    kernel = newton_kernel(m.nv, work.listed.shape[1], lanes)
-    wp.launch_tiled(kernel, dim=d.nworld, inputs=[problem(m, d)], block_dim=lanes)
+    lanes, worlds = shape_of(m.nv, d)
+    kernel = newton_kernel(m.nv, work.listed.shape[1], lanes, worlds)
+    blocks = -(-d.nworld // worlds)
+    wp.launch_tiled(kernel, dim=blocks, inputs=[problem(m, d)], block_dim=lanes * worlds)
 
 
 def problem(m: Any, d: Any) -> Any:
