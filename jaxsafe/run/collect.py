@@ -2,8 +2,6 @@
 
 import json
 import math
-import os
-import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -91,11 +89,11 @@ def data_file(path: str | Path) -> Path:
         raise ConfigError(
             f"out={out} is a folder; expected a file, such as {out / f'data{out.suffix}'}"
         )
-    above = next(folder for folder in out.absolute().parents if os.path.lexists(folder))
+    above = files.nearest_above(out.parent)
     if not above.is_dir():
         raise ConfigError(f"out={out}: {above} is {files.kind_of(above)}; expected a folder")
     try:
-        tempfile.TemporaryFile(dir=above).close()
+        files.try_writing(above)
     except OSError as error:
         raise ConfigError(f"out={out}: cannot write to {above}: {error.strerror}") from error
     return out

@@ -16,6 +16,7 @@ import json
 import lzma
 import os
 import stat
+import tempfile
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -84,6 +85,21 @@ def make_folder(folder: Path, *names: str) -> Path:
     path = inside(folder, *names)
     path.mkdir(parents=True, exist_ok=True)
     return path
+
+
+def nearest_above(path: Path) -> Path:
+    """The path itself or, where there is nothing of this name, the nearest one above that is there."""
+    path = path.absolute()
+    return next(each for each in (path, *path.parents) if os.path.lexists(each))
+
+
+def try_writing(folder: Path) -> None:
+    """Write in a folder or, where it is not there yet, in the nearest one above. Nothing of it stays.
+
+    Raises:
+        OSError: nobody can write there.
+    """
+    tempfile.TemporaryFile(dir=nearest_above(folder)).close()
 
 
 @contextlib.contextmanager

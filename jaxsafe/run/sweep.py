@@ -46,9 +46,12 @@ def train(sweep: Sweep, resume_command: str, report: Reporter, after: After) -> 
     Returns:
         The exit status: 0, or 130 if the user stopped it.
     Raises:
+        checkpoint.NotSaved: the disk failed. A folder that cannot be written shows before it compiles.
         Diverged: a run did, after the others were trained.
     """
     parallel, diverged = open_folder(sweep), []
+    with checkpoint.writing_to(sweep.folder):
+        files.try_writing(sweep.folder)
     sizes = [len(s.configs) for s in sweep.groups.values()]
     report.line(
         f"sweep: {sum(sizes)} settings in {len(sizes)} group{'s' * (len(sizes) > 1)}, in {sweep.folder}"

@@ -490,6 +490,13 @@ def test_a_bad_sweep_is_one_line_and_status_2(arguments, tmp_path, monkeypatch, 
     assert not list(tmp_path.glob("runs/*"))
 
 
+def test_a_sweep_in_a_place_where_nobody_can_write_compiles_nothing(monkeypatch, capsys):
+    monkeypatch.setattr(sweep, "members_at_once", lambda *_: pytest.fail("it went on to compile"))
+    assert shell.typed("sweep", *SMALL, *GRID, "run_dir=/proc/here/sweep") == 1  # as train.py
+    out, err = capsys.readouterr()
+    assert out == "" and err == "error: cannot write to /proc/here/sweep: No such file or directory\n"
+
+
 def test_the_command_rewrites_the_summary_of_a_sweep_at_any_time(tmp_path, capsys):
     asked = planned("env=point_goal0", "algo.cost_limit=2,4", f"run_dir={tmp_path}")
     sweep.write_folder(asked, {})
