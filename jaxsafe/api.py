@@ -35,7 +35,7 @@ from jaxsafe.run.plain import to_plain
 from jaxsafe.run.policies import ROBOT, RunPolicies, open_run
 from jaxsafe.run.progress import Reporter
 from jaxsafe.run.session import Session
-from jaxsafe.run.settings import load, nested, settings_from_config, settings_from_options, yours
+from jaxsafe.run.settings import load, nested, settings_from_options, settings_of_run, yours
 from jaxsafe.run.sweep_plan import plan
 from jaxsafe.types import Env, PyTree
 
@@ -108,7 +108,7 @@ class Run:
         choice = chosen(env, algo)
         self._extras, self._given = choice.extras, {*flat(nested(choice.given))}
         self.folder = Path(folder).expanduser()
-        self.settings = settings_from_config(run_folder.read_config(self.folder), self._extras)
+        self.settings = settings_of_run(run_folder.read_config(self.folder), self._extras)
 
     def __repr__(self) -> str:
         s = self.settings

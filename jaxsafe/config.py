@@ -33,6 +33,16 @@ class UnnamedCode(ConfigError):
         )
 
 
+class MissingObject(ConfigError):
+    """An environment or algorithm of the user's that a run was trained with, which is not given."""
+
+    def __init__(self, kind: str, name: str):
+        super().__init__(
+            f"the run was trained with {kind}={name}, which jaxsafe does not have; if it is an object "
+            f"of your program, open the run from Python with it: jaxsafe.Run(FOLDER, {kind}=OBJECT)"
+        )
+
+
 def one_line(error: BaseException) -> str:
     """The first line of what an error says, or its kind if it says nothing."""
     lines = (line.strip() for line in str(error).splitlines())

@@ -11,7 +11,7 @@ import numpy as np
 
 import jaxsafe
 from jaxsafe.algos import ALGOS
-from jaxsafe.config import ConfigError, UnnamedCode, flat
+from jaxsafe.config import ConfigError, MissingObject, UnnamedCode, flat
 from jaxsafe.envs import ENVS
 from jaxsafe.learn.constraints import cost_title, limits_of
 from jaxsafe.report import scores, study_files
@@ -23,8 +23,8 @@ from jaxsafe.run.settings import (
     NO_EXTRAS,
     NOT_COMPARED,
     Extras,
-    settings_from_config,
     settings_from_options,
+    settings_of_run,
 )
 
 # Fields that do not make another setting.
@@ -124,8 +124,8 @@ def read_one(folder: Path, extras: Extras = NO_EXTRAS) -> list[SettingRun]:
         return read_study(folder)
     plain = run_folder.read_config(folder)
     try:
-        saved = settings_from_config(plain, extras)
-    except UnnamedCode as error:
+        saved = settings_of_run(plain, extras)
+    except (UnnamedCode, MissingObject) as error:
         raise ConfigError(f"{folder}: {error}") from error
     except ConfigError as error:
         by = run_folder.trained_by(folder)

@@ -25,7 +25,7 @@ from jaxsafe.run.settings import (
     check_read_from,
     load,
     make_env,
-    settings_from_config,
+    settings_of_run,
 )
 from jaxsafe.types import Algorithm, Env, PyTree, Shared
 
@@ -85,7 +85,7 @@ def open_run(folder: Path, code: Sequence[str] = (), extras: Extras = NO_EXTRAS)
             raise ConfigError(f"{kind}={name}: {folder} was trained with {kind}={there}")
         if kind in DEFAULT:
             load(kind, name)
-    settings = settings_from_config(saved, extras)
+    settings = settings_of_run(saved, extras)
     check_read_from(settings, folder, {*given, "dataset", "init_from"})  # these two are not read here
     if not checkpoint.checkpoints(policy_folder(folder)):
         raise ConfigError(f"{folder} holds no checkpoint")
@@ -203,7 +203,7 @@ def warm_start(
         ConfigError: no run, or one whose networks have other shapes.
     """
     source = Path(settings.train.init_from or "").expanduser()
-    saved = settings_from_config(run_folder.read_config(source), settings.extras)
+    saved = settings_of_run(run_folder.read_config(source), settings.extras)
     if not checkpoint.checkpoints(policy_folder(source)):
         raise ConfigError(f"init_from={source} holds no checkpoint")
     first, count = saved.train.seed, saved.train.num_seeds

@@ -30,7 +30,7 @@ from jaxsafe.run.settings import (
     Settings,
     TrainConfig,
     make_env,
-    settings_from_config,
+    settings_of_run,
     unusual_in_words,
 )
 from jaxsafe.types import Env
@@ -127,7 +127,7 @@ def agree_on_folder(settings: Settings, job: int | None, say: Callable[[str], No
 
 def check_same_run(settings: Settings, folder: Path) -> None:
     """Raise ConfigError if the run in `folder` has other settings than these."""
-    saved = flat(settings_from_config(run_folder.read_config(folder), settings.extras).plain())
+    saved = flat(settings_of_run(run_folder.read_config(folder), settings.extras).plain())
     free = {*NOT_COMPARED}
     if len(settings.configs) * settings.train.num_seeds > 1:
         free.add("devices")  # each member is whole on one of them

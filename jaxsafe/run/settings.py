@@ -21,6 +21,7 @@ from jaxsafe.config import (
     Bounds,
     ConfigError,
     Devices,
+    MissingObject,
     Period,
     RunSteps,
     Seed,
@@ -217,6 +218,21 @@ def settings_from_config(config: dict[str, Any], extras: Extras = NO_EXTRAS) -> 
     return Settings(env_name, entry, options, algo_name, row, configs, train)
 
 
+def settings_of_run(config: dict[str, Any], extras: Extras = NO_EXTRAS) -> Settings:
+    """`settings_from_config` of what `run_folder.read_config` finds in a run folder.
+
+    Raises:
+        MissingObject: the run was trained with an object that `extras` lacks.
+        ConfigError: as of `settings_from_config`.
+    """
+    environments = {*envs.ENVS, *envs.ALIASES, *extras.envs}
+    for kind, known in ("env", environments), ("algo", {*algos.ALGOS, *extras.algos}):
+        name = config[kind]["name"]
+        if name not in known and ":" not in name:
+            raise MissingObject(kind, name)
+    return settings_from_config(config, extras)
+
+
 def settings_from_options(given: dict[str, Any], extras: Extras = NO_EXTRAS) -> Settings:
     """Settings from the options that somebody gives, which are checked by name.
 
@@ -278,7 +294,7 @@ def resumed(
     given: Collection[str] = (),
 ) -> dict[str, Any]:
     """Every option of the run in `folder`, which must be of this environment and algorithm."""
-    saved = settings_from_config(run_folder.read_config(folder), extras)
+    saved = settings_of_run(run_folder.read_config(folder), extras)
     asked = names["env"] and find_env(names["env"], extras)[0]
     for kind, name, there in (
         ("env", asked, saved.env_name),

@@ -24,6 +24,7 @@ from jaxsafe.learn.steps import adam_epochs
 from jaxsafe.learn.surrogates import clipped
 from jaxsafe.learn.treatments import penalty
 from jaxsafe.report.evaluation import evaluate
+from jaxsafe.report.read import read
 from jaxsafe.run import checkpoint, programs, progress, run_folder
 from jaxsafe.run.arguments import compose
 from jaxsafe.run.plain import to_plain
@@ -274,8 +275,15 @@ def test_a_run_of_ones_own_opens_with_the_same_object_alone(run):
     again = jaxsafe.Run(run.folder, Corridor())
     obs = run.env().reset(jax.random.key(0)).obs
     np.testing.assert_array_equal(again.policy(obs), run.policy(obs))
-    with pytest.raises(jaxsafe.ConfigError, match="unknown environment 'Corridor'"):
-        jaxsafe.Run(run.folder)
+    opens = r"trained with env=Corridor, .* jaxsafe\.Run\(FOLDER, env=OBJECT\)"
+    for elsewhere in (
+        lambda: jaxsafe.Run(run.folder),
+        lambda: jaxsafe.train(resume=run.folder),
+        lambda: jaxsafe.train("pendulum_tilt", init_from=run.folder),
+        lambda: read([run.folder]),
+    ):
+        with pytest.raises(jaxsafe.ConfigError, match=opens):
+            elsewhere()
 
 
 @pytest.fixture
@@ -296,6 +304,8 @@ def test_an_interrupted_run_is_saved_and_continues(signals, run, capsys):
     with pytest.raises(KeyboardInterrupt, match=r"env=<your Corridor>, algo=<your Priced>, r"):
         jaxsafe.train(Corridor(), PRICED, run_dir="stopped", **TINY)
     assert signal.getsignal(signal.SIGINT) is before
+    with pytest.raises(jaxsafe.ConfigError, match=r"trained with algo=Priced, .* algo=OBJECT\)"):
+        jaxsafe.Run("stopped", Corridor())
     stopped = jaxsafe.Run("stopped", Corridor(), PRICED)
     assert 0 < stopped.steps < 96
     out = capsys.readouterr().out
