@@ -117,7 +117,8 @@ def data_set(
     if truncated is not None:
         truncated = np.asarray(truncated, bool) & ~terminated
         ends = terminated | truncated
-        episodes = episodes_of(obs, reward, cost, ends, ends if cut is None else ends | cut)
+        last = ends if cut is None else ends | np.asarray(cut, bool)
+        episodes = episodes_of(obs, reward, cost, ends, last)
     else:
         truncated = np.zeros_like(terminated)
     costs = {name: np.asarray(x, np.float32) for name, x in (costs or {}).items()}

@@ -13,6 +13,7 @@ What is written, as .npz or .hdf5:
     rewards, costs                    float [n]
     terminals                         bool [n]; the end of an episode by its time limit is none
     timeouts                          bool [n]; that end
+    cuts                              bool [n], if there are any: an episode stops there without an end
     cost_NAME                         float [n], for each cost with a name
     vision, next_vision               uint8 [n, height, width, channels], where there are pictures
     about                             what the file says of itself, as JSON; in .hdf5 its attributes
@@ -160,7 +161,7 @@ def from_flat(path: str, source: Source) -> DataSet:
     raw = {name: source.read(name) for name in ARRAYS}
     axes = {name: axes for name, (_, axes) in ARRAYS.items()}
     for name in source.names:
-        if name == "timeouts" or name.startswith(NAMED):
+        if name in ("timeouts", "cuts") or name.startswith(NAMED):
             raw[name], axes[name] = source.read(name), 1
     raw = {name: checked(path, name, x, axes[name], raw["rewards"]) for name, x in raw.items()}
     costs = {name.removeprefix(NAMED): x for name, x in raw.items() if name.startswith(NAMED)}
@@ -169,7 +170,7 @@ def from_flat(path: str, source: Source) -> DataSet:
         if "vision" in source.names:
             picture = pictures(path, name, source, raw["rewards"])
             fields[field] = {"vector": fields[field], "vision": picture}
-    return data_set(**fields, truncated=raw.get("timeouts"), costs=costs)
+    return data_set(**fields, truncated=raw.get("timeouts"), costs=costs, cut=raw.get("cuts"))
 
 
 def pictures(path: str, name: str, source: Source, like: np.ndarray) -> np.ndarray:
@@ -371,6 +372,9 @@ def write_dataset(
             arrays[name] = np.asarray(getattr(data, field)["vision"])
     if data.episodes:
         arrays["timeouts"] = np.asarray(data.truncated)
+        last = np.append(np.diff(data.episodes.number) > 0, False)  # the very last one needs no mark
+        if (cuts := last & ~(np.asarray(data.terminated) | arrays["timeouts"])).any():
+            arrays["cuts"] = cuts
     arrays |= {f"{NAMED}{name}": np.asarray(x) for name, x in data.costs.items()} | dict(more or {})
     if path.suffix not in (".npz", ".hdf5"):
         raise ConfigError(f"{path}: expected a name that ends in .hdf5 or .npz")

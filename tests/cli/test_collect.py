@@ -234,9 +234,10 @@ def test_episodes_are_found_and_those_that_are_cut_are_not_whole():
 
 
 @pytest.mark.filterwarnings("error")  # as of a file that stays open
+@pytest.mark.parametrize("ends", ["..t..T...T", "..t..T.c..T", "c.c.."])
 @pytest.mark.parametrize("suffix", [".hdf5", ".npz"])
-def test_our_files_come_back_bit_for_bit(tmp_path, suffix):
-    data, _ = made("..t..T...T")
+def test_our_files_come_back_bit_for_bit(tmp_path, suffix, ends):
+    data, _ = made(ends)
     write_dataset(tmp_path / f"data{suffix}", data)
     assert_equal(read_dataset(str(tmp_path / f"data{suffix}")), data)
 
