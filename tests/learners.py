@@ -21,6 +21,7 @@ from toys import START, Corridor, updated
 from jaxsafe.algos import ALGOS
 from jaxsafe.config import ConfigError
 from jaxsafe.learn.on_policy import OnPolicyConfig
+from jaxsafe.learn.world_model import latents_of
 from jaxsafe.run import compat
 from jaxsafe.types import Algorithm, Metrics, PyTree, Shared
 
@@ -158,3 +159,9 @@ def numbers(tree: PyTree) -> list[jax.Array]:
 
 def is_key(x: jax.Array) -> bool:
     return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+
+
+def likeliest_latents(world: Any, params: PyTree, rows: Any) -> Any:
+    """What a world model makes of the rows [T, B]: the latents of its loss, without chance."""
+    embedded = world.apply(params, rows.obs, method="embed")
+    return latents_of(world, params, rows, embedded, None)

@@ -175,17 +175,14 @@ def clip_by_share(share: jax.Array | float) -> optax.GradientTransformation:
 # ---- the model's loss --------------------------------------------------------------------------
 
 
-def filtered(world: WorldModel, params: PyTree, rows: Record, key: jax.Array | None) -> Latent:
-    """The latents of the rows [T, B], the likeliest ones where `key` is None. The first row of each
-    sequence remembers nothing."""
-    embedded: Any = world.apply(params, rows.obs, method="embed")
-    return latents_of(world, params, rows, embedded, key)
-
-
 def latents_of(
     world: WorldModel, params: PyTree, rows: Record, embedded: jax.Array, key: jax.Array | None
 ) -> Latent:
-    """`filtered`, where the observations are `embedded`, float [T, B, E]."""
+    """The latents of the rows [T, B], the likeliest ones where `key` is None. The first row of each
+    sequence remembers nothing.
+
+    embedded: the observations of the rows as the model's `embed` has them, float [T, B, E].
+    """
     first = rows.first.at[0].set(True)
     came_by = jnp.roll(rows.action, 1, axis=0)  # row t came of the action of row t - 1
 

@@ -10,7 +10,7 @@ import numpy as np
 import optax
 import pytest
 from compiling import BUSY, FAST
-from learners import TINY
+from learners import TINY, likeliest_latents
 from toys import START, Corridor, Patch, training
 
 from jaxsafe.algos import ALGOS, dreamer, seditor
@@ -249,7 +249,7 @@ def test_a_model_learns_to_paint_what_it_sees():
         params: Any = world.init(key, blank(observation_like(env)), jnp.zeros(1), method="everything")
         keys = jax.random.split(key, 200)
         (params, _), losses = jax.lax.scan(step, (params, rule.init(params)), keys)
-        latents = world_model.filtered(world, params, rows, None)
+        latents = likeliest_latents(world, params, rows)
         return losses, world.apply(params, latents, method="decode"), rows.obs
 
     losses, painted, seen = jax.jit(train, compiler_options=FAST)(jax.random.key(0))

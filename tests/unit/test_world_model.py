@@ -12,6 +12,7 @@ import optax
 import pytest
 import scipy.stats
 from compiling import FAST
+from learners import likeliest_latents
 from toys import START, Corridor, Ticker
 
 from jaxsafe.algos import ALGOS, ambs, dreamer
@@ -264,7 +265,7 @@ def test_steps_rise_to_the_learning_rate_and_forget_the_size_of_gradients():
 class Glass:
     """A model one can look through: its latent is the observation, what was observed before, and the
     action in between. It foretells the clock of `Ticker` from what was observed before, and what `Echo`
-    earns and costs. It stands for `WorldModel` in the loss, in `filtered` and in the policy."""
+    earns and costs. It stands for `WorldModel` in the loss, in its latents and in the policy."""
 
     decoder = SimpleNamespace(loss=lambda decoded, obs: ((decoded - obs) ** 2).sum(-1))
 
@@ -345,7 +346,7 @@ def test_a_reward_meets_the_latent_of_the_observation_that_it_came_with():
     def worst(rows: Any, **changes: Any) -> jax.Array:
         """The largest error where there was a step: not in a sequence's first row, nor at a start."""
         rows = rows.replace(**changes)
-        latents = world_model.filtered(GLASS, {}, rows, None)
+        latents = likeliest_latents(GLASS, {}, rows)
         known = ~batch.rows.first[1:]
         return jnp.where(known, jnp.abs(echoed(latents)[1:] - rows.reward[1:]), 0).max()
 
@@ -355,11 +356,11 @@ def test_a_reward_meets_the_latent_of_the_observation_that_it_came_with():
     assert worst(rows, obs=jnp.roll(rows.obs, 1, axis=0)) > 1
     assert worst(rows, action=jnp.roll(rows.action, 1, axis=0)) > 0.5
 
-    latents = world_model.filtered(GLASS, {}, rows, None)
+    latents = likeliest_latents(GLASS, {}, rows)
     starts = rows.first.at[0].set(True)
     assert (latents.deter[starts] == 0).all()  # nothing is remembered
     forgotten: Any = rows.replace(first=jnp.zeros_like(rows.first))
-    latents = world_model.filtered(GLASS, {}, forgotten, None)
+    latents = likeliest_latents(GLASS, {}, forgotten)
     assert (jnp.abs(latents.deter[starts]) > 0).any()
 
     cfg = dreamer.DreamerConfig()
@@ -445,10 +446,10 @@ def test_the_policy_remembers_what_the_model_learns_from():
     rows, acted = both(ts.stepping, jax.random.split(jax.random.key(1), 16))
     assert rows.first[1:].any()
     world = world_model.world_of(env, dreamer.blind.all_heads(cfg), cfg)
-    latents = world_model.filtered(world, learned.params["model"], rows, None)
+    latents = likeliest_latents(world, learned.params["model"], rows)
     np.testing.assert_allclose(acted.features, latents.features, atol=1e-5)
     late = rows.replace(action=jnp.roll(rows.action, 1, axis=0))
-    other = world_model.filtered(world, learned.params["model"], late, None)
+    other = likeliest_latents(world, learned.params["model"], late)
     assert jnp.abs(other.features - latents.features).max() > 1e-3
 
 
@@ -465,7 +466,7 @@ def test_a_sequence_that_begins_anew_is_two_sequences():
     rows = recorded(Ticker(episode_length=5), 12)
     begins = int(jnp.argmax(rows.first[1:, 0])) + 1
     world, params = tiny()
-    through = jax.jit(lambda rows: world_model.filtered(world, params, rows, None))
+    through = jax.jit(lambda rows: likeliest_latents(world, params, rows))
     whole, alone = through(rows), through(jax.tree.map(lambda x: x[begins:], rows))
     np.testing.assert_array_equal(whole.features[begins:, 0], alone.features[:, 0])
 
@@ -495,7 +496,7 @@ def test_overshooting_reads_dreams_of_the_replayed_actions_until_an_episode_ends
     cfg, ahead = dreamer.DreamerConfig(size="tiny", n_step=11, overshoot=4), 4
     weight, key = jnp.array([0.5, 0.25, 0.25]), jax.random.key(3)
     batch = SequenceBatch(rows, weight)
-    latents = world_model.filtered(world, params, rows, None)
+    latents = likeliest_latents(world, params, rows)
     targets = {"reward": rows.reward, "cont": world_model.goes_on(rows, cfg)}
     loss = jax.jit(lambda p: world_model.overshoot_loss(world, p, batch, latents, targets, key, cfg))
 
@@ -573,7 +574,7 @@ def test_the_model_foresees_a_deterministic_toy():
         end: Any = jax.lax.scan(improve, (begin, rule.init(begin)), jax.random.split(key, 900))[0]
         params = end[0]
         rows = play(jax.random.key(9))
-        latents = world_model.filtered(world, params, rows, None)
+        latents = likeliest_latents(world, params, rows)
         seen = jax.tree.map(lambda x: x[5], latents)
 
         def blind(latent, x):
@@ -618,7 +619,7 @@ def test_a_task_without_failures_is_foreseen_to_go_on_beyond_its_time_limit():
 
     @jax.jit
     def foreseen(params):
-        latents = world_model.filtered(world, params["model"], rows, None)
+        latents = likeliest_latents(world, params["model"], rows)
         return world_model.read(world, params["model"], latents.features)["cont"].mean()
 
     def learned_from(rows):
