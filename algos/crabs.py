@@ -179,6 +179,75 @@ def foresee(model: Fitted, obs: jax.Array, action: jax.Array, cfg: Any) -> jax.A
     return jnp.clip(obs + change, -FARTHEST, FARTHEST)
 
 
+# ---- violations and certificates ---------------------------------------------------------------
+
+
+def core_of(params: dict[str, PyTree]) -> Core:
+    return Core(params["barrier"], params["actor"], params["model"])
+
+
+def resist(here: System, nets: Trainable, cfg: Any) -> tuple[Trainable, Metrics]:
+    """A step of the search for violations, and the policy's steps against them that are due."""
+    state = nets.opt_state
+    optimiser = decayed_adam(cfg.adversary_lr, cfg.barrier_decay)
+    search = walk(here, core_of(nets.params), state["search"], cfg)
+
+    def against(_: jax.Array, now: tuple) -> tuple:
+        policy, opt_state, _ = now
+        core = core_of(nets.params | {"actor": policy})
+
+        def loss(policy: PyTree) -> tuple[jax.Array, jax.Array]:
+            h, u = here.judge(dataclasses.replace(core, actor=policy), search.obs, cfg)
+            counts = violating(h, u)
+            return jnp.where(counts, u, 0.0).sum() / jnp.maximum(counts.sum(), 1), counts.mean()
+
+        grads, violated = jax.grad(loss, has_aux=True)(policy)
+        change, new_state = optimiser.update(grads, opt_state, policy)
+        moved = (optax.apply_updates(policy, change), new_state)
+        return *select(violated > 0, moved, (policy, opt_state)), violated
+
+    owed = state["owed"] + state["pressure"] * nets.params["certified"]
+    due = jnp.floor(owed)
+    begin = nets.params["actor"], state["adversary"], jnp.float32(jnp.nan)
+    policy, adversary, violated = jax.lax.fori_loop(0, due.astype(jnp.int32), against, begin)
+    params = nets.params | {"actor": policy}
+    state = state | {"search": search, "adversary": adversary, "owed": owed - due}
+    return Trainable(params, state), {"train/violating": violated}
+
+
+def renew(here: System, nets: Trainable, cfg: Any) -> tuple[Trainable, Metrics]:
+    """The next certificate, of the present policy and models, if one is found; else the last one."""
+    params, state = nets
+    core, safe, certified = core_of(params), params["safe"], params["certified"]
+    keep = cfg.barrier_keep * certified
+    found = certify(here, core, safe.barrier, keep, state["barrier"], state["search"], cfg)
+    new = dataclasses.replace(core, barrier=found.barrier)
+    # back to the last certificate, if there is one
+    rejected = select(certified > 0, safe.barrier, found.barrier)
+    factor = jnp.where(found.at_once, 1 / 2, 1 / 1.2)
+    pressure = state["pressure"] * jnp.where(found.certified, factor, 2.0)
+    params = params | {
+        "barrier": select(found.certified, found.barrier, rejected),
+        "safe": select(found.certified, new, safe),
+        "certified": jnp.maximum(certified, found.certified),
+    }
+    state = state | {
+        "barrier": found.opt_state,
+        "search": found.search,
+        "pressure": jnp.clip(pressure, LEAST, MOST),
+    }
+    found_volume = volume(here, found.barrier, found.search, cfg)
+    return Trainable(params, state), {
+        "train/certified": found.certified.astype(jnp.float32),
+        "train/certified_volume": jnp.where(found.certified, found_volume, jnp.nan),
+        "train/barrier_steps": found.steps.astype(jnp.float32),
+        "train/pressure": state["pressure"],
+    }
+
+
+# ---- the learner -------------------------------------------------------------------------------
+
+
 def crabs(env: Env) -> Learner:
     actor = sac.soft_actor(env.action_size)
 
@@ -191,9 +260,6 @@ def crabs(env: Env) -> Learner:
             return squashed_mean(squashed_policy(actor, obs, env.action_size, cfg))
 
         return System(safe, start, mean_action, foresee)
-
-    def core_of(params: dict[str, PyTree]) -> Core:
-        return Core(params["barrier"], params["actor"], params["model"])
 
     def init(key: jax.Array, obs_size: int, action_size: int, cfg: Any) -> Trainable:
         actor_key, critic_key, model_key, barrier_key, search_key = jax.random.split(key, 5)
@@ -245,7 +311,7 @@ def crabs(env: Env) -> Learner:
     def random_start(learned: Learned) -> jax.Array:
         return learned.params["certified"] == 0
 
-    # ---- gradient steps ------------------------------------------------------------------------
+    # ---- learning ------------------------------------------------------------------------------
 
     def step(
         nets: Trainable, batch: Transitions, at: GradientStep, cfg: Any, axis_name: str | None
@@ -282,38 +348,8 @@ def crabs(env: Env) -> Learner:
             return follow(nets, cfg.tau), found
 
         nets, found = at_every(cfg.policy_delay, at.number, improve, nets)
-        nets, more = resist(nets, cfg)
+        nets, more = resist(here, nets, cfg)
         return nets, metrics | found | more
-
-    def resist(nets: Trainable, cfg: Any) -> tuple[Trainable, Metrics]:
-        """A step of the search for violations, and the policy's steps against them that are due."""
-        here, state = system(cfg), nets.opt_state
-        optimiser = decayed_adam(cfg.adversary_lr, cfg.barrier_decay)
-        search = walk(here, core_of(nets.params), state["search"], cfg)
-
-        def against(_: jax.Array, now: tuple) -> tuple:
-            policy, opt_state, _ = now
-            core = core_of(nets.params | {"actor": policy})
-
-            def loss(policy: PyTree) -> tuple[jax.Array, jax.Array]:
-                h, u = here.judge(dataclasses.replace(core, actor=policy), search.obs, cfg)
-                counts = violating(h, u)
-                return jnp.where(counts, u, 0.0).sum() / jnp.maximum(counts.sum(), 1), counts.mean()
-
-            grads, violated = jax.grad(loss, has_aux=True)(policy)
-            change, new_state = optimiser.update(grads, opt_state, policy)
-            moved = (optax.apply_updates(policy, change), new_state)
-            return *select(violated > 0, moved, (policy, opt_state)), violated
-
-        owed = state["owed"] + state["pressure"] * nets.params["certified"]
-        due = jnp.floor(owed)
-        begin = nets.params["actor"], state["adversary"], jnp.float32(jnp.nan)
-        policy, adversary, violated = jax.lax.fori_loop(0, due.astype(jnp.int32), against, begin)
-        params = nets.params | {"actor": policy}
-        state = state | {"search": search, "adversary": adversary, "owed": owed - due}
-        return Trainable(params, state), {"train/violating": violated}
-
-    # ---- certificates --------------------------------------------------------------------------
 
     def refit(
         nets: Trainable,
@@ -327,34 +363,8 @@ def crabs(env: Env) -> Learner:
 
         def learn(span: Span) -> tuple[Trainable, Metrics]:
             model, metrics = fit(model_of(nets), replay, span, key, cfg, axis_name)
-            fitted = with_model(nets, model)
-            params, state = fitted
-            core, safe, certified = core_of(params), params["safe"], params["certified"]
-            keep = cfg.barrier_keep * certified
-            found = certify(here, core, safe.barrier, keep, state["barrier"], state["search"], cfg)
-            new = dataclasses.replace(core, barrier=found.barrier)
-            # back to the last certificate, if there is one
-            rejected = select(certified > 0, safe.barrier, found.barrier)
-            factor = jnp.where(found.at_once, 1 / 2, 1 / 1.2)
-            pressure = state["pressure"] * jnp.where(found.certified, factor, 2.0)
-            params = params | {
-                "barrier": select(found.certified, found.barrier, rejected),
-                "safe": select(found.certified, new, safe),
-                "certified": jnp.maximum(certified, found.certified),
-            }
-            state = state | {
-                "barrier": found.opt_state,
-                "search": found.search,
-                "pressure": jnp.clip(pressure, LEAST, MOST),
-            }
-            found_volume = volume(here, found.barrier, found.search, cfg)
-            metrics |= {
-                "train/certified": found.certified.astype(jnp.float32),
-                "train/certified_volume": jnp.where(found.certified, found_volume, jnp.nan),
-                "train/barrier_steps": found.steps.astype(jnp.float32),
-                "train/pressure": state["pressure"],
-            }
-            return Trainable(params, state), metrics
+            renewed, found = renew(here, with_model(nets, model), cfg)
+            return renewed, metrics | found
 
         return when_due(learn, nets, replay, shared, cfg, axis_name)
 
