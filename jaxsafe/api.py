@@ -401,9 +401,9 @@ def evaluate(
     Returns:
         Printed, a table. `scores.rows` has an estimate (mean, low, high: the 95% interval
         over seeds, or over the episodes of a lone one) of 'return' and 'cost' (undiscounted sums of an
-        episode), 'violation rate' (the share of episodes over the limit), 'episode length' (steps), in
-        Safety Gym 'goals' (reached in an episode), 'cost rate (training)' (cost a step) and, where
-        known, Safety Gym's normalised scores;
+        episode), 'violation rate' (the share of episodes over the limit), 'episode length' (steps of
+        the policy), in Safety Gym 'goals' (reached in an episode), 'cost rate (training)' (cost a step
+        of the policy) and, where known, Safety Gym's normalised scores;
         `scores.seeds` has the mean of each seed; `scores.calibration`, of a policy under a shield, how
         often its risk came true.
 

@@ -10,7 +10,8 @@
     OUT/scores.png, .svg    Safety Gym's normalised scores over all tasks, mean and IQM
     OUT/profiles.png, .svg  the share of seeds beyond each normalised return and cost
 
-The figures of a seed are those of the last 10% of its training. Its cost rate is of all its training.
+The figures of a seed are those of the last 10% of its training. Its cost rate is of all its training,
+and of steps of the policy, which with `env.wrap.action_repeat` are several of the environment.
 Where training plays no episodes, as from a data set, they are those of its final evaluation.
 Runs on your own environment or algorithm are read once that is named, as it is imported.
 Tasks stand apart. Only normalised scores, and comparisons within a task, are averaged over tasks.

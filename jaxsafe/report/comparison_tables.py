@@ -88,7 +88,8 @@ def details(groups: Sequence[Group]) -> list[Table]:
         "Each task. IQM: interquartile mean over seeds. Held: whether the mean cost is within the "
         "limit; unclear where it is not but its interval is or, of two seeds, one is; diverged where a "
         "seed stopped learning. Violation rate: the share of iterations, in the last 10%, whose mean "
-        "cost of an episode is over the limit. Cost rate: total cost over total steps of training."
+        "cost of an episode is over the limit. Cost rate: total cost over "
+        "total steps of the policy in training; an action that is repeated is one step."
     )
     out = [Table(caption, header, rows, left=2)]
     scored = [g for g in groups if known_of(g, SCORES[0])]

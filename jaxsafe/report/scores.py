@@ -17,7 +17,7 @@ import numpy as np
 
 
 class Characteristic(NamedTuple):
-    """What unconstrained PPO reaches: episode return, episode cost, cost a training step."""
+    """What unconstrained PPO reaches: episode return, episode cost, cost a step of the environment."""
 
     ret: float
     cost: float
@@ -94,4 +94,5 @@ def dsrl_cost(cost, cost_limit: float):
 
 
 def normalized_cost_rate(env: str, cost_rate):
+    """1 where unconstrained PPO is; `cost_rate` is the cost a step of the environment."""
     return cost_rate / CHARACTERISTIC[env].cost_rate
