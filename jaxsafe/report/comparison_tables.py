@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxsafe.learn.constraints import limits_in_words
 from jaxsafe.report import scores, stats, tables
-from jaxsafe.report.group import Group, Suite, clock, differing, period, suite, tasks_of
+from jaxsafe.report.group import FEW, LATE, Group, Suite, clock, differing, period, suite, tasks_of
 from jaxsafe.report.published import Published, beside
 from jaxsafe.report.stats import Estimate
 from jaxsafe.report.tables import Table
@@ -194,6 +194,11 @@ def notes(groups: Sequence[Group]) -> list[str]:
             lines.append(f"diverged, so no limit counts as held: {run.config['run_dir']}, {which}")
         if run.estimated:
             lines.append(f"estimates, as no episode ended yet: {run.config['run_dir']}")
+    for g in (g for g in groups if g.few_episodes):
+        lines.append(
+            f"too few episodes in the {LATE} to tell whether the limit is held: {g.name} on {g.env}, "
+            f"{g.few_episodes} of at least {FEW}"
+        )
     envs = tasks_of(groups)
     if left := [env for env in envs if env not in suite(groups).tasks]:
         lines.append(f"not in comparisons across tasks, as a setting lacks them: {', '.join(left)}")

@@ -15,6 +15,7 @@ from jaxsafe.report.stats import Estimate
 from jaxsafe.run import run_folder
 
 LATE, EVALUATED = "last 10% of training", "final evaluation"  # what figures are of
+FEW = 10  # episodes; the mean of fewer says little of a limit
 
 
 class Group(NamedTuple):
@@ -88,6 +89,12 @@ class Group(NamedTuple):
     def evaluated(self) -> bool:
         """Whether return and costs of every run are of its final evaluation."""
         return all(run.evaluated for run in self.runs)
+
+    @property
+    def few_episodes(self) -> int:
+        """On how many episodes return and costs rest, where these are few; else 0."""
+        count = sum(run.episodes for run in self.runs)
+        return int(count) if count < FEW else 0
 
     @property
     def diverged(self) -> list[int]:

@@ -74,6 +74,14 @@ class SettingRun(NamedTuple):
         return int(self.table[column].max()), int(updates), "updates"
 
     @property
+    def episodes(self) -> float:
+        """How many ended in the last 10% of training, of all seeds; NaN where return and costs are not
+        known to be theirs."""
+        if self.evaluated or "train/episodes" not in self.table:
+            return np.nan
+        return float(np.nansum(self.table["train/episodes"][run_folder.late_rows(self.table)]))
+
+    @property
     def ended(self) -> bool:
         """Whether training is at the end that its config gives."""
         done, end, _ = self.progress

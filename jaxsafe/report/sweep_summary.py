@@ -7,7 +7,7 @@ from pathlib import Path
 
 from jaxsafe.learn.constraints import cost_title, limits_in_words
 from jaxsafe.report import plots, stats, tables, trade_off
-from jaxsafe.report.group import Group, clock, group, period
+from jaxsafe.report.group import FEW, LATE, Group, clock, group, period
 from jaxsafe.report.read import or_evaluated, read_one
 from jaxsafe.report.tables import Table
 from jaxsafe.run import files
@@ -73,6 +73,11 @@ def markdown(rows: list[Group]) -> str:
         notes += f"\nDiverged, so no limit counts as held: {'; '.join(lost)}.\n"
     if begun:
         notes += f"\nNo episode ended yet: return and cost of {'; '.join(begun)} are estimates.\n"
+    if few := [f"{r.name} ({r.few_episodes})" for r in rows if r.few_episodes]:
+        notes += (
+            f"\nFewer than {FEW} episodes ended in the {LATE}, too few to tell whether the limit is "
+            f"held: {'; '.join(few)}.\n"
+        )
     if final:
         of = "; ".join(final)
         notes += f"\nTraining has no episodes: return and cost of {of} are of the final evaluation.\n"

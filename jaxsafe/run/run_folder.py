@@ -337,10 +337,14 @@ def step_column(metrics: Mapping[str, np.ndarray]) -> str:
     return "steps" if moves else "updates"
 
 
+def late_rows(metrics: Mapping[str, np.ndarray]) -> np.ndarray:
+    """The rows of the last 10% of training so far, bool [rows]."""
+    return metrics["iteration"] > 0.9 * metrics["iteration"].max()
+
+
 def last_tenth(metrics: dict[str, np.ndarray], name: str) -> np.ndarray:
     """The mean of a metric over the last 10% of training so far, [S]; NaN for a seed without value."""
-    late = metrics["iteration"] > 0.9 * metrics["iteration"].max()
-    late &= np.isfinite(metrics[name])
+    late = late_rows(metrics) & np.isfinite(metrics[name])
     values = (metrics[name][late & (metrics["seed"] == s)] for s in np.unique(metrics["seed"]))
     return np.array([v.mean() if len(v) else np.nan for v in values])
 

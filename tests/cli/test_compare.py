@@ -188,6 +188,20 @@ def test_a_group_with_a_seed_that_diverged_holds_no_limit_and_the_tables_say_so(
     assert "| diverged |" in text and "no limit counts as held: ppo_lag (seed 3)" in text
 
 
+@pytest.mark.parametrize("each, few", [(3, False), (2, True)])
+def test_a_limit_that_few_episodes_are_within_is_held_with_a_remark(tmp_path, each, few):
+    """In the last two of 20 iterations of two seeds, 4 times as many end as in one of one seed."""
+    write(tmp_path / "a", costs=(1.0, 2.0), columns={"train/episodes": np.full(2, each)}.items())
+    groups = compared(tmp_path)
+    assert [g.held for g in groups] == ["yes"]
+    told = "to tell whether the limit is held: ppo_lag"
+    remarks, text = comparison_tables.notes(groups), sweep_summary.markdown(groups)
+    assert [f"{told} on point_goal1, 8 of at least 10" in x for x in remarks] == [True] * few
+    assert (f"{told} (8)." in text) == few
+    final = [run._replace(evaluated=True) for run in groups[0].runs]  # not of these episodes
+    assert not groups[0]._replace(runs=final).few_episodes
+
+
 def test_settings_of_an_algorithm_are_told_apart_by_what_differs(tmp_path):
     for limit in (100, 5, 20):
         write(tmp_path / f"{limit}", cost_limit=float(limit), costs=(19.0, 31.0))
