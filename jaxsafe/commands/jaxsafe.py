@@ -20,7 +20,7 @@ COMMANDS = {
 
 
 def main() -> int:
-    """Exit status of the command; 2 for one that there is not."""
+    """Exit status of the command; 2 for one that there is not, 130 if stopped before it begins."""
     name, *rest = sys.argv[1:] or ["--help"]
     if name in ("-h", "--help"):
         print(overview())
@@ -34,7 +34,12 @@ def main() -> int:
         print(f"error: unknown command {name}{nearest(name, COMMANDS)}", file=sys.stderr)
         return 2
     sys.argv = [f"jaxsafe {name}", *rest]
-    return importlib.import_module(f"jaxsafe.commands.{name}").main()
+    try:
+        command = importlib.import_module(f"jaxsafe.commands.{name}")  # takes some seconds
+    except KeyboardInterrupt:
+        print("error: stopped before it began", file=sys.stderr)
+        return 130
+    return command.main()
 
 
 def overview() -> str:

@@ -51,6 +51,15 @@ def test_a_typo_names_the_nearest_command(monkeypatch, capsys):
     assert capsys.readouterr().err == "error: unknown command trian; did you mean 'train'?\n"
 
 
+def test_ctrl_c_while_a_command_loads_is_one_line(monkeypatch, capsys):
+    def stopped(name):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(jaxsafe.importlib, "import_module", stopped)
+    assert run(monkeypatch, "train", "algo=cpo") == 130
+    assert capsys.readouterr() == ("", "error: stopped before it began\n")
+
+
 WRONG = {
     "train algo.lr=nan": "algo.lr=nan: expected",
     "sweep algo.lr=0.1": "nothing to sweep",
