@@ -7,8 +7,8 @@ has to be there for that. Runs that failed or diverged are kept and marked. Fail
 at the end.
 
 Several runs share a GPU with --at-once; start NVIDIA's multi-process service first
-(docs/performance.md). Exit status: 0 if nothing is left to do, 130 if stopped, 1 if a run failed, 2 for
-bad input.
+(docs/performance.md). Exit status: 0 if nothing is left to do, 130 if stopped, 1 if a run or the
+disk failed, 2 for bad input.
 """
 
 import argparse
@@ -31,7 +31,7 @@ from jaxsafe.config import Bounds, ConfigError, Devices, nearest
 from jaxsafe.report import studies, study_files
 from jaxsafe.report.read import read_one
 from jaxsafe.report.studies import Study
-from jaxsafe.run import files, run_folder
+from jaxsafe.run import checkpoint, files, run_folder
 from jaxsafe.run.arguments import argument
 from jaxsafe.run.flags import Parser, number
 from jaxsafe.run.settings import load
@@ -137,10 +137,17 @@ def stopping(event: threading.Event) -> Iterator[None]:
 
 
 def work(study: Study, args: argparse.Namespace, train: Callable[[list[str], Place], int]) -> int:
-    """Train what is left, several at once. Returns the exit status."""
+    """Train what is left, several at once. Returns the exit status.
+
+    Raises:
+        checkpoint.NotSaved: nobody can write where the runs or the study are.
+    """
     runs, stop, one_at_a_time = args.runs / study.folder.name, threading.Event(), threading.Lock()
     todo: queue.SimpleQueue[str] = queue.SimpleQueue()
     asked = left(study, args.only, runs)
+    for folder in (runs, study.folder) if asked else ():  # before hours of training
+        with checkpoint.writing_to(folder):
+            files.try_writing(folder)
     for run in asked:
         todo.put(run)
     for word in " ".join([*study.options, *study.runs]).split():

@@ -435,6 +435,21 @@ def test_an_interrupted_study_continues_with_what_is_left(toy, tmp_path, monkeyp
         assert f"(../images/{name})" in text and (toy.folder.parent / "images" / name).exists()
 
 
+@pytest.mark.parametrize("closed", ["runs/toy", "results/toy"])
+def test_where_nobody_can_write_nothing_is_trained(closed, toy, tmp_path, monkeypatch, capsys):
+    def try_writing(folder: Path) -> None:
+        if folder == tmp_path / closed:
+            raise OSError(30, "Read-only file system")
+
+    def train(options: list[str], place: command.Place) -> int:
+        pytest.fail("it went on to train")
+
+    monkeypatch.setattr(files, "try_writing", try_writing)
+    assert call(monkeypatch, toy.folder, "--runs", tmp_path / "runs", train=train) == 1
+    out, err = capsys.readouterr()
+    assert out == "" and err == f"error: cannot write to {tmp_path / closed}: Read-only file system\n"
+
+
 def test_a_run_that_another_process_trains_is_left_to_it(toy, tmp_path, monkeypatch, capsys):
     runs, asked = tmp_path / "runs", []
 
