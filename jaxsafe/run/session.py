@@ -55,12 +55,16 @@ def choose_folder(settings: Settings, job: int | None, say: Callable[[str], None
 
     Raises:
         ConfigError: it holds another run, or this one and `resume` is not set or it has lost its
-            checkpoints.
+            checkpoints; or `resume` and `run_dir` are two folders.
     """
     train = settings.train
     if isinstance(train.resume, str):
         folder = Path(train.resume).expanduser()
         check_same_run(settings, folder)
+        saved = run_folder.read_config(folder).get("run_dir")  # another one, if the folder has moved
+        given = folder if train.run_dir in (None, saved) else Path(train.run_dir).expanduser()
+        if given.absolute() != folder.absolute():
+            raise ConfigError(f"run_dir={given}: resume={folder} goes on in that folder; give one")
         check_goes_on(folder, say)
         return folder
     home = Path("runs") / settings.label

@@ -302,6 +302,11 @@ def test_a_folder_with_a_run_is_not_overwritten_nor_resumed_with_other_settings(
     other = settings.settings_from_config(run_folder.read_config(run) | {"resume": str(run), "seed": 5})
     with pytest.raises(ConfigError, match=r"seed=5 but .* was trained with 0"):
         session.choose_folder(other, None, print)
+    same = saved._replace(train=dataclasses.replace(saved.train, run_dir=f"{tmp_path}/./run"))
+    assert session.choose_folder(same, None, print) == run
+    two = saved._replace(train=dataclasses.replace(saved.train, run_dir="elsewhere"))
+    with pytest.raises(ConfigError, match=r"run_dir=elsewhere: resume=.* goes on in that folder"):
+        session.choose_folder(two, None, print)
     shutil.rmtree(run / "checkpoints")  # what is left of a run is not overwritten either
     with pytest.raises(ConfigError, match="already holds a run"):
         session.choose_folder(settled(f"run_dir={run}"), None, print)
