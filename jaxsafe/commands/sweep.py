@@ -13,6 +13,7 @@ from jaxsafe.run import files, sweep
 from jaxsafe.run.arguments import read_values
 from jaxsafe.run.flags import Parser
 from jaxsafe.run.progress import Reporter
+from jaxsafe.run.sweep_folder import open_folder
 from jaxsafe.run.sweep_plan import plan
 
 EPILOG = """\
@@ -45,6 +46,7 @@ def command() -> int:
         print(summarise(args.summary), end="")
         return 0
     asked = plan(given.options, given.several)
+    open_folder(asked)  # the summary of another sweep is not written again
     resume_command = f"{called('sweep')} {shlex.join(sys.argv[1:])}"
     try:
         return sweep.train(asked, resume_command, Reporter(), sweep.After(finish, summarise))

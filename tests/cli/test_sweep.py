@@ -490,6 +490,14 @@ def test_a_bad_sweep_is_one_line_and_status_2(arguments, tmp_path, monkeypatch, 
     assert not list(tmp_path.glob("runs/*"))
 
 
+def test_the_summary_of_another_sweep_is_neither_shown_nor_written_again(tmp_path, capsys):
+    sweep.write_folder(planned(*SMALL, "algo.cost_limit=2,4", f"run_dir={tmp_path}"), {})
+    assert shell.typed("sweep", *SMALL, "algo.cost_limit=2,5", f"run_dir={tmp_path}") == 2
+    out, err = capsys.readouterr()
+    assert out == "" and "belongs to another sweep: algo.cost_limit is [2.0, 4.0] there" in err
+    assert [path.name for path in tmp_path.iterdir()] == ["sweep.yaml"]
+
+
 def test_a_sweep_in_a_place_where_nobody_can_write_compiles_nothing(monkeypatch, capsys):
     monkeypatch.setattr(sweep, "members_at_once", lambda *_: pytest.fail("it went on to compile"))
     assert shell.typed("sweep", *SMALL, *GRID, "run_dir=/proc/here/sweep") == 1  # as train.py
