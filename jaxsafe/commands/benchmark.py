@@ -333,6 +333,8 @@ def command() -> int:
         config_of(args.algo, args.options)
     elif args.options:
         raise ConfigError(f"{args.options[0]}: expected env.OPTION=; other settings need --algo")
+    if not args.envs and not args.peer:
+        raise ConfigError("nothing to measure: name a task, as in `benchmark point_goal1`, or a --peer")
     for spec in args.peer:
         if (peer := spec.partition("=")[0]) not in PEERS:
             raise ConfigError(f"--peer {spec}: unknown peer{nearest(peer, PEERS)}")

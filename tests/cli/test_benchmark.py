@@ -90,6 +90,13 @@ def test_settings_without_an_algorithm_are_refused(monkeypatch, capsys):
     assert "algo.tau=0.5: expected env.OPTION=; other settings need --algo" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("arguments", [[], ["--algo=sac_lag", "algo.tau=0.5"], ["env.awake=3"]])
+def test_without_a_task_or_a_peer_there_is_nothing_to_measure(arguments, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["benchmark", *arguments])
+    assert benchmark.main() == 2
+    assert "nothing to measure: name a task" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     "option, message",
     [
