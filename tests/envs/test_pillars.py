@@ -13,7 +13,7 @@ from mujoco.mjx.third_party import mujoco_warp
 from jaxsafe import envs
 from jaxsafe.config import ConfigError
 from jaxsafe.envs.engines.jax import contacts as jax_contacts
-from jaxsafe.envs.engines.warp import constraints
+from jaxsafe.envs.engines.warp import constraints, touching
 from jaxsafe.envs.safety_gym import scene
 
 XML = """
@@ -46,7 +46,9 @@ def by_warp(poses):
     m = mujoco_warp.put_model(model)
     d = mujoco_warp.make_data(model, nworld=len(poses), naconmax=4 * len(poses), njmax=64)
     found = constraints.adopt(model, m, d, ["upright", "leaning"], limits=False)
-    assert found and found.geoms.upright == 1  # the leaning one is MuJoCo Warp's
+    assert found
+    kinds = found.geoms.kinds.numpy().tolist()
+    assert kinds == [touching.NONE, touching.PILLAR]  # the leaning one is MuJoCo Warp's
     assert found.geoms.pairs.numpy()[1:].tolist() == [[0, 1]]
     d.qpos.assign(poses.astype(np.float32))
     mujoco_warp.kinematics(m, d)
@@ -185,7 +187,7 @@ def test_only_pillars_and_boxes_are_taken():
         pairs = found.geoms.pairs.numpy()
         given = m.nxn_geom_pair_filtered.numpy()  # each pair of the model is there once
         assert sorted(map(sorted, pairs.tolist())) == sorted(map(sorted, given.tolist()))
-        taken = pairs[found.geoms.upright :]
+        taken = pairs[found.geoms.kinds.numpy() == touching.PILLAR]
         assert bool(len(taken)) == some
         bodies = {frozenset(model.body(model.geom_bodyid[g]).name for g in pair) for pair in taken}
         assert all(any("pillar" in name for name in pair) for pair in bodies)

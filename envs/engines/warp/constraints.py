@@ -36,7 +36,7 @@ from mujoco.mjx.third_party.mujoco_warp._src.math import make_frame
 from jaxsafe.envs.engines.warp.pillars import touch, upright_pairs
 from jaxsafe.envs.engines.warp.recording import Recording
 from jaxsafe.envs.engines.warp.solver import REGISTERS
-from jaxsafe.envs.engines.warp.touching import FORMULAS, NONE, Touch
+from jaxsafe.envs.engines.warp.touching import FORMULAS, NONE, PILLAR, Touch
 
 GeomType = mujoco_warp.GeomType
 vec5 = wp.types.vector(length=5, dtype=float)
@@ -47,10 +47,9 @@ MESH = (GeomType.PLANE, GeomType.MESH)  # has a formula, but it needs the mesh
 class Geoms:
     """The pairs, and the model's fields that say where geoms are and what they are made of."""
 
-    pairs: wp.array[wp.vec2i]  # those with a formula, then others, then boxes with pillars
+    pairs: wp.array[wp.vec2i]  # those with a formula, then others, then pillars with boxes
     pairids: wp.array[wp.vec2i]  # which <pair> and which collision sensor each is of
-    kinds: wp.array[int]  # the place of their formula in FORMULAS, or NONE
-    upright: int  # where those with pillars begin
+    kinds: wp.array[int]  # the place of their formula in FORMULAS, PILLAR or NONE
     geom_size: wp.array2d[wp.vec3]
     geom_condim: wp.array[int]
     geom_priority: wp.array[int]
@@ -231,41 +230,27 @@ def pillar_box(pillar: collision_core.Geom, box: collision_core.Geom) -> Touch:
 
 
 @functools.cache
-def constraint_function(kinds: tuple[int, ...], pillars: bool, near_by: tuple[int, ...]) -> Any:
+def constraint_function(kinds: tuple[int, ...], near_by: tuple[int, ...]) -> Any:
     """What looks at a pair of geoms, or a joint.
 
     Args:
-        kinds: places in FORMULAS.
+        kinds: places in FORMULAS, and PILLAR where there are some.
         near_by: what MuJoCo Warp's test of nearness is made for.
     """
     formulas, known = list(FORMULAS.values()), sum(1 << kind for kind in kinds)
+    given = [kind for kind in kinds if kind != PILLAR]
     near = collision_driver._broadphase_filter(*near_by)
 
     @wp.func
     def touch_of(
-        i: int, world: int, m: Geoms, out: Found, pair: wp.vec2i, ids: wp.vec2i, margin: float,
-        gap: float,
-    ) -> Touch:  # fmt: skip
-        one, other = geom_at(m, world, pair[0]), geom_at(m, world, pair[1])
-        if wp.static(pillars):  # noqa: SIM102, or it would be compiled for all
-            if i >= m.upright:  # pillars come first in these pairs
+        kind: int, one: collision_core.Geom, other: collision_core.Geom, margin: float, gap: float
+    ) -> Touch:
+        if wp.static(PILLAR in kinds):  # noqa: SIM102, or it would be compiled for all
+            if kind == PILLAR:
                 return pillar_box(one, other)
-        if ids[1] < 0 and not near(
-            m.geom_aabb, m.geom_rbound, m.geom_margin, m.geom_gap, m.pair_margin, m.pair_gap,
-            m.geom_xpos, m.geom_xmat, pair[0], pair[1], ids[0], world,
-        ):  # fmt: skip
-            return Touch()
-        kind = m.kinds[i]
-        if (known >> kind) & 1 == 0:  # also tells Warp apart what it compiles for other kinds
-            place = wp.atomic_add(out.near_count, 0, 1)
-            if place < out.room:
-                out.near_pair[place] = pair
-                out.near_pairid[place] = ids
-                out.near_world[place] = world
-            return Touch()
-        for k in range(wp.static(len(kinds))):
-            if kind == wp.static(kinds[k]):
-                return wp.static(formulas[kinds[k]])(one, other, margin, gap)
+        for k in range(wp.static(len(given))):
+            if kind == wp.static(given[k]):
+                return wp.static(formulas[given[k]])(one, other, margin, gap)
         return Touch()
 
     @wp.func
@@ -273,11 +258,24 @@ def constraint_function(kinds: tuple[int, ...], pillars: bool, near_by: tuple[in
         if i >= m.pairs.shape[0]:
             limit(joints, world, joints.limited[i - m.pairs.shape[0]])
             return
-        pair, ids = m.pairs[i], m.pairids[i]
+        pair, ids, kind = m.pairs[i], m.pairids[i], m.kinds[i]
+        if kind != PILLAR and ids[1] < 0 and not near(
+            m.geom_aabb, m.geom_rbound, m.geom_margin, m.geom_gap, m.pair_margin, m.pair_gap,
+            m.geom_xpos, m.geom_xmat, pair[0], pair[1], ids[0], world,
+        ):  # fmt: skip
+            return
+        if (known >> kind) & 1 == 0:  # also tells Warp apart what it compiles for other kinds
+            place = wp.atomic_add(out.near_count, 0, 1)
+            if place < out.room:
+                out.near_pair[place] = pair
+                out.near_pairid[place] = ids
+                out.near_world[place] = world
+            return
         margin, gap = contact_margin_gap(
             m.geom_margin, m.geom_gap, m.pair_margin, m.pair_gap, pair, ids[0], world
         )
-        found = touch_of(i, world, m, out, pair, ids, margin, gap)
+        one, other = geom_at(m, world, pair[0]), geom_at(m, world, pair[1])
+        found = touch_of(kind, one, other, margin, gap)
         if found.count == 0:
             return
         condim, friction, solref, solreffriction, solimp, adhesion = contact_material_params(
@@ -373,6 +371,7 @@ def adopt(
     # neither a pair with settings of its own nor a sensor's
     pillars = upright_pairs(model, pairs, upright) & (ids == -1).all(1)
     others = (places == NONE) & ~pillars
+    places = np.where(pillars, PILLAR, places)
     order = np.argsort(others + 2 * pillars, kind="stable")
     has = {pair for pair, without in zip(kinds, others, strict=True) if without}
 
@@ -390,7 +389,6 @@ def adopt(
     joints.room = d.njmax
     geoms.pairs = wp.array(pairs[order], dtype=wp.vec2i, device=device)
     geoms.pairids = wp.array(ids[order], dtype=wp.vec2i, device=device)
-    geoms.upright = int((~pillars).sum())
     near = collision_core.create_collision_context(d.naconmax)
     found.count, found.room, found.near_count = d.nacon, d.naconmax, d.ncollision
     found.near_pair, found.near_pairid = near.collision_pair, near.collision_pairid
@@ -399,7 +397,6 @@ def adopt(
     geoms.kinds = wp.array(places[order], dtype=int, device=device)
     look = constraint_function(
         tuple(sorted(set(places.tolist()) - {NONE})),
-        bool(pillars.any()),
         (int(m.opt.broadphase_filter), *(x.shape[0] for x in near_by)),
     )
 

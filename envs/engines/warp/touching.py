@@ -209,4 +209,5 @@ FORMULAS = {
     (Kind.CAPSULE, Kind.BOX): capsule_box,
     (Kind.BOX, Kind.BOX): box_box,
 }
-NONE = len(FORMULAS)
+# kinds of pairs beyond these: for MuJoCo Warp's kernels, and of a pillar and a box
+NONE, PILLAR = wp.constant(len(FORMULAS)), wp.constant(len(FORMULAS) + 1)
