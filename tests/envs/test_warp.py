@@ -245,6 +245,19 @@ def test_a_physics_step_takes_few_kernels(name, theirs, many, monkeypatch):
         assert len(launched) == 1 + bool(model.nsensor), launched
 
 
+@pytest.mark.parametrize(("bodies", "together"), [(250, True), (340, False)])
+def test_all_passes_are_one_kernel_where_shared_memory_has_room_for_all_parts(bodies, together):
+    """A multiprocessor gives a block 48 KiB. 340 bodies leave too little for the solver."""
+    from mujoco.mjx.third_party import mujoco_warp
+
+    from jaxsafe.envs.engines.warp import dynamics
+
+    one = '<body pos="0 5 0"><geom size=".1" contype="0"/></body>'
+    model = compiled(LIMITS.replace("</worldbody>", f"{bodies * one}</worldbody>"))
+    m, d = mujoco_warp.put_model(model), mujoco_warp.make_data(model, njmax=8)
+    assert dynamics.adopt(model, m, d) and bool(d.dynamics.lists) == together
+
+
 SENSED = """
 <mujoco>
   <option magnetic="1 2 3"/>

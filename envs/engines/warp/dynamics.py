@@ -46,6 +46,7 @@ from jaxsafe.envs.engines.warp.solver import REGISTERS, THREADS, Listing, Proble
 
 EULER, RK4 = mujoco_warp.IntegratorType.EULER, mujoco_warp.IntegratorType.RK4
 SHARED_MEMORY = 47 * 1024  # bytes of a block; Warp takes one more KiB
+SHARED_AT_THE_END = 8 * 1024  # bytes, at most, of newton.cu and advance.cu
 vec10 = wp.types.vector(length=10, dtype=float)
 HERE = Path(__file__)
 DYNAMICS, LANES, ADVANCE = (
@@ -442,7 +443,9 @@ def adopt(
     found = constraints.adopt(model, m, d, upright, limits=not others)
     theirs = others or (found is None and m.jnt_limited_slide_hinge_adr.size > 0)
     lists = None
-    if found and found.by_formula and not theirs and d.nworld <= solver.MANY:
+    fits = 4 * shared_size(*sizes_of(model)) + SHARED_AT_THE_END <= SHARED_MEMORY
+    few = d.nworld <= solver.MANY
+    if found and found.by_formula and not theirs and few and fits:
         widen(d)
         found = constraints.adopt(model, m, d, upright, limits=not others)
         lists = found.by_world(d.nworld) if found else None
