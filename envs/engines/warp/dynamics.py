@@ -498,7 +498,7 @@ def forward(m: Any, d: Any, steps: int = 0, guides: Any = None) -> None:
     """
     plan = getattr(d, "dynamics", None)
     see = not m.opt.disableflags & mujoco_warp.DisableBit.SENSOR
-    if at_once(m, d):
+    if plan and at_once(m, d):
         passes(m, d, steps, stay=True, guides=guides)
         if see:
             plan.sensors.read(d.nworld)
