@@ -77,6 +77,17 @@ def test_contacts_without_room_are_counted():
         envs.make("point_goal1", contact_room=0.0)
 
 
+BALL = """
+<mujoco>
+  <worldbody>
+    <geom name="floor" type="plane" size="5 5 1"/>
+    <body pos="0 0 .099"><joint type="slide" axis="0 0 1"/><geom size=".1"/></body>
+  </worldbody>
+  <sensor/>
+</mujoco>
+"""
+
+
 ROOM = """
 <mujoco>
   <option timestep="0.01"/>
@@ -619,6 +630,25 @@ def test_a_world_without_constraints_forgets_its_warmstart():
     c = mujoco.MjData(model)
     mujoco.mj_forward(model, c)
     np.testing.assert_allclose(d.qacc.numpy(), np.tile(c.qacc, (3, 1)), rtol=1e-4)
+
+
+@pytest.mark.parametrize("many", [False, True])
+def test_contacts_may_be_switched_off_later(many, monkeypatch):
+    from mujoco.mjx.third_party import mujoco_warp
+
+    from jaxsafe.envs.engines.warp import dynamics, solver
+
+    if many:
+        monkeypatch.setattr(solver, "MANY", 0)
+    model = compiled(BALL)
+    m, d = mujoco_warp.put_model(model), mujoco_warp.make_data(model, nworld=2, naconmax=20, njmax=32)
+    assert dynamics.adopt(model, m, d) and bool(d.dynamics.lists) != many
+    off = int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+    without = dataclasses.replace(m, opt=dataclasses.replace(m.opt, disableflags=off))
+    for of, contacts in ((m, 1), (without, 0), (m, 1)):
+        dynamics.forward(of, d)
+        assert d.newton.count.numpy().tolist() == [contacts] * 2
+        assert (d.qacc.numpy() < -9).all() == (contacts == 0)
 
 
 def test_models_that_the_solver_is_not_for_keep_mujocos():

@@ -80,8 +80,9 @@ def enlist(p: Listing, i: int, world: int):
     """Give a contact its rows, its world's list the contact, and say how soft it is: stiffness D of a
     row, its part of -aref from the depth, and damping, all as in MuJoCo."""
     constrains = (p.type[i] & wp.static(int(types.ContactType.CONSTRAINT))) != 0
+    off = (p.disableflags & wp.static(int(types.DisableBit.CONTACT | types.DisableBit.CONSTRAINT))) != 0
     depth = p.dist[i] - p.includemargin[i]
-    if not constrains or depth >= 0.0:
+    if off or not constrains or depth >= 0.0:
         return
     rows = wp.max(1, 2 * (p.dim[i] - 1))
     first = wp.atomic_add(p.nefc, world, rows)
@@ -291,8 +292,6 @@ def plain_rows(m: Any, d: Any) -> None:
 
 def list_contacts(m: Any, d: Any) -> None:
     """After the plain rows, to lists that are empty."""
-    if m.opt.disableflags & (mujoco_warp.DisableBit.CONTACT | mujoco_warp.DisableBit.CONSTRAINT):
-        return
     wp.launch(assign, d.naconmax, inputs=[listing(m, d), d.nacon])
 
 
