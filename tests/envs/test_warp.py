@@ -651,6 +651,29 @@ def test_contacts_may_be_switched_off_later(many, monkeypatch):
         assert (d.qacc.numpy() < -9).all() == (contacts == 0)
 
 
+@pytest.mark.parametrize("gap", [True, False])
+def test_contacts_without_rows_take_no_room_from_others(gap):
+    """Eight points of each of five boxes above the floor: within a gap, or asked for by a sensor."""
+    from mujoco.mjx.third_party import mujoco_warp
+
+    from jaxsafe.envs.engines.warp import dynamics
+
+    box = """
+    <body pos="K 1 .3"><joint type="slide" axis="0 0 1"/>
+      <geom name="K" type="box" size=".1 .1 .1"/></body></worldbody>"""
+    sensor = '<distance geom1="K" geom2="floor" cutoff="5"/></sensor>'
+    xml = BALL.replace("<sensor/>", "<sensor></sensor>")
+    for k in range(5):
+        xml = xml.replace("</worldbody>", box.replace("K", str(k)))
+        xml = xml if gap else xml.replace("</sensor>", sensor.replace("K", str(k)))
+    model = compiled(xml.replace('name="floor"', 'name="floor" gap="1"') if gap else xml)
+    m, d = mujoco_warp.put_model(model), mujoco_warp.make_data(model, nworld=2, naconmax=100, njmax=32)
+    assert dynamics.adopt(model, m, d)
+    dynamics.step(m, d)
+    assert not d.overflow.numpy().any() and d.newton.count.numpy().tolist() == [1, 1]
+    assert (d.qvel.numpy()[:, 0] > 0).all()  # of the ball, which the floor pushes out
+
+
 def test_models_that_the_solver_is_not_for_keep_mujocos():
     from mujoco.mjx.third_party import mujoco_warp
 

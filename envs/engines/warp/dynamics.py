@@ -8,8 +8,8 @@
 With a few thousand worlds or fewer the number of kernels sets the pace. MuJoCo Warp takes some 50 of a
 few microseconds each for the first alone, for robots of 4 to 30 bodies. Here 8, 16 or 32 threads share
 a world and keep what they compute in shared memory. Where an H200 holds all worlds at a time, and all
-contacts have formulas, the passes of several steps are one kernel. With more worlds kernels apart are
-faster: together they are longer than what a multiprocessor keeps of a program.
+contacts have formulas and rows, the passes of several steps are one kernel. With more worlds kernels
+apart are faster: together they are longer than what a multiprocessor keeps of a program.
 
 Equalities, dry friction, limits of ball joints and collisions of meshes and of convex shapes without a
 formula are MuJoCo Warp's. Sensors are `sensors.py`.
@@ -445,7 +445,9 @@ def adopt(
     lists = None
     fits = 4 * shared_size(*sizes_of(model)) + SHARED_AT_THE_END <= SHARED_MEMORY
     few = d.nworld <= solver.MANY
-    if found and found.by_formula and not theirs and few and fits:
+    # contacts without rows: the solver's lists are not made for their number
+    rowless = model.geom_gap.any() or model.pair_gap.any() or m.nsensorcollision
+    if found and found.by_formula and not theirs and few and fits and not rowless:
         widen(d)
         found = constraints.adopt(model, m, d, upright, limits=not others)
         lists = found.by_world(d.nworld) if found else None
