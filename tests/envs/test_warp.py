@@ -267,6 +267,7 @@ def test_all_passes_are_one_kernel_where_shared_memory_has_room_for_all_parts(bo
     model = compiled(LIMITS.replace("</worldbody>", f"{bodies * one}</worldbody>"))
     m, d = mujoco_warp.put_model(model), mujoco_warp.make_data(model, njmax=8)
     assert dynamics.adopt(model, m, d) and bool(d.dynamics.lists) == together
+    assert d.dynamics.system.contacts == d.naconmax  # beyond it a world is flagged
 
 
 SENSED = """

@@ -432,7 +432,6 @@ def adopt(
                 setattr(p, name, getattr(owner, name))
     p.levels = int(extra["body_level"].max()) + 1
     p.begin, p.column, p.place = m.M_mulm_rowadr, m.M_mulm_col, m.M_mulm_madr
-    p.rows, p.contacts = d.njmax, d.naconmax
     four = m.opt.integrator == RK4
     for name in ("start_qpos", "start_qvel", "mean_qvel", "mean_qacc"):
         shape = (d.nworld, model.nq if name == "start_qpos" else model.nv)
@@ -451,6 +450,7 @@ def adopt(
         widen(d)
         found = constraints.adopt(model, m, d, upright, limits=not others)
         lists = found.by_world(d.nworld) if found else None
+    p.rows, p.contacts = d.njmax, d.naconmax
     d.dynamics = Plan(
         system=p,
         sizes=sizes_of(model),
