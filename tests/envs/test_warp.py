@@ -334,6 +334,16 @@ CUBES = """
 """
 
 
+def test_there_is_a_formula_for_all_kinds_of_geoms_that_have_one_in_mujoco_warp():
+    """Where a new MuJoCo Warp has one more: write it in touching.py, or say here why not."""
+    from mujoco.mjx.third_party.mujoco_warp._src import collision_primitive
+
+    from jaxsafe.envs.engines.warp import constraints
+
+    theirs = set(collision_primitive._PRIMITIVE_COLLISIONS)
+    assert set(constraints.FORMULAS) == theirs - {constraints.MESH}
+
+
 def test_two_boxes_touch_where_mujocos_do():
     """At the same points. For 44 of these 200 pairs MuJoCo Warp by default finds another number."""
     from mujoco.mjx.third_party import mujoco_warp
