@@ -13,6 +13,7 @@ from tasks import task
 
 from jaxsafe import envs
 from jaxsafe.config import ConfigError
+from jaxsafe.envs.engines import Simulation, make_engine
 from jaxsafe.envs.safety_gym import scene, sleeping, suite
 from jaxsafe.envs.velocity.config import ROBOTS
 
@@ -58,6 +59,38 @@ def test_guides_go_round_and_steps_of_different_length_live_side_by_side():
     assert worst["qpos"] < 1e-4 and worst["qvel"] < 1e-2
     t = task("point_goal0", engine="warp", **options)
     assert len(set(t.idle(t.begin()).physics.bodies.substeps.tolist())) > 1
+
+
+GUIDED = """
+<mujoco>
+  <option timestep="0.01" integrator="RK4"/>
+  <worldbody>
+    <body name="rests" mocap="true" pos="-2 0 .5"><geom size=".1"/></body>
+    <body name="guide" mocap="true" pos="0 -.3 .5"><geom size=".1"/></body>
+    <body name="ball" pos="0 0 .5">
+      <joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 1 0" damping=".1"/>
+      <geom size=".1" mass=".1"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def test_guides_go_round_where_all_passes_are_one_kernel():
+    """Of three worlds at different times, in two of which the guide hits the ball."""
+    found = {}
+    for engine in ("c", "warp"):
+        spec = mujoco.MjSpec.from_string(GUIDED)
+        made = make_engine(engine, Simulation(spec, substeps=10, orbits=np.array([0, 0.2])))
+        run = jax.jit(jax.vmap(lambda physics, made=made: made.run(physics, jnp.zeros(0))[0]))
+        physics = jax.tree.map(lambda x: jnp.stack([x] * 3), made.start())
+        physics = physics.replace(substeps=jnp.array([0, 50, 100], jnp.int32))
+        for _ in range(4):
+            physics = run(physics)
+        found[engine] = physics
+    assert (jnp.abs(found["c"].qvel).max(1) > 0.1).tolist() == [True, True, False]
+    for name in ("qpos", "qvel", "mocap_pos"):
+        np.testing.assert_allclose(getattr(found["warp"], name), getattr(found["c"], name), atol=1e-5)
 
 
 def test_poses_that_a_task_asks_for_come_along():
