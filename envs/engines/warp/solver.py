@@ -14,7 +14,7 @@ bodies at one point; and a box on the floor has 20 contacts. So the rows of cont
 
 and likewise forces and slopes. Limits, equalities and dry friction, the *plain* rows, are as MuJoCo
 Warp makes them. That writes all of J and launches ten kernels an iteration for all worlds until the
-last has converged; here a warp of threads stays with one world until that has.
+last has converged; here a warp of threads, or half of one, stays with one world until that has.
 
 Of a contact's rows `efc.force` alone is written, `efc.state` is not, and the flag of a solve that is
 cut short is set without a printed line.
@@ -39,7 +39,7 @@ from mujoco.mjx.third_party.mujoco_warp._src import constraint, types
 
 THREADS = 32  # of a block: a warp
 REGISTERS = 128  # of a thread, for 16 blocks a multiprocessor
-HALF = 16
+HALF = 16  # threads of a world, of many whose robots have no more degrees of freedom
 MANY = 2048  # worlds: of more an H200 does not hold all at a time, if each is a block
 MOST = 32  # degrees of freedom: beyond them MuJoCo Warp's J is sparse
 
