@@ -117,7 +117,7 @@ def main() -> int:
             wp.copy(getattr(data, name), wp.array(x, dtype=getattr(data, name).dtype))
 
     def go(m, blind, data) -> None:
-        at_once = dynamics.at_once(m, data)
+        at_once = dynamics.at_once(data)
         for _ in range(0 if at_once else substeps):
             dynamics.step(blind, data)
         dynamics.forward(m, data, substeps if at_once else 0)

@@ -269,8 +269,8 @@ def go_round(p: Guides, k: int, world: int, body: int):
 
 
 @functools.cache
-def passes_kernel(dynamics: Any, look: Any, newton: Any, advance: Any, lanes: int, worlds: int) -> Any:
-    """All passes of a world, one after the other."""
+def passes_kernel(dynamics: Any, look: Any, newton: Any, advance: Any, lanes: int) -> Any:
+    """All passes of a world, one after the other. A world is a block."""
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=REGISTERS)
     def kernel(
@@ -286,10 +286,7 @@ def passes_kernel(dynamics: Any, look: Any, newton: Any, advance: Any, lanes: in
         stages: int,  # of a step
         passes: int,  # those of the steps, and maybe one more that stays
     ):
-        block, thread = wp.tid()
-        world, lane = block * worlds + thread // lanes, thread % lanes
-        if world >= p.qpos.shape[0]:
-            return
+        world, lane = wp.tid()
         mine, room = own(lists, world), lists.dist.shape[1]
         for k in range(passes):
             moves = k < steps * stages
@@ -299,7 +296,7 @@ def passes_kernel(dynamics: Any, look: Any, newton: Any, advance: Any, lanes: in
             if lane == 0:
                 mine.count[0] = 0
             sync()
-            dynamics(p, not moves, block, thread)
+            dynamics(p, not moves, world, lane)
             sync()
             for i in range(lane, looks, lanes):
                 look(i, world, geoms, joints, mine)
@@ -310,9 +307,9 @@ def passes_kernel(dynamics: Any, look: Any, newton: Any, advance: Any, lanes: in
             if lane == 0 and mine.count[0] > room:
                 p.overflow[world] = p.overflow[world] | NO_CONTACTS
             sync()
-            newton(problem, world, thread)
+            newton(problem, world, lane)
             if moves:
-                advance(p, k % stages, world, thread)
+                advance(p, k % stages, world, lane)
             sync()
 
     return kernel
@@ -484,11 +481,10 @@ def lanes_of(sizes: tuple[int, ...]) -> int:
     return lanes
 
 
-def at_once(m: Any, d: Any) -> bool:
-    """Whether steps and a forward pass are one kernel."""
+def at_once(d: Any) -> bool:
+    """Whether several steps are one kernel."""
     plan = getattr(d, "dynamics", None)
-    see = not m.opt.disableflags & mujoco_warp.DisableBit.SENSOR
-    return bool(plan and plan.lists and (not see or (plan.readable and plan.sensors)))
+    return bool(plan and plan.lists)
 
 
 def forward(m: Any, d: Any, steps: int = 0, guides: Any = None) -> None:
@@ -500,12 +496,13 @@ def forward(m: Any, d: Any, steps: int = 0, guides: Any = None) -> None:
     """
     plan = getattr(d, "dynamics", None)
     see = not m.opt.disableflags & mujoco_warp.DisableBit.SENSOR
-    if plan and at_once(m, d):
+    if plan and at_once(d) and (not see or (plan.readable and plan.sensors)):
         passes(m, d, steps, stay=True, guides=guides)
         if see:
             plan.sensors.read(d.nworld)
         return
-    assert steps == 0
+    if steps:
+        passes(m, d, steps, guides=guides)
     if plan is None or (see and not plan.readable):
         mujoco_warp.forward(m, d)
         return
@@ -539,20 +536,19 @@ def step(m: Any, d: Any) -> None:
 
 def passes(m: Any, d: Any, steps: int, stay: bool = False, guides: Any = None) -> None:
     """Steps, and if asked a pass that stays, in one kernel."""
-    plan, (lanes, worlds) = d.dynamics, solver.shape_of(m.nv, d)
+    plan, lanes = d.dynamics, solver.shape_of(m.nv, d)[0]
     stages, room = 1 if plan.euler else 4, d.newton.listed.shape[1]
     find = plan.constraints
     kernel = passes_kernel(
-        dynamics_function(plan.sizes, plan.fluid, lanes, worlds),
+        dynamics_function(plan.sizes, plan.fluid, lanes, worlds=1),
         find.look,
-        solver.newton_function(m.nv, room, lanes, worlds),
-        advance_function(m.nv, plan.damped, plan.euler, lanes, worlds),
+        solver.newton_function(m.nv, room, lanes, worlds=1),
+        advance_function(m.nv, plan.damped, plan.euler, lanes, worlds=1),
         lanes,
-        worlds,
     )
     wp.launch_tiled(
         kernel,
-        dim=-(-d.nworld // worlds),
+        dim=d.nworld,
         inputs=[
             solver.problem(m, d),
             plan.system,
@@ -566,7 +562,7 @@ def passes(m: Any, d: Any, steps: int, stay: bool = False, guides: Any = None) -
             stages,
             steps * stages + stay,
         ],
-        block_dim=lanes * worlds,
+        block_dim=lanes,
     )
 
 

@@ -234,7 +234,7 @@ class Kernels:
             guides.base, guides.mocap_pos = wp.clone(data.mocap_pos), data.mocap_pos
             guides.orbits, guides.timestep = w.orbits, self.model.opt.timestep
             guides.done, guides.substeps = done, taken
-        at_once = dynamics.at_once(w.model, data) and not self.simulation.varied
+        at_once = dynamics.at_once(data) and not self.simulation.varied
         for k in range(0 if at_once else substeps):
             if self.orbits.any():
                 wp.launch(go_round, data.mocap_pos.shape, inputs=[guides, k])
