@@ -47,7 +47,7 @@ MESH = (GeomType.PLANE, GeomType.MESH)  # has a formula, but it needs the mesh
 class Geoms:
     """The pairs, and the model's fields that say where geoms are and what they are made of."""
 
-    pairs: wp.array[wp.vec2i]  # those with a formula, then others, then pillars with boxes
+    pairs: wp.array[wp.vec2i]
     pairids: wp.array[wp.vec2i]  # which <pair> and which collision sensor each is of
     kinds: wp.array[int]  # the place of their formula in FORMULAS, PILLAR or NONE
     geom_size: wp.array2d[wp.vec3]
@@ -372,7 +372,6 @@ def adopt(
     pillars = upright_pairs(model, pairs, upright) & (ids == -1).all(1)
     others = (places == NONE) & ~pillars
     places = np.where(pillars, PILLAR, places)
-    order = np.argsort(others + 2 * pillars, kind="stable")
     has = {pair for pair, without in zip(kinds, others, strict=True) if without}
 
     geoms, joints, found, device = Geoms(), Joints(), Found(), d.qacc.device
@@ -387,14 +386,14 @@ def adopt(
                     setattr(struct, name, getattr(owner, name))
     joints.limited = m.jnt_limited_slide_hinge_adr if limits else wp.empty(0, dtype=int, device=device)
     joints.room = d.njmax
-    geoms.pairs = wp.array(pairs[order], dtype=wp.vec2i, device=device)
-    geoms.pairids = wp.array(ids[order], dtype=wp.vec2i, device=device)
+    geoms.pairs = wp.array(pairs, dtype=wp.vec2i, device=device)
+    geoms.pairids = wp.array(ids, dtype=wp.vec2i, device=device)
     near = collision_core.create_collision_context(d.naconmax)
     found.count, found.room, found.near_count = d.nacon, d.naconmax, d.ncollision
     found.near_pair, found.near_pairid = near.collision_pair, near.collision_pairid
     found.near_world = near.collision_worldid
     near_by = (m.geom_aabb, m.geom_rbound, m.geom_margin, m.geom_gap, m.pair_margin, m.pair_gap)
-    geoms.kinds = wp.array(places[order], dtype=int, device=device)
+    geoms.kinds = wp.array(places, dtype=int, device=device)
     look = constraint_function(
         tuple(sorted(set(places.tolist()) - {NONE})),
         (int(m.opt.broadphase_filter), *(x.shape[0] for x in near_by)),

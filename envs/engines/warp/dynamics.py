@@ -468,8 +468,9 @@ def widen(d: Any) -> None:
     d.naconmax = d.nworld * d.newton.listed.shape[1]
     for field in dataclasses.fields(d.contact):
         x = getattr(d.contact, field.name)
-        shape = (d.naconmax, *x.shape[1:])
-        setattr(d.contact, field.name, wp.zeros(shape, dtype=x.dtype, device=x.device))
+        if x.size:
+            shape = (d.naconmax, *x.shape[1:])
+            setattr(d.contact, field.name, wp.zeros(shape, dtype=x.dtype, device=x.device))
     d.newton.soft = wp.zeros(d.naconmax, dtype=wp.vec3, device=d.qacc.device)
 
 
