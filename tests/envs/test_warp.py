@@ -412,6 +412,23 @@ def test_two_boxes_touch_where_mujocos_do():
     assert {0, 1, 2, 4} <= counts
 
 
+@pytest.mark.parametrize(("name", "pairs"), [("car_push1", 20), ("point_goal1", 0)])
+def test_convex_collisions_have_room_for_every_pair_of_a_kind_and_no_more(name, pairs):
+    """Kinds follow each other, so they share it."""
+    from mujoco.mjx.third_party import mujoco_warp
+
+    from jaxsafe.envs.engines.warp import dynamics
+
+    model, m, d, _ = simulated(name, 3)
+    assert dynamics.adopt(model, m, d)
+    kinds = [tuple(sorted(model.geom_type[list(pair)])) for pair in m.nxn_geom_pair_filtered.numpy()]
+    cylinder, box = mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_BOX
+    assert kinds.count((cylinder, box)) == pairs >= kinds.count((cylinder, cylinder))
+    assert d.naccdmax == 3 * pairs
+    dynamics.step(m, d)
+    assert not (d.overflow.numpy() & int(mujoco_warp.OverflowType.CCD)).any()
+
+
 LIMITS = """
 <mujoco>
   <option timestep="0.005"/>

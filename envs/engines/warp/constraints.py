@@ -10,6 +10,7 @@ near pairs in one kernel, looks at them in another, and takes three more for lim
 # pyright: reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false
 # pyright: reportInvalidTypeForm=false
 
+import collections
 import dataclasses
 import functools
 from collections.abc import Sequence
@@ -368,6 +369,9 @@ def adopt(
     kinds = [(GeomType(kind[a]), GeomType(kind[b])) for a, b in pairs]
     place = {of: k for k, of in enumerate(FORMULAS)}
     places = np.array([place.get(of, NONE) for of in kinds], int)
+    if mujoco_warp.GeomType.HFIELD not in kind:  # a pair of others is one convex collision at most
+        convex = collections.Counter(of for of in kinds if of not in FORMULAS)
+        d.naccdmax = min(d.naccdmax, d.nworld * max(convex.values(), default=0))
     # neither a pair with settings of its own nor a sensor's
     pillars = upright_pairs(model, pairs, upright) & (ids == -1).all(1)
     others = (places == NONE) & ~pillars
