@@ -178,10 +178,8 @@ def shape_of(nv: int, d: Any) -> tuple[int, int]:
     lanes = threads(d)
     if d.nworld > MANY and nv <= HALF:
         lanes = min(lanes, HALF)
-    return (
-        lanes,
-        THREADS // lanes if d.qacc.device.is_cuda else 1,
-    )  # on a CPU all of a block wait for all
+    # on a CPU all threads of a block wait for each other
+    return lanes, THREADS // lanes if d.qacc.device.is_cuda else 1
 
 
 @functools.cache

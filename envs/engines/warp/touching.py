@@ -1,8 +1,8 @@
 """How two geoms touch, for kinds of geoms that have a formula.
 
 The formulas are MuJoCo Warp's, but for a capsule on a plane. MuJoCo Warp writes the contacts of each
-formula by code of its own. Here all return the same, `Touch`, which is written in one place. That makes
-a kernel half as long. With few worlds, a kernel takes as long as it takes to fetch its instructions.
+formula by code of its own. Here all return the same, `Touch`, which is written in one place: less code,
+that compiles sooner.
 """
 # Kernels are Warp's language in Python's syntax, which no type checker of Python knows:
 # pyright: reportIndexIssue=false, reportAssignmentType=false, reportGeneralTypeIssues=false
