@@ -12,6 +12,7 @@ algorithm may be left out, as it can be large; a run that is resumed without it 
 import contextlib
 import hashlib
 import json
+import logging
 import math
 import os
 import re
@@ -107,14 +108,26 @@ def from_arrays(like: PyTree, arrays: dict[str, np.ndarray]) -> PyTree:
     return jax.tree.unflatten(treedef, restored)
 
 
-def orbax_checkpointer() -> ocp.Checkpointer:
-    """One that waits for no other process."""
+@contextlib.contextmanager
+def orbax_checkpointer() -> Iterator[ocp.Checkpointer]:
+    """One that waits for no other process. What it raises it does not log as well, with a traceback of
+    each of its threads."""
     index = jax.process_index()
     alone = ocp.options.MultiprocessingOptions(
         primary_host=index, active_processes={index}, barrier_sync_key_prefix=f"process{index}"
     )
     handler = ocp.StandardCheckpointHandler(multiprocessing_options=alone)
-    return ocp.Checkpointer(handler, multiprocessing_options=alone)
+    logger = logging.getLogger("absl")  # Orbax's
+    logger.addFilter(no_traceback)
+    try:
+        with ocp.Checkpointer(handler, multiprocessing_options=alone) as orbax:
+            yield orbax
+    finally:
+        logger.removeFilter(no_traceback)
+
+
+def no_traceback(record: logging.LogRecord) -> bool:
+    return not record.exc_info
 
 
 def in_replay(name: str) -> bool:

@@ -1,3 +1,5 @@
+import resource
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -137,6 +139,19 @@ def test_a_full_disk_is_one_error_and_the_last_good_checkpoint_stays(tmp_path, m
         save(tmp_path, state(2.0), at(2))
     assert checkpoints(tmp_path) == [good] and not list(tmp_path.glob("*.part"))
     assert_same(restore(tmp_path, jax.eval_shape(state))[0], state(1.0))
+
+
+def test_what_orbax_raises_of_a_full_disk_it_does_not_log_as_well(tmp_path, caplog):
+    """A limit on file size stands in for the disk: it fails in Orbax's own threads."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    noise = jax.random.normal(jax.random.key(0), (200, 200))  # 160 kB, which do not pack
+    resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, hard))
+    try:
+        with pytest.raises(NotSaved, match="File too large; there is no earlier one"):
+            save(tmp_path, {"w": noise}, at(1))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert not [record for record in caplog.records if record.exc_info]
 
 
 def test_what_a_killed_process_left_behind_is_ignored_and_cleared(tmp_path):
