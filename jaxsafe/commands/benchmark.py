@@ -39,7 +39,7 @@ from jaxsafe.learn.observations import EncoderConfig
 from jaxsafe.learn.offline import OfflineConfig
 from jaxsafe.learn.rollout import collect, init_rollout, memoryless
 from jaxsafe.learn.timetable import ReplayConfig, RoundConfig, timetable_of
-from jaxsafe.run import run_folder
+from jaxsafe.run import files, run_folder
 from jaxsafe.run.arguments import compose
 from jaxsafe.run.devices import check_devices, device_name, use_compilation_cache
 from jaxsafe.run.flags import Parser, number
@@ -357,7 +357,7 @@ def command() -> int:
 
     def keep(row: dict) -> None:
         if args.json:
-            with args.json.open("a") as file:
+            with files.naming(args.json), args.json.open("a") as file:
                 command = " ".join(sys.argv)
                 row = {"command": command, "commit": run_folder.commit(), **about} | row
                 file.write(json.dumps(row) + "\n")

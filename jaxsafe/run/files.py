@@ -304,12 +304,24 @@ def array_in(data: bytes, what: str) -> np.ndarray:
 
 
 @contextlib.contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """An OSError that names no file, as when the disk is full, names `path`."""
+    try:
+        yield
+    except OSError as error:
+        if error.strerror and error.filename is None:
+            error.filename = str(path)
+        raise
+
+
+@contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """A new empty file to write, of the same suffix, which takes the place of `path` at the end."""
     part = path.with_name(f".{path.stem}.{os.urandom(8).hex()}{path.suffix}")
     os.close(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o666))
     try:
-        yield part
+        with naming(path):
+            yield part
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)

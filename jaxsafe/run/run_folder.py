@@ -204,18 +204,21 @@ class Metrics:
         """Add one row a seed; `values` holds float [S] by metric name, those of evaluation if known."""
         nothing = dict.fromkeys(COLUMNS, np.full(len(seeds), np.nan))
         columns = [np.asarray((nothing | dict(values))[name], np.float32) for name in self.names]
-        for s, seed in enumerate(seeds):
-            cells = ("" if math.isnan(c[s]) else str(c[s]) for c in columns)
-            self.writer.writerow([*at, seed, f"{seconds:.3f}", *cells])
-        self.file.flush()
+        with files.naming(self.path):
+            for s, seed in enumerate(seeds):
+                cells = ("" if math.isnan(c[s]) else str(c[s]) for c in columns)
+                self.writer.writerow([*at, seed, f"{seconds:.3f}", *cells])
+            self.file.flush()
 
     def sync(self) -> None:
         """Put every row on the disk, before a checkpoint counts on them."""
-        self.file.flush()
-        os.fsync(self.file.fileno())
+        with files.naming(self.path):
+            self.file.flush()
+            os.fsync(self.file.fileno())
 
     def close(self) -> None:
-        self.file.close()
+        with files.naming(self.path):
+            self.file.close()
 
 
 class Board:
@@ -224,10 +227,10 @@ class Board:
     def __init__(self, folder: Path, steps: int):
         """Open for appending after `steps`; TensorBoard drops what older files have beyond."""
         host, now = platform.node(), time.time()
-        path = folder / f"events.out.tfevents.{int(now):010d}.{host}.{os.getpid()}.{steps}"
-        with files.replacing(path):  # a new file, whatever is there
+        self.path = folder / f"events.out.tfevents.{int(now):010d}.{host}.{os.getpid()}.{steps}"
+        with files.replacing(self.path):  # a new file, whatever is there
             pass
-        self.writer = RecordWriter(str(path))
+        self.writer = RecordWriter(str(self.path))
         self._write(0, file_version="brain.Event:2")
         if steps:
             session = event_pb2.SessionLog(status=event_pb2.SessionLog.START)  # type: ignore[attr-defined]
@@ -239,13 +242,16 @@ class Board:
 
     def _write(self, steps: int, **what: Any) -> None:
         event = event_pb2.Event(wall_time=time.time(), step=steps, **what)  # type: ignore[attr-defined]
-        self.writer.write(event.SerializeToString())
+        with files.naming(self.path):
+            self.writer.write(event.SerializeToString())
 
     def flush(self) -> None:
-        self.writer.flush()
+        with files.naming(self.path):
+            self.writer.flush()
 
     def close(self) -> None:
-        self.writer.close()
+        with files.naming(self.path):
+            self.writer.close()
 
 
 def metrics_file(folder: Path) -> Path:

@@ -3,13 +3,13 @@
 import dataclasses
 import json
 import os
-import resource
 from types import SimpleNamespace
 from typing import Any
 
 import h5py
 import numpy as np
 import pytest
+from disk import full_beyond
 from shell import SMALL, TOY, typed
 from toys import Corridor, Ticker
 
@@ -149,15 +149,11 @@ def test_a_place_that_cannot_be_written_is_refused_before_anything_is_played(tmp
 
 @pytest.mark.parametrize("suffix", [".hdf5", ".npz"])
 def test_a_disk_that_fails_at_the_end_is_one_line_and_status_1(run, tmp_path, capsys, suffix):
-    out, (soft, hard) = tmp_path / f"data{suffix}", resource.getrlimit(resource.RLIMIT_FSIZE)
-    write = dataset.write_dataset
+    out, write = tmp_path / f"data{suffix}", dataset.write_dataset
 
     def on_a_full_disk(*args):
-        resource.setrlimit(resource.RLIMIT_FSIZE, (4000, hard))
-        try:
+        with full_beyond(4000):
             write(*args)
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(dataset, "write_dataset", on_a_full_disk)

@@ -1,9 +1,8 @@
-import resource
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from disk import full_beyond
 from jax.flatten_util import ravel_pytree
 
 from jaxsafe.run import checkpoint
@@ -142,15 +141,9 @@ def test_a_full_disk_is_one_error_and_the_last_good_checkpoint_stays(tmp_path, m
 
 
 def test_what_orbax_raises_of_a_full_disk_it_does_not_log_as_well(tmp_path, caplog):
-    """A limit on file size stands in for the disk: it fails in Orbax's own threads."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     noise = jax.random.normal(jax.random.key(0), (200, 200))  # 160 kB, which do not pack
-    resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, hard))
-    try:
-        with pytest.raises(NotSaved, match="File too large; there is no earlier one"):
-            save(tmp_path, {"w": noise}, at(1))
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    with full_beyond(50_000), pytest.raises(NotSaved, match="File too large; there is no earlier one"):
+        save(tmp_path, {"w": noise}, at(1))
     assert not [record for record in caplog.records if record.exc_info]
 
 

@@ -9,13 +9,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from disk import full_beyond
 from toys import Ticker, reflex
 
 from jaxsafe.config import ConfigError
 from jaxsafe.report import evaluation, plots, scores, stats
-from jaxsafe.run import checkpoint, evaluate, run_folder
+from jaxsafe.run import checkpoint, evaluate, files, run_folder
 from jaxsafe.run.checkpoint import Progress
-from jaxsafe.run.run_folder import Metrics, read_config, read_metrics
+from jaxsafe.run.run_folder import Board, Metrics, read_config, read_metrics
 
 
 def write(folder, iterations, resume_at=0):
@@ -71,6 +72,24 @@ def test_a_run_whose_metrics_are_packed_continues_with_all_its_rows(tmp_path):
     log = write(tmp_path, [3], resume_at=2)
     assert (path.read_text(), log.seconds) == (whole, 2.0)
     assert read_metrics(tmp_path)["iteration"].tolist() == [1, 1, 2, 2, 3, 3]
+
+
+def test_an_error_of_the_disk_names_the_file(tmp_path):
+    log, board, text = Metrics(tmp_path, ["train/cost"], 0), Board(tmp_path, 0), tmp_path / "a.txt"
+    row = Progress(1, 10, 2), [*range(99)], 1.0, {"train/cost": np.ones(99)}
+    with full_beyond(500):
+        for path, write_to in (
+            (log.path, lambda: log.append(*row)),
+            (log.path, log.sync),
+            (log.path, log.close),
+            (board.path, lambda: [board.append(i, {"a": 1.0}) for i in range(999)]),
+            (board.path, board.flush),
+            (board.path, board.close),
+            (text, lambda: files.write(text, 999 * " ")),
+        ):
+            with pytest.raises(OSError, match="File too large") as error:
+                write_to()
+            assert error.value.filename == str(path)
 
 
 def test_metrics_of_other_columns_are_refused(tmp_path):
