@@ -26,7 +26,10 @@ WIDE = 10.5  # inches of the widest figure, which a page shrinks little
 LONG = 30  # letters of a name in the legend that leave the panels too little room
 LETTER = 0.06  # inches, of the legend
 ESTIMATED = "estimate, no episode ended yet"
-RATES = {"train/cost_rate": "cost rate so far", "train/overruled": "override rate of the shield"}
+RATES = {
+    "train/cost_rate": "cost rate so far,\nper step of the policy",
+    "train/overruled": "override rate of the shield",
+}
 PANELS = (("train/return", "return of an episode"), ("train/cost", "cost of an episode"))
 
 

@@ -450,6 +450,14 @@ def test_the_axis_of_training_begins_at_0(tmp_path):
     assert words == ["0", "500", "2.5k", "1.5M", "10M"]
 
 
+def test_the_axes_say_what_a_value_is_of(tmp_path):
+    write(tmp_path / "a")
+    labels = [x.get_ylabel() for x in plots.learning(compared(tmp_path / "a")).axes]
+    assert labels == [
+        "return of an episode", "cost of an episode", "cost rate so far,\nper step of the policy",
+    ]  # fmt: skip
+
+
 def test_the_end_of_a_published_curve_stands_beside_runs_of_its_length(tmp_path):
     write(tmp_path / "a", algo="cpo")
     (g,) = compared(tmp_path / "a")
