@@ -5,6 +5,7 @@ steps. What a user reads names environment steps, or gradient steps where an upd
 environment step.
 """
 
+from pathlib import Path
 from typing import NamedTuple
 
 from jaxsafe.config import ConfigError
@@ -50,8 +51,25 @@ def iterations(train_cfg: TrainConfig, clocks: Clocks) -> int:
     return -(-total // each)
 
 
+def end(train_cfg: TrainConfig) -> tuple[str, int]:
+    """What ends a run, 'steps' or 'updates', and how many."""
+    if train_cfg.total_updates is not None:
+        return "updates", train_cfg.total_updates
+    return "steps", train_cfg.total_steps
+
+
 def ended(train_cfg: TrainConfig, done: Progress) -> bool:
     """Whether a run that is so far is at its end."""
-    if train_cfg.total_updates is not None:
-        return done.updates >= train_cfg.total_updates
-    return done.steps >= train_cfg.total_steps
+    name, total = end(train_cfg)
+    return getattr(done, name) >= total
+
+
+def check_end(train_cfg: TrainConfig, done: Progress, folder: Path) -> None:
+    """Raise ConfigError if the run in `folder`, which is so far, is beyond its end by an iteration or
+    more."""
+    name, total = end(train_cfg)
+    reached = getattr(done, name)
+    if reached - reached // max(1, done.iteration) >= total:
+        raise ConfigError(
+            f"total_{name}={total}: {folder} has {reached:,} {name} already; expected at least as many"
+        )

@@ -54,8 +54,8 @@ def choose_folder(settings: Settings, job: int | None, say: Callable[[str], None
     """The folder to train in. `job` is the number of a multirun's job.
 
     Raises:
-        ConfigError: it holds another run, or this one and `resume` is not set or it has lost its
-            checkpoints; or `resume` and `run_dir` are two folders.
+        ConfigError: it holds another run, or this one and `resume` is not set, it is beyond the end
+            that is asked for or it has lost its checkpoints; or `resume` and `run_dir` are two folders.
     """
     train = settings.train
     if isinstance(train.resume, str):
@@ -65,7 +65,7 @@ def choose_folder(settings: Settings, job: int | None, say: Callable[[str], None
         given = folder if train.run_dir in (None, saved) else Path(train.run_dir).expanduser()
         if given.absolute() != folder.absolute():
             raise ConfigError(f"run_dir={given}: resume={folder} goes on in that folder; give one")
-        check_goes_on(folder, say)
+        check_goes_on(folder, train, say)
         return folder
     home = Path("runs") / settings.label
     if train.run_dir is None:
@@ -86,7 +86,7 @@ def choose_folder(settings: Settings, job: int | None, say: Callable[[str], None
         raise ConfigError(f"run_dir={folder} is not a folder")
     if files.there(folder / "config.yaml") and train.resume:
         check_same_run(settings, folder)
-        check_goes_on(folder, say)
+        check_goes_on(folder, train, say)
     elif any(checkpoint.checkpoints(files.inside(folder, x)) for x in ("checkpoints", "policy")):
         raise ConfigError(
             f"{folder} already holds a run: continue it with resume=true, or choose another run_dir"
@@ -96,9 +96,11 @@ def choose_folder(settings: Settings, job: int | None, say: Callable[[str], None
     return folder
 
 
-def check_goes_on(folder: Path, say: Callable[[str], None]) -> None:
-    """Raise ConfigError if the run in `folder` has lost its checkpoints. One that was killed before its
-    first has none yet, and starts from the beginning."""
+def check_goes_on(folder: Path, train: TrainConfig, say: Callable[[str], None]) -> None:
+    """Raise ConfigError if the run in `folder` is beyond the end that `train` has, or has lost its
+    checkpoints. One that was killed before its first has none yet, and starts from the beginning."""
+    if done := run_folder.newest_progress(folder):
+        clock.check_end(train, done, folder)
     store, policies = (
         checkpoint.checkpoints(files.inside(folder, x)) for x in ("checkpoints", "policy")
     )

@@ -75,7 +75,7 @@ def train(sweep: Sweep, resume_command: str, report: Reporter, after: After) -> 
             if finished(piece, folder):
                 report.line(f"finished already: {folder}")
                 continue
-            session.check_goes_on(folder, lambda line: None)
+            session.check_goes_on(folder, piece.train, lambda line: None)
             run = run_of(piece, folder, compiled, resume_command)
             try:
                 status = session.run(run, report, after.finish)

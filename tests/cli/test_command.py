@@ -313,6 +313,26 @@ def test_a_folder_with_a_run_is_not_overwritten_nor_resumed_with_other_settings(
         session.choose_folder(settled(f"run_dir={run}"), None, print)
 
 
+@pytest.mark.parametrize(
+    "given, refused",
+    [
+        (f"total_steps={END - STEPS}", f"total_steps={END - STEPS}: FOLDER has {END:,} steps already"),
+        ("total_updates=7", "total_updates=7: FOLDER has 160 updates already"),
+    ],
+)
+def test_a_run_is_not_resumed_to_end_before_where_it_is(finished, tmp_path, capsys, given, refused):
+    run = shutil.copytree(finished, tmp_path / "run")
+    config = (run / "config.yaml").read_bytes()
+    refused = f"error: {refused.replace('FOLDER', str(run))}; expected at least as many\n"
+    for how in ((f"resume={run}", TOY), (*SMALL, f"run_dir={run}", "resume=true")):
+        assert typed("train", *how, given) == 2
+        assert capsys.readouterr().err == refused
+    assert (run / "config.yaml").read_bytes() == config
+    # the last iteration may be beyond the end by less than itself
+    within = run_folder.read_config(run) | {"resume": str(run), "total_steps": END - STEPS + 1}
+    assert session.choose_folder(settings.settings_from_config(within), None, print) == run
+
+
 def test_a_policy_that_a_kill_left_unwritten_is_written_when_resumed(finished, tmp_path, capsys):
     run = shutil.copytree(finished, tmp_path / "run")
     newest, *_ = checkpoint.checkpoints(run / "policy")
