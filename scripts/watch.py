@@ -2,7 +2,7 @@
 
 import sys
 
-from jaxsafe.commands.watch import main
+from jaxsafe.commands.jaxsafe import run
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run("watch"))

@@ -1,7 +1,11 @@
 """The command `jaxsafe`: `jaxsafe train algo=cpo` does what `python scripts/train.py algo=cpo` does."""
 
+import contextlib
 import importlib
+import os
+import signal
 import sys
+from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
 
@@ -20,7 +24,7 @@ COMMANDS = {
 
 
 def main() -> int:
-    """Exit status of the command; 2 for one that there is not, 130 if stopped before it begins."""
+    """Exit status of the command; 2 for one that there is not."""
     name, *rest = sys.argv[1:] or ["--help"]
     if name in ("-h", "--help"):
         print(overview())
@@ -34,12 +38,33 @@ def main() -> int:
         print(f"error: unknown command {name}{nearest(name, COMMANDS)}", file=sys.stderr)
         return 2
     sys.argv = [f"jaxsafe {name}", *rest]
-    try:
-        command = importlib.import_module(f"jaxsafe.commands.{name}")  # takes some seconds
-    except KeyboardInterrupt:
-        print("error: stopped before it began", file=sys.stderr)
-        return 130
+    return run(name)
+
+
+def run(name: str) -> int:
+    """Exit status of the command `name`, whose arguments are in `sys.argv`. To import it takes some
+    seconds, in which Ctrl-C ends the process with 130."""
+    with leaving_at_ctrl_c():
+        command = importlib.import_module(f"jaxsafe.commands.{name}")
     return command.main()
+
+
+@contextlib.contextmanager
+def leaving_at_ctrl_c() -> Iterator[None]:
+    """Ctrl-C is one line and the end of the process. As an exception, an extension that is imported may
+    lose it, make another one of it, or crash."""
+
+    def leave(*_: object) -> None:
+        os.write(2, b"error: stopped before it began\n")
+        os._exit(130)
+
+    before = signal.getsignal(signal.SIGINT)
+    if before is not signal.SIG_IGN:  # as it is in the background
+        signal.signal(signal.SIGINT, leave)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def overview() -> str:
