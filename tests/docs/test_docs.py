@@ -15,6 +15,7 @@ DOCS = ROOT / "docs"
 sys.path.insert(0, str(DOCS))
 hooks = importlib.import_module("hooks")
 equations = importlib.import_module("equations")
+cells = importlib.import_module("cells")
 PAGES = sorted(DOCS.rglob("*.md"))
 
 
@@ -136,3 +137,11 @@ def test_equations_of_algorithms_are_typeset():
         "<tr><td><i>R</i></td><td>= <i>c</i>,&emsp;by <code>kappa_lr</code></td></tr>"
         "<tr><td></td><td><i>H</i></td></tr></table></div>\nafter, `algo.kappa_lr`\n"
     )
+
+
+def test_choosing_gives_the_advice_that_the_cells_count_by():
+    text = (DOCS / "choosing.md").read_text()
+    words = {x for advice in cells.ADVISED.values() for x in advice.split() if "total_steps" not in x}
+    assert len(words) == 6
+    for word in words:
+        assert word in text
