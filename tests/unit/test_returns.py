@@ -11,6 +11,8 @@ from jaxsafe.learn.returns import (
     LostTime,
     ValuedSteps,
     advantages,
+    empty_window,
+    episode_cost,
     expected_length,
     gae,
     no_lost_time,
@@ -80,6 +82,15 @@ def test_episode_cost_is_the_plain_mean_over_synchronous_episodes():
     np.testing.assert_allclose(batch_mean(cost, None) * length, cost.sum(0).mean(), rtol=1e-6)
 
 
+def test_an_episode_costs_what_its_good_steps_cost():
+    charged = jnp.array([[1.0, 0.0], [3.0, 0.0]])  # the second environment was bad in both steps
+    found = episode_cost(empty_window(1, ()), charged, jnp.float32(2), jnp.float32(10), None)
+    assert found.of_iteration == found.recent == 2 * 10
+    several = jnp.stack([charged, 3 * charged], -1)
+    found = episode_cost(empty_window(1, (2,)), several, jnp.float32(2), jnp.float32(10), None)
+    assert found.recent.tolist() == [20, 60]
+
+
 def test_the_length_by_lost_time_by_hand():
     # of 8 steps one fails at step 2 of 10 and loses 8: x = 1, and 10 / (1 + 1) = 5
     failed, lengths = jnp.zeros((4, 2), bool).at[1, 0].set(True), jnp.full((4, 2), 2)
@@ -91,6 +102,22 @@ def test_the_length_by_lost_time_by_hand():
     # where 4 of the first 8 entries are resets: x = 8 / 4
     length, _ = expected_length(no_lost_time(), 10, Failures(failed, lengths), 4)
     np.testing.assert_allclose(length, 10 / 3, rtol=1e-6)
+
+
+def test_two_devices_lose_as_much_time_as_one():
+    failed = jnp.zeros((4, 2), bool).at[1, 0].set(True)
+    steps = Failures(failed, jnp.full((4, 2), 2))
+    past = LostTime(jnp.float32(20), jnp.float32(40))  # so that not all of it is remembered
+    length, one = expected_length(past, 10, steps, 8)
+
+    def on_one(failed, lengths):
+        steps = Failures(failed[:, None], lengths[:, None])
+        return expected_length(past, 10, steps, 4, "devices")
+
+    lengths, two = jax.vmap(on_one, 1, axis_name="devices")(*steps)
+    assert one.taken < 48
+    np.testing.assert_allclose(lengths, [length] * 2, rtol=1e-6)
+    np.testing.assert_allclose(two, [[x] * 2 for x in one], rtol=1e-6)
 
 
 def test_the_length_by_lost_time_stays_exactly_at_the_time_limit():
