@@ -191,6 +191,13 @@ def test_unconstrained_ppo_scores_one_and_a_safe_policy_violates_by_zero():
     assert len(scores.CHARACTERISTIC) == 18
 
 
+def test_dsrls_scores_by_hand():
+    for env, (least, largest) in scores.DSRL.items():
+        assert [scores.dsrl_return(env, x) for x in (least, largest)] == [0, 1]
+    assert [scores.dsrl_cost(np.float64(x), 20.0) for x in (0, 10, 20, 50)] == [0, 0.5, 1, 2.5]
+    assert [scores.dsrl_cost(np.float64(x), 0.0) for x in (0, 3)] == [1, 4]
+
+
 def test_a_seed_within_the_limit_does_not_excuse_one_that_violates():
     found = {"return": np.zeros((2, 2)), "cost": np.array([[0.0, 10.0], [40.0, 60.0]])}
     rows = evaluation.summary("point_goal1", found, 25.0, {"seed": np.empty(0)})

@@ -73,6 +73,13 @@ def test_means_and_interquartile_means_by_hand():
     np.testing.assert_allclose(stats.estimate(np.array([1.0, 3.0, 5.0])), (3.0, low, 6.0 - low))
 
 
+def test_of_three_seeds_the_interval_of_the_interquartile_mean_is_that_of_the_mean():
+    x = X[:3, 0]  # of three there is no quarter to leave out
+    known, found = stats.estimate(x), stats.estimate(x, statistic=stats.iqm)
+    assert found.mean == pytest.approx(known.mean)
+    np.testing.assert_allclose(found.high - found.low, known.high - known.low, rtol=0.02)
+
+
 def test_the_spread_between_tasks_does_not_widen_the_interval():
     assert stats.estimate(np.full(5, 1.0), np.full(5, 9.0)) == (5.0, 5.0, 5.0)
 
@@ -122,6 +129,11 @@ def test_an_interval_stops_where_its_measure_does(name, values, ends):
     e = stats.of_measure(name, np.array(values))
     assert e.mean == np.mean(values) and isinstance(e.low, float)
     np.testing.assert_allclose(e[1:], ends, rtol=1e-4)
+
+
+def test_a_cost_below_0_of_one_task_leaves_the_interval_over_all_tasks_open():
+    below, above = np.array([-1.0, 1.0, 3.0]), np.array([0.0, 0.0, 0.0])
+    assert stats.of_measure("cost", below, above).low == stats.estimate(below, above).low < 0
 
 
 def test_probability_of_improvement_counts_pairs_and_halves_of_equal_ones():
