@@ -142,6 +142,16 @@ def test_evaluations_of_each_seed_join_in_where_the_run_has_them(tmp_path):
         runs_in(b)
 
 
+def test_scores_follow_what_stands_in_for_return_and_cost(tmp_path):
+    (run,) = runs_in(write(tmp_path / "a"))
+    final = {"final return": np.array([6.0, 9.0]), "final cost": np.array([30.0, 10.0])}
+    found = read.with_evaluation(run._replace(values=run.values | final)).values
+    ppo = scores.CHARACTERISTIC["point_goal1"]
+    np.testing.assert_array_equal(found["return"], [6, 9])
+    np.testing.assert_allclose(found["normalised return"], [6 / ppo.ret, 9 / ppo.ret])
+    np.testing.assert_allclose(found["normalised violation"], [5 / (ppo.cost - 25), 0])
+
+
 def test_stretches_of_training_are_means_carried_on_to_the_end_of_each_seed():
     table = {
         "steps": np.array([10, 20, 30, 40, 10, 20.0]), "seed": np.array([0, 0, 0, 0, 1, 1.0]),
