@@ -2,16 +2,20 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from compiling import FAST
 from learners import begin, compiled
-from toys import Ticker
+from toys import Sometimes, Ticker
 
-from jaxsafe.learn.estimates import Signals, scaled
+from jaxsafe.learn.acting import learned_of
+from jaxsafe.learn.estimates import Experience, Signals, estimate_batch, scaled
 from jaxsafe.learn.normalise import normalise
-from jaxsafe.learn.returns import Window
+from jaxsafe.learn.returns import ValuedSteps, Window, gae
+from jaxsafe.learn.rollout import collect, memoryless
 from jaxsafe.nn.gaussian import kl
-from jaxsafe.nn.networks import action_dist
+from jaxsafe.nn.networks import action_dist, value
 
 FIVE_STEPS = {"stagger": False, "horizon": 5}
 
@@ -40,6 +44,43 @@ def test_what_the_learner_sees_is_normalised_by_all_batches_up_to_this_one():
         cfg = dataclasses.replace(ts.config, reward_normalize=reward_too, cost_normalize=cost_too)
         a, b, _ = scaled(Signals(reward[0], cost[0], start), cfg, None)
         assert (a == reward[0]).all() == (not reward_too) and (b == cost[0]).all() == (not cost_too)
+
+
+def test_a_batch_has_the_advantages_of_its_good_steps_each_by_its_own_discount_and_decay():
+    discounts = {"discount": 0.9, "gae_lambda": 0.8, "cost_discount": 0.7, "cost_gae_lambda": 0.6}
+    env = Sometimes(episode_length=5, lives=(2, 9))
+    ts = begin("ppo_lag", env, stagger=False, **discounts)
+    # so that the cleared observation of a bad step has a value
+    ts = dataclasses.replace(ts, normaliser=dataclasses.replace(ts.normaliser, mean=jnp.ones(3)))
+    still = memoryless(lambda obs, key: (jnp.zeros((len(obs), 1)), jnp.zeros(len(obs))))
+
+    def made():
+        _, traj = collect(env, still, ts.rollout, jax.random.key(0), 12)
+        reward, cost = jnp.where(traj.bad.any, 0.0, jax.random.normal(jax.random.key(1), (2, 12, 8)))
+        seen = Experience(traj, Signals(reward, cost, ()), ())
+        return traj, reward, cost, estimate_batch(learned_of(ts), seen, (), None)[0]
+
+    traj, reward, cost, batch = jax.jit(made, compiler_options=FAST)()
+    bad, good, cfg, params = traj.bad.any, ~traj.bad.any, ts.config, ts.params
+    assert all(0 < x.sum() < x.size / 2 for x in (bad, traj.terminated, traj.truncated & good))
+    obs, after = (normalise(ts.normaliser, x) for x in (traj.obs, traj.next_obs))
+
+    def expected(critic, paid, discount, decay):
+        v, later = (value(params[critic], x, cfg) for x in (obs, after))
+        paid, later = jnp.where(bad, v, paid), jnp.where(bad, 0.0, later)  # an error of 0
+        found = gae(ValuedSteps(paid, v, later, traj.terminated, traj.done), discount, decay)
+        return (good * (found - found.mean()) * good.size / good.sum()).ravel(), found, v
+
+    (r, error, v), (c, error_c, v_c) = (
+        expected("critic_r", reward, cfg.discount, cfg.gae_lambda),
+        expected("critic_c", cost, cfg.cost_discount, cfg.cost_gae_lambda),
+    )
+    close = {"rtol": 1e-4, "atol": 1e-5}
+    np.testing.assert_allclose(batch.adv_r, r / error.std(), **close)
+    np.testing.assert_allclose(batch.adv_c, c, **close)
+    np.testing.assert_allclose(batch.ret_r, (error + v).ravel(), **close)
+    np.testing.assert_allclose(batch.ret_c, (error_c + v_c).ravel(), **close)
+    np.testing.assert_allclose(batch.ret_c.reshape(bad.shape)[bad], v_c[bad], **close)
 
 
 def test_the_constraint_and_the_metrics_see_rewards_and_costs_as_they_are():
