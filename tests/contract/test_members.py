@@ -1,5 +1,6 @@
 """Seeds and settings side by side, and one seed on two devices, are what lone runs are."""
 
+import dataclasses
 from functools import partial
 from typing import Any
 
@@ -59,7 +60,9 @@ def devices_agree_on(name, trunk="separate"):
         statistics = (ts.normaliser, ts.signal_normaliser, ts.lost_time)
         agree((ts.params, ts.opt_state, ts.dual, statistics, metrics))
         obs = np.asarray(ts.rollout.state.obs)
-        assert (obs[0] != obs[1]).any()  # on environments of their own
+        assert (obs[0] != obs[1]).any()  # on environments of their own, and then by actions alone
+        alike = jax.tree.map(lambda x: jnp.stack([x[0]] * 2), ts.rollout)
+        ts = dataclasses.replace(ts, rollout=alike)
 
 
 def signals_are_scaled_alike():

@@ -1,17 +1,20 @@
 """What the constraint, the metrics and the learner see of rewards and costs, by hand."""
 
 import dataclasses
+from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from compiling import FAST
 from learners import begin, compiled
-from toys import Sometimes, Ticker
+from toys import START, Sometimes, Ticker
 
 from jaxsafe.learn.acting import learned_of
 from jaxsafe.learn.estimates import Experience, Signals, estimate_batch, scaled
 from jaxsafe.learn.normalise import normalise
+from jaxsafe.learn.on_policy import Improved, Method, on_policy_loop
 from jaxsafe.learn.returns import ValuedSteps, Window, gae
 from jaxsafe.learn.rollout import collect, memoryless
 from jaxsafe.nn.gaussian import kl
@@ -47,7 +50,7 @@ def test_what_the_learner_sees_is_normalised_by_all_batches_up_to_this_one():
 
 
 def test_a_batch_has_the_advantages_of_its_good_steps_each_by_its_own_discount_and_decay():
-    discounts = {"discount": 0.9, "gae_lambda": 0.8, "cost_discount": 0.7, "cost_gae_lambda": 0.6}
+    discounts: Any = {"discount": 0.9, "gae_lambda": 0.8, "cost_discount": 0.7, "cost_gae_lambda": 0.6}
     env = Sometimes(episode_length=5, lives=(2, 9))
     ts = begin("ppo_lag", env, stagger=False, **discounts)
     # so that the cleared observation of a bad step has a value
@@ -75,12 +78,12 @@ def test_a_batch_has_the_advantages_of_its_good_steps_each_by_its_own_discount_a
         expected("critic_r", reward, cfg.discount, cfg.gae_lambda),
         expected("critic_c", cost, cfg.cost_discount, cfg.cost_gae_lambda),
     )
-    close = {"rtol": 1e-4, "atol": 1e-5}
-    np.testing.assert_allclose(batch.adv_r, r / error.std(), **close)
-    np.testing.assert_allclose(batch.adv_c, c, **close)
-    np.testing.assert_allclose(batch.ret_r, (error + v).ravel(), **close)
-    np.testing.assert_allclose(batch.ret_c, (error_c + v_c).ravel(), **close)
-    np.testing.assert_allclose(batch.ret_c.reshape(bad.shape)[bad], v_c[bad], **close)
+    close = partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-5)
+    close(batch.adv_r, r / error.std())
+    close(batch.adv_c, c)
+    close(batch.ret_r, (error + v).ravel())
+    close(batch.ret_c, (error_c + v_c).ravel())
+    close(batch.ret_c.reshape(bad.shape)[bad], v_c[bad])
 
 
 def test_the_constraint_and_the_metrics_see_rewards_and_costs_as_they_are():
@@ -127,6 +130,21 @@ def test_the_constraint_sees_the_mean_cost_of_the_window():
     before = dataclasses.replace(ts, past_costs=Window(jnp.array([0.0, 0.0, 4.0]), jnp.int32(1)))
     after, metrics = update(before)
     assert metrics["train/over_limit"] == 0 and after.past_costs.count == 2
+
+
+def test_a_violation_is_of_the_window_too():
+    def improve(ts, batch, context):
+        told = {"train/violation": context.violation, "train/nonfinite": jnp.zeros(())}
+        return Improved(ts.params["actor"], (), (), told)
+
+    env = Ticker(episode_length=5)
+    method = Method(lambda cfg: None, lambda actor, cfg: (), lambda cfg: (), improve)
+    algo = on_policy_loop(env, method, None)
+    ts = begin("ppo", env, cost_window=3, cost_limit=6.0)
+    past = Window(jnp.array([0.0, 1.0, 4.0]), jnp.int32(3))
+    ts = dataclasses.replace(ts, past_costs=past, dual=(), opt_state=ts.opt_state | {"actor": ()})
+    _, metrics = jax.jit(algo.update, compiler_options=FAST)(ts, START)
+    assert metrics["train/violation"] == (1 + 4 + 10) / 3 - 6
 
 
 def test_metrics_are_of_the_episodes_that_ended_and_of_none_there_is_no_mean():
