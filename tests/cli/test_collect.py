@@ -60,6 +60,7 @@ def test_whole_episodes_of_every_policy_with_dsrls_keys_and_a_recipe(run, tmp_pa
     assert np.bincount(arrays["policy"][60:]).tolist() == [80, 80]
     assert arrays["timeouts"].nonzero()[0].tolist() == list(range(19, 220, 20))
     assert not arrays["terminals"].any()
+    assert len(np.unique(arrays["observations"][::20], axis=0)) == 11  # of one run given twice, too
     recipe = json.loads(attrs["recipe"])
     assert [x["share"] for x in recipe["runs"]] == [0.25, 0.75] and attrs["actions"] == "mean"
     assert recipe["runs"][0]["algo"] == "ppo_lag" and recipe["runs"][0]["seeds"] == 2
@@ -103,6 +104,7 @@ def test_the_same_command_collects_the_same_and_mean_actions_are_not_sampled_one
     first, again, mean = (read_dataset(str(path)) for path in files)
     assert_equal(first, again)
     assert np.abs(first.action - mean.action).max() > 0.1
+    assert np.abs(first.action).max() == 1  # as environments clip them
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,16 @@
 """Which episodes evaluation plays."""
 
-import jax
-import numpy as np
+from types import SimpleNamespace
+from typing import Any
 
-from jaxsafe.run.evaluate import keys_of_episodes
+import jax
+import jax.numpy as jnp
+import numpy as np
+from toys import Ticker, reflex
+
+from jaxsafe.algos.bc import BCConfig
+from jaxsafe.learn.acting import Learned
+from jaxsafe.run.evaluate import keys_of_episodes, make_evaluation
 from jaxsafe.run.settings import TrainConfig
 
 
@@ -26,3 +33,14 @@ def test_a_seed_meets_its_episodes_whichever_seed_comes_first():
     key = jax.random.fold_in(jax.random.key(0), 0x6576616C)
     first = [jax.random.split(jax.random.fold_in(key, i), 4) for i in range(5)]
     np.testing.assert_array_equal(five_seeds, np.stack([jax.random.key_data(x) for x in first]))
+
+
+def test_each_policy_s_rewards_and_costs_are_discounted_as_in_its_training():
+    env = Ticker(lives=(2, 2))  # 1 and 2 a step
+    policy = reflex(lambda obs: obs[:1], env).policy
+    algo: Any = SimpleNamespace(policy=policy, task=lambda learned: env)
+    cfgs = BCConfig(discount=0.5, cost_discount=0.25), BCConfig(discount=1.0, cost_discount=0.0)
+    cfg = jax.tree.map(lambda *x: jnp.array(x), *cfgs)
+    found = make_evaluation(algo, keys_of_episodes(0, 1, range(2)))(Learned(cfg, {}, (), ()))
+    np.testing.assert_array_equal(found.discounted_ret, [[1.5], [2]])
+    np.testing.assert_array_equal(found.discounted_cost, [[2.5], [2]])

@@ -151,7 +151,7 @@ def test_discounted_sums_and_named_costs_of_an_episode_by_hand():
     found = evaluate.measures(own, ("a", "b"), {"a": a - 0.5, "b": b})
     assert [found[f"cost {name}"].item() for name in "ab"] == [a, b]
     assert [found[k].item() for k in (f"a over {a - 0.5:g}", f"b over {b:g}")] == [True, False]
-    assert found["violation rate"].item() and not {"cost wall", "goals"} & found.keys()
+    assert found["violation rate"].item() == 1 and not {"cost wall", "goals"} & found.keys()
 
 
 def test_the_only_cost_has_a_row_of_its_own_where_it_has_a_limit_of_its_own():
