@@ -20,10 +20,11 @@ from toys import START, Corridor, updated
 
 from jaxsafe.algos import ALGOS
 from jaxsafe.config import ConfigError
-from jaxsafe.learn.on_policy import OnPolicyConfig
+from jaxsafe.learn.on_policy import Improved, Method, OnPolicyConfig, on_policy_loop
+from jaxsafe.learn.steps import Context
 from jaxsafe.learn.world_model import latents_of
 from jaxsafe.run import compat
-from jaxsafe.types import Algorithm, Metrics, PyTree, Shared
+from jaxsafe.types import Algorithm, Env, Metrics, PyTree, Shared
 
 TINY: dict[str, Any] = {"num_envs": 8, "horizon": 25, "minibatches": 2, "hidden": (8,)}
 OPTIONS: dict[str, Any] = {
@@ -130,6 +131,17 @@ def initial(name: str, env: Any, cfg: Any) -> Callable[[jax.Array, dict[str, jax
         return algo.init(key, dataclasses.replace(cfg, **swept), START)
 
     return jax.jit(jax.vmap(init), compiler_options=FAST)
+
+
+def telling(env: Env, tell: Callable[[Any, Context], Metrics]) -> Algorithm:
+    """The on-policy loop with a policy that never moves, and the metrics `tell(batch, context)`."""
+
+    def improve(ts: Any, batch: Any, context: Context) -> Improved:
+        told = tell(batch, context) | {"train/nonfinite": jnp.zeros(())}
+        return Improved(ts.params["actor"], (), (), told)
+
+    method = Method(lambda cfg: None, lambda actor, cfg: (), lambda cfg: (), improve)
+    return on_policy_loop(env, method, None)
 
 
 def two_members(algo: Algorithm, cfg: Any) -> tuple[PyTree, Callable]:

@@ -8,13 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from compiling import FAST
-from learners import begin, compiled
+from learners import TINY, begin, compiled, telling
 from toys import START, Sometimes, Ticker
 
+from jaxsafe.algos.ppo import PPOConfig
 from jaxsafe.learn.acting import learned_of
 from jaxsafe.learn.estimates import Experience, Signals, estimate_batch, scaled
 from jaxsafe.learn.normalise import normalise
-from jaxsafe.learn.on_policy import Improved, Method, on_policy_loop
 from jaxsafe.learn.returns import ValuedSteps, Window, gae
 from jaxsafe.learn.rollout import collect, memoryless
 from jaxsafe.nn.gaussian import kl
@@ -96,6 +96,7 @@ def test_the_constraint_and_the_metrics_see_rewards_and_costs_as_they_are():
         assert (m["train/return"], m["train/cost"], m["train/cost_estimate"]) == (5, 10, 10)
         assert m["train/cost_rate"] == 2 and m["train/return_estimate"] == 5
         np.testing.assert_allclose(ts.dual.lam, 0.001 + 0.1, rtol=1e-4)  # a violation of 1, Adam's step
+        assert ts.normaliser.mean[1] == 2  # of steps 0 to 4, at which the policy acted
     plain, scaled = (m["train/value_loss_c"] for _, m in runs)
     assert scaled < plain / 2  # the critic's targets are near 1 / (1 - discount), not twice that
 
@@ -132,19 +133,16 @@ def test_the_constraint_sees_the_mean_cost_of_the_window():
     assert metrics["train/over_limit"] == 0 and after.past_costs.count == 2
 
 
-def test_a_violation_is_of_the_window_too():
-    def improve(ts, batch, context):
-        told = {"train/violation": context.violation, "train/nonfinite": jnp.zeros(())}
-        return Improved(ts.params["actor"], (), (), told)
-
-    env = Ticker(episode_length=5)
-    method = Method(lambda cfg: None, lambda actor, cfg: (), lambda cfg: (), improve)
-    algo = on_policy_loop(env, method, None)
-    ts = begin("ppo", env, cost_window=3, cost_limit=6.0)
+def test_a_violation_is_of_the_window_and_costs_are_those_of_good_steps():
+    algo = telling(Sometimes(), lambda batch, context: {"train/violation": context.violation})
+    ts = algo.init(jax.random.key(0), PPOConfig(**TINY, cost_window=3, cost_limit=6.0), START)
     past = Window(jnp.array([0.0, 1.0, 4.0]), jnp.int32(3))
-    ts = dataclasses.replace(ts, past_costs=past, dual=(), opt_state=ts.opt_state | {"actor": ()})
-    _, metrics = jax.jit(algo.update, compiler_options=FAST)(ts, START)
-    assert metrics["train/violation"] == (1 + 4 + 10) / 3 - 6
+    update = jax.jit(algo.update, compiler_options=FAST)
+    _, metrics = update(dataclasses.replace(ts, past_costs=past), START)
+    assert metrics["train/bad_cost"] > 0
+    expected = {"cost_rate": 2, "cost_estimate": 10, "violation": (1 + 4 + 10) / 3 - 6}
+    for name, x in expected.items():
+        np.testing.assert_allclose(metrics[f"train/{name}"], x, rtol=1e-5)
 
 
 def test_metrics_are_of_the_episodes_that_ended_and_of_none_there_is_no_mean():

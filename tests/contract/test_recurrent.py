@@ -7,11 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compiling import FAST
+from learners import telling
 from toys import START, Recall, Ticker, run_episodes, training, updated
 
 from jaxsafe.algos import ALGOS
 from jaxsafe.config import ConfigError
 from jaxsafe.learn.acting import Player, reset_carry
+from jaxsafe.nn.gaussian import log_prob
 from jaxsafe.nn.networks import apply_to_rollout, net_of, recurrent_step
 from jaxsafe.nn.recurrent import Sequences, unroll
 
@@ -82,6 +84,16 @@ def test_the_value_after_a_step_is_that_of_the_next_unless_the_episode_ended():
         pair = found.next_value[t, 1], found.value[t + 1, 1]
         np.testing.assert_allclose(*pair, rtol=1e-5, atol=1e-6)
     assert not np.allclose(found.next_value[1, 1], found.value[2, 1], atol=1e-4)  # of the old episode
+
+
+def test_it_learns_from_the_distributions_that_acted_in_the_middle_of_an_episode_too():
+    def tell(batch, context):
+        off = log_prob(batch.old, batch.action) - batch.log_prob
+        return {"train/off": jnp.abs(off).max()}
+
+    algo, (_, cfg) = telling(Recall(), tell), learner(horizon=4)  # of 6 steps
+    ts, metrics = jax.jit(training(algo, cfg, 2), compiler_options=FAST)(jax.random.key(0))
+    assert (metrics["train/off"] < 1e-5).all() and jnp.abs(ts.rollout.carry).max() > 0.1
 
 
 def test_costs_of_several_names_and_a_price_work_with_a_memory():

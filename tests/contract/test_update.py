@@ -69,10 +69,14 @@ def test_the_same_key_gives_the_same_run(name):
 @pytest.mark.parametrize("name", COMPILED)
 def test_a_batch_that_is_not_finite_changes_nothing_that_is_learned_and_is_counted(name):
     ts = first_update(name).after
+    # so that an update moves what is remembered, in a task without failures and costs too
+    past, lost = ts.past_costs, ts.lost_time
+    past, lost = past._replace(values=past.values + 1), lost._replace(taken=lost.taken / 2)
+    ts = dataclasses.replace(ts, past_costs=past, lost_time=lost)
     whole, _ = compiled(name).together(ts)
     after, metrics = compiled(name).together(senseless(ts, 1))
     assert metrics["train/nonfinite"][1] > 0
-    for field in ("params", "dual", "normaliser", "lost_time"):
+    for field in ("params", "dual", "normaliser", "lost_time", "past_costs"):
         same(member(getattr(ts, field), 1), member(getattr(after, field), 1))
     for other in (0, 2):  # the members beside it learn on
         assert metrics["train/nonfinite"][other] == 0
