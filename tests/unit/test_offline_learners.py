@@ -516,6 +516,53 @@ def test_limits_of_named_costs_are_held_apart():
     )
 
 
+RATES: dict[str, Any] = {"lr": 4e-3, "critic_lr": 2e-3, "lr_decay": True}
+
+
+@pytest.mark.parametrize(
+    "name, settings, rates",
+    [
+        ("vae_bc", {"vae_hidden": (), "lr": 4e-3, "lr_decay": True}, {"vae": 2e-3}),
+        (
+            "bcq_lag",
+            {"vae_hidden": (), **RATES},
+            {"vae": 2e-3, "actor": 2e-3, "critic_r": 1e-3, "critic_c": 1e-3},
+        ),
+        ("ccrr", RATES, {"actor": 2e-3, "critic_r": 1e-3, "critic_c": 1e-3}),
+        # tau's rate does not fall
+        ("coptidice", {**RATES, "tau_lr": 1e-2}, {"actor": 2e-3, "nu": 1e-3, "chi": 1e-3, "tau": 1e-2}),
+    ],
+)
+def test_each_network_moves_at_its_own_rate_which_falls_with_what_is_left_of_training(
+    name, settings, rates
+):
+    makers: dict[str, Any] = {"vae_bc": bc.autoencoder, "coptidice": coptidice.learner}
+    makers |= {"bcq_lag": partial(bcq.learner, treatment=lagrangian)}
+    makers |= {"ccrr": partial(crr.learner, treatment=crr.unscaled)}
+    learner, cfg = makers[name](Corridor()), ALGOS[name].config(**LINEAR | settings, batch_size=5)
+    nets, batch, at, _ = prepared(learner, cfg)
+    after, _ = stepped(learner, nets, batch, at._replace(remaining=jnp.float32(0.5)), cfg)
+    for net, rate in rates.items():  # the length of Adam's first step
+        old, new = (jax.tree.leaves(x.params[net]) for x in (nets, after))
+        moved = max(float(jnp.abs(a - b).max()) for a, b in zip(old, new, strict=True))
+        np.testing.assert_allclose(moved, rate, rtol=1e-3, err_msg=net)
+
+
+def test_observations_where_episodes_begin_are_not_drawn_as_the_batch_is():
+    """In episodes of a step each, where both are drawn from the same observations."""
+
+    def step(nets, batch, at, cfg, axis_name):
+        return nets, {"train/same": (batch.obs == at.first_obs).all(-1).mean()}
+
+    learner = Learner(init=lambda *_: Trainable({}, {}), step=step, act=lambda *_: jnp.zeros(2))
+    obs, zero = np.tile(np.arange(50.0)[:, None], 4), np.zeros(50)
+    data = data_set(obs, obs[:, :2], zero, zero, obs, zero == 0, zero > 0)
+    algo, shared = offline(Corridor(), learner), Shared(np.int32(0), data=data)
+    cfg = crr.CCRRConfig(updates=5, batch_size=20)
+    _, metrics = algo.update(algo.init(jax.random.key(0), cfg, shared), shared)
+    assert metrics["train/same"] < 0.2
+
+
 def test_first_observations_are_those_at_which_episodes_begin():
     """Episodes of 3 steps, the last of 1, whose observations are the numbers of their rows."""
     obs = np.arange(7.0)[:, None]
