@@ -270,7 +270,7 @@ def rows_that_count(rows, **options):
     the error of models that stay what they are.
     """
     small: dict[str, Any] = {"model_hidden": (), "model_lr": 0.0, "max_epochs": 1, "holdout": 0.5}
-    cfg = dataclasses.replace(Config(), **small, **options)
+    cfg = dataclasses.replace(Config(), **small | options)
     x, y = draw(jax.random.key(0), (rows + 1, 1))  # nothing follows the last row
     span, model = Span(jnp.int32(0), jnp.int32(rows + 1)), init_model(jax.random.key(1), LINE, cfg)
 
@@ -289,11 +289,13 @@ def test_rows_either_train_all_models_or_measure_their_error():
     np.testing.assert_array_equal(trained, np.stack([~held_out] * 3, 1))
 
 
-def test_each_model_has_batches_of_its_own():
+def test_each_model_has_batches_of_its_own_in_each_epoch():
     trained, _ = rows_that_count(40, epoch_steps=1, model_batch=4)
     count = trained.sum(0)
     assert (count >= 1).all() and (count <= 4).all()
     assert all((trained[:, i] != trained[:, j]).any() for i, j in ((0, 1), (0, 2), (1, 2)))
+    trained, _ = rows_that_count(40, epoch_steps=1, model_batch=4, max_epochs=2)
+    assert (trained.sum(0) > 4).all()
 
 
 def test_an_epoch_with_a_gradient_that_is_not_finite_moves_nothing():
