@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from compiling import BUSY, FAST
 from learners import at, copy, member
-from toys import START, Arriving, Corridor, Lever, Patch, Ticker, training
+from toys import START, Arriving, Corridor, Lever, Patch, Sometimes, Ticker, training
 from two_devices import agree, on_two_devices, split
 
 from jaxsafe.algos import ALGOS
@@ -19,9 +19,10 @@ from jaxsafe.config import ConfigError
 from jaxsafe.learn.acting import Player
 from jaxsafe.learn.learner import Learner
 from jaxsafe.learn.models import EnsembleConfig
-from jaxsafe.learn.next_step_rollout import collect_records
+from jaxsafe.learn.next_step_rollout import collect_records, started
 from jaxsafe.learn.normalise import normalise
 from jaxsafe.learn.off_policy import OffPolicyConfig, off_policy
+from jaxsafe.learn.rollout import init_rollout
 from jaxsafe.learn.steps import Trainable
 from jaxsafe.learn.timetable import ReplayConfig, timetable_of
 from jaxsafe.types import Env, State
@@ -506,6 +507,26 @@ def test_the_last_observation_of_an_episode_has_a_row_and_the_next_row_is_a_rese
     np.testing.assert_array_equal(np.asarray(steps.episode.ret)[ended], np.asarray(steps.length)[ended])
 
 
+def test_a_bad_step_is_none_and_the_episode_that_it_ends_does_not_count():
+    env, keys = Sometimes(episode_length=5), jax.random.split(jax.random.key(1), 40)
+
+    def act(carry, state, first, key):
+        return jnp.zeros((8, 1)), carry, {}
+
+    def run(key):
+        stepping = started(init_rollout(env, key, 8, stagger=False))
+        return collect_records(env, act, stepping, keys)[1]
+
+    rows, steps = jax.jit(run, compiler_options=FAST)(jax.random.key(0))
+    bad = np.asarray(steps.bad.any)
+    assert bad.any() and (np.asarray(steps.real) == ~(np.asarray(rows.last) | bad)).all()
+    assert not (np.asarray(steps.ended) & bad).any() and not steps.terminated.any()
+    assert (np.asarray(steps.episode.cost)[np.asarray(steps.ended)] == 2 * 5).all()
+    # it leads to a row that no transition leads to
+    came = [np.asarray(x)[1:][bad[:-1]] for x in (rows.truncated, rows.reward)]
+    assert came[0].all() and np.isnan(came[1]).all()
+
+
 def test_an_episode_that_the_environment_ends_is_truncated_and_has_lost_no_time():
     """Three steps of nine at a cost of 2 each: J_c is that of nine."""
     env = Arriving(episode_length=9, lives=(3, 3))
@@ -523,7 +544,8 @@ def test_metrics_are_of_the_episodes_that_ended():
     sizes = {"horizon": 16, "learn_every": 16, "stagger": False, "replay_size": 8 * 32}
     _, m = build("sac", env, **sizes)[1](start("sac", env=env, **sizes), START)
     expected = {"episodes": 4 * 8, "return": 3, "cost": 6, "cost_a": 1.5, "cost_b": 4.5, "ticks": 3}
-    expected |= {"episode_length": 3, "cost_rate": 2}  # per step: a reset is none
+    # per step, and a reset is none: 2 of 5 steps are lost for 3 taken, which makes episodes of 3
+    expected |= {"episode_length": 3, "cost_rate": 2, "cost_estimate": 6}
     for name, x in expected.items():
         np.testing.assert_allclose(m[f"train/{name}"], x, rtol=1e-6)
 
