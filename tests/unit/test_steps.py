@@ -7,14 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compiling import FAST
-from toys import context
+from toys import context, momentum
 
 from jaxsafe.algos.cpo import CPOConfig
 from jaxsafe.algos.ppo import PPOConfig
 from jaxsafe.learn.estimates import Batch
 from jaxsafe.learn.steps import Trainable, adam, adam_epochs, critic_passes, fit_critic, one_pass
 from jaxsafe.learn.surrogates import clipped, plain, with_entropy
-from jaxsafe.nn.gaussian import log_prob, sample
+from jaxsafe.nn.gaussian import kl, log_prob, sample
 from jaxsafe.nn.networks import action_dist, init_params, value
 
 SMALL: dict[str, Any] = {"hidden": (8,), "num_envs": 8, "horizon": 8, "minibatches": 4}
@@ -71,8 +71,12 @@ def test_the_first_pass_beyond_the_kl_limit_is_the_last():
     ]
     assert free[0] < free[1] < free[2]
     limit = float(free[0] + free[1]) / 2
-    _, _, metrics = improve(PPOConfig(**SMALL, lr=1e-2, target_kl=limit))
+    cfg = PPOConfig(**SMALL, lr=1e-2, target_kl=limit)
+    _, after, metrics = improve(cfg)
     assert metrics["train/passes"] == 2 and metrics["train/kl"] == free[1]
+    batch = problem()[1]
+    divergence = kl(batch.old, action_dist(after, batch.obs, cfg)).mean()  # from the old one to the new
+    np.testing.assert_allclose(metrics["train/kl"], divergence, rtol=1e-4)
 
 
 def test_the_learning_rate_falls_to_zero_at_the_last_iteration():
@@ -100,6 +104,18 @@ def test_steps_with_gradients_that_are_not_finite_are_skipped_and_counted():
     assert metrics["train/nonfinite"] == cfg.epochs
     assert all(jnp.isfinite(x).all() for x in jax.tree.leaves(after))
     assert any((a != b).any() for a, b in zip(*map(jax.tree.leaves, (before, after)), strict=True))
+
+
+def test_each_pass_has_minibatches_of_its_own():
+    """Two of 64 samples are in the same one of 4 in a quarter of the passes."""
+    one, other = problem()[1].obs[:2, 0].tolist()
+
+    def apart(actor, batch, cfg):
+        together = (batch.obs[:, 0] == one).any() & (batch.obs[:, 0] == other).any()
+        return jnp.where(together, jnp.nan, 1.0) * earn(actor, batch, cfg)[0], {}
+
+    _, _, metrics = improve(PPOConfig(**SMALL, epochs=20, target_kl=1e9), apart)
+    assert 0 < metrics["train/nonfinite"] < 20
 
 
 def test_two_devices_take_the_step_of_one():
@@ -155,6 +171,20 @@ def test_a_critic_learns_its_targets():
     )
     assert error < 0.01 and skipped == 0
     np.testing.assert_allclose(value(critic.params, batch.obs, cfg), batch.ret_c, atol=0.4)
+
+
+def test_a_critic_without_an_error_only_shrinks():
+    """Down the gradient of critic_norm_coef |theta|^2."""
+    cfg = dataclasses.replace(PPOConfig(**SMALL), minibatches=1, critic_epochs=1, critic_norm_coef=0.5)
+    params, batch = problem()
+    theta = params["critic_c"]
+    start = Trainable(theta, adam(cfg.critic_lr, cfg).init(theta))
+    known = batch.obs, value(theta, batch.obs, cfg)
+    after, error, _ = fit_jitted(start, known, 1, jax.random.key(0), cfg, None)
+    named = Trainable({"critic": after.params}, {"critic": after.opt_state})
+    for mu, x in zip(*map(jax.tree.leaves, (momentum(named, "critic"), theta)), strict=True):
+        np.testing.assert_allclose(mu, 0.1 * 2 * 0.5 * x, rtol=1e-4, atol=1e-6)
+    assert error < 1e-10
 
 
 def test_passes_of_a_critic_beyond_those_that_count_change_nothing():

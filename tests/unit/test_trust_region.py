@@ -142,6 +142,7 @@ def taken(step, cfg):
     start, unravel = ravel_pytree(actor)
     g = jax.grad(lambda x: objective(unravel(x), batch)[0])(start)
     hessian = jax.hessian(lambda x: kl(old, action_dist(unravel(x), obs, cfg)).mean())(start)
+    metrics["from old to new"] = kl(old, action_dist(after, obs, cfg)).mean()
     return ravel_pytree(after)[0] - start, g, hessian + cfg.damping * jnp.eye(len(g)), metrics
 
 
@@ -160,6 +161,7 @@ def test_a_trust_region_step_is_the_natural_one_shortened_until_it_holds():
     step, _, _, metrics, cfg = natural(trust_region, target_kl=0.5, damping=1e-3)
     assert metrics["train/accepted"] == 1 and metrics["train/objective"] > 0
     assert metrics["train/kl"] <= cfg.target_kl
+    np.testing.assert_allclose(metrics["train/kl"], metrics["from old to new"], rtol=1e-4)
     shrunk = cfg.line_search_shrink ** float(metrics["train/line_search"])
     np.testing.assert_allclose(step, shrunk * long, rtol=1e-3, atol=1e-5)
     _, _, _, unsearched, _ = natural(natural_gradient, target_kl=0.5, damping=1e-3)
