@@ -9,7 +9,18 @@ from jax.flatten_util import ravel_pytree
 from scipy.optimize import minimize
 from toys import context
 
-from jaxsafe.algos.cpo import BOUNDED, FREE, RECOVER, RETURN, CPOConfig, Margin, cpo_step, multipliers
+from jaxsafe.algos.cpo import (
+    BOUNDED,
+    FREE,
+    RECOVER,
+    RETURN,
+    CPOConfig,
+    Margin,
+    Problem,
+    cpo_step,
+    multipliers,
+    solution,
+)
 from jaxsafe.learn.estimates import Batch
 from jaxsafe.learn.steps import Pair, mean_kl
 from jaxsafe.learn.surrogates import plain
@@ -140,6 +151,13 @@ def test_the_plane_by_hand(b, c, case, x):
     step, found, *_ = step_of(np.array([1.0, 0.0]), np.array(b, float), np.eye(2), c, 0.5)
     assert found == case
     np.testing.assert_allclose(step, x, atol=1e-4)
+
+
+@pytest.mark.parametrize("c, earns", [(-2.0, True), (-0.5, True), (0.5, False), (2.0, False)])
+def test_reward_must_not_fall_where_the_present_policy_is_safe(c, earns):
+    g, b = jnp.array([1.0, 0.0]), jnp.array([0.6, 0.8])
+    problem = Problem(g, g, b, g @ g, g @ b, b @ b, jnp.float32(c), jnp.float32(0.5))
+    assert solution(problem, None).earns == earns
 
 
 def test_scales_of_the_gradients_change_the_multipliers_and_not_the_step():
