@@ -59,6 +59,13 @@ def test_the_pendulum_moves_as_in_gymnasium():
         before = wrapped
 
 
+def test_a_pendulum_turns_by_8_rad_a_second_at_most():
+    env = envs.make("pendulum_upright")
+    start = env.reset(jax.random.key(0))
+    fast = env.step(start.replace(physics=jnp.array([0.5, 7.9])), jnp.ones(1))
+    assert fast.obs[1] == 8.0  # 7.9 and 0.05 (15 sin(0.5) + 6) are more
+
+
 @pytest.mark.parametrize(
     "name", ["pendulum_upright", "pendulum_tilt", "pendulum_move", "pendulum_swing"]
 )

@@ -247,6 +247,19 @@ def test_leaving_the_road_costs_once_and_only_without_obstacles():
         assert paid == costs
 
 
+def test_each_axle_has_the_grip_of_its_own_wheels():
+    step = compiled(0)[2]
+    state, action = put(stadium(0), 20.0, 0.0), jnp.array([-1.0, 1.0, -1.0])
+    car = state.physics.car.replace(velocity=jnp.array([10.0, 0.0]))
+    grass = jnp.array([False, False, True, True])  # the rear wheels
+    world = replace(state.physics, car=car, on_road=~grass)
+    after = step(replace(state, physics=world), action)
+    grip = jnp.array([1.0, cars.OFF_ROAD])
+    alone = cars.drive(car, jnp.float32(1), jnp.float32(1), jnp.float32(0), grip)
+    for a, b in zip(*map(jax.tree.leaves, (after.physics.car, alone)), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
+
+
 def test_an_obstacle_costs_when_it_is_met_and_again_after_it_was_left():
     step = compiled(1)[2]
     state, paid = stadium(1), []

@@ -325,6 +325,7 @@ def test_velocities_cost_what_they_cost_in_safety_gymnasium():
 def test_a_threshold_of_one_s_own_counts():
     env = envs.make("hopper_velocity", engine="c", velocity_threshold=0.5)
     assert env.threshold == 0.5 and float(env.cost(jnp.array([0.6, 0.0]))) == 1
+    assert float(env.cost(jnp.array([0.5, 0.0]))) == 0  # at the threshold
 
 
 @pytest.mark.parametrize(

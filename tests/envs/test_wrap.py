@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from toys import Corridor, Ticker
+from toys import Arriving, Corridor, Ticker
 
 from jaxsafe import envs
 from jaxsafe.config import ConfigError
@@ -71,6 +71,9 @@ def test_a_repeated_action_earns_and_costs_the_sums_and_stops_at_the_end():
     np.testing.assert_array_equal([s.info["ticks"] for s in after], [2, 2, 1])
     np.testing.assert_array_equal([s.terminated for s in after], [False, False, True])
     assert after[-1].obs[1] == 5 and env.episode_length == 3  # 7 raw steps hold 3 whole rows
+    _, *after = steps(ActionRepeat(Arriving(lives=(5, 5)), 2), [[0.0]] * 3)
+    np.testing.assert_array_equal([s.reward for s in after], [2, 2, 1])
+    np.testing.assert_array_equal([s.truncated for s in after], [False, False, True])
 
 
 def test_frames_are_stacked_newest_first():
