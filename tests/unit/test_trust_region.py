@@ -119,14 +119,17 @@ def test_the_line_search_stays_where_it_is_when_nothing_is_finite():
     assert not accepted and x[0] == 1.0
 
 
-def natural(step, **options):
-    """The flat step taken, its gradient and Fisher matrix (dense), the metrics, and the config."""
+def natural(step, bend=0.0, **options):
+    """The flat step taken, its gradient and Fisher matrix (dense), the metrics, and the config.
+
+    bend: of the objective, which loses so much times the square of the step.
+    """
     cfg = TRPOConfig(hidden=(4,), cg_iterations=60, **options)
-    return *taken(step, cfg), cfg
+    return *taken(step, cfg, bend), cfg
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=FAST)
-def taken(step, cfg):
+def taken(step, cfg, bend):
     keys = jax.random.split(jax.random.key(0), 3)
     actor = init_params(keys[0], jnp.zeros(3), 2, cfg)["actor"]
     obs = jax.random.normal(keys[1], (256, 3))
@@ -135,11 +138,14 @@ def taken(step, cfg):
     adv = action.sum(-1) - action.sum(-1).mean()
     batch = Batch(obs, action, log_prob(old, action), old, adv, adv, adv, adv)
 
+    start, unravel = ravel_pytree(actor)
+
     def objective(actor, batch):
-        return plain(action_dist(actor, batch.obs, cfg), batch, batch.adv_r, cfg)
+        gain, found = plain(action_dist(actor, batch.obs, cfg), batch, batch.adv_r, cfg)
+        return 1 + gain - bend * jnp.square(ravel_pytree(actor)[0] - start).sum(), found
 
     after, _, metrics = step.update(actor, (), objective, batch, context(cfg))
-    start, unravel = ravel_pytree(actor)
+    metrics["gained"] = objective(after, batch)[0] - objective(actor, batch)[0]
     g = jax.grad(lambda x: objective(unravel(x), batch)[0])(start)
     hessian = jax.hessian(lambda x: kl(old, action_dist(unravel(x), obs, cfg)).mean())(start)
     metrics["from old to new"] = kl(old, action_dist(after, obs, cfg)).mean()
@@ -166,3 +172,11 @@ def test_a_trust_region_step_is_the_natural_one_shortened_until_it_holds():
     np.testing.assert_allclose(step, shrunk * long, rtol=1e-3, atol=1e-5)
     _, _, _, unsearched, _ = natural(natural_gradient, target_kl=0.5, damping=1e-3)
     assert (unsearched["train/kl"] > cfg.target_kl) == (metrics["train/line_search"] > 0)
+
+
+def test_a_trust_region_step_never_lowers_its_objective():
+    long, *_ = natural(natural_gradient, bend=20.0, target_kl=0.01)
+    step, _, _, metrics, _ = natural(trust_region, bend=20.0, target_kl=0.01)
+    assert metrics["train/accepted"] == 1 and 0 <= metrics["gained"] < 1
+    np.testing.assert_allclose(metrics["train/objective"], metrics["gained"], rtol=1e-3, atol=1e-6)
+    assert metrics["train/kl"] < 0.01 and jnp.linalg.norm(step) < 0.95 * jnp.linalg.norm(long)
