@@ -92,6 +92,11 @@ def test_the_loss_of_f_is_the_mean_of_u_less_lam_h_over_the_violations():
     np.testing.assert_allclose(loss(core.barrier), by_hand.mean(), atol=1e-6)
     kept, _ = certificate.barrier_loss(line(), core, s, lower, 1e3, cfg)
     np.testing.assert_allclose(kept(core.barrier), by_hand.mean(), atol=1e-6)  # h is h_ref still
+    other = certificate.init_barrier(jax.random.key(1), 1, cfg)
+    kept, _ = certificate.barrier_loss(line(), core, s, other, 10.0, cfg)
+    risen = np.maximum(0, line().h(core.barrier, s, cfg) - line().h(other, s, cfg))
+    assert risen.any()
+    np.testing.assert_allclose(kept(core.barrier), by_hand.mean() + 10 * risen.mean(), rtol=1e-5)
 
 
 def test_the_certified_policy_takes_over_exactly_where_no_candidate_is_allowed():
