@@ -419,7 +419,7 @@ def test_each_network_moves_along_its_own_objective_alone():
     cfg = jax.tree.map(
         jnp.float32,
         dataclasses.replace(CFG, n_step=3, batch_size=8, max_grad_norm=float("inf"), tau=0.1,
-                            discount=0.9, cost_discount=0.8, td_lambda=0.7),
+                            discount=0.9, cost_discount=0.8, td_lambda=0.7, editor_min_prob=0.25),
     )  # fmt: skip
     learner, batch = seditor.seditor_learner(Lever()), batch_of(jax.random.key(5))
     dual = seditor.init_soft_multiplier(dataclasses.replace(cfg, lam_init=jnp.float32(2)))
@@ -493,8 +493,11 @@ def test_each_network_moves_along_its_own_objective_alone():
         for x, y in zip(jax.tree.leaves(expected), jax.tree.leaves(found), strict=True):
             np.testing.assert_allclose(-0.1 * x, y, rtol=1e-3, atol=1e-6)
             assert jnp.abs(y).max() > 1e-5
-    for name, entropy in (("log_alpha", "train/entropy"), ("log_alpha_editor", "train/entropy_editor")):
-        aim = 2 * math.log(0.2)
+    for name, entropy, share in (
+        ("log_alpha", "train/entropy", 0.2),
+        ("log_alpha_editor", "train/entropy_editor", 0.5),
+    ):
+        aim = 2 * math.log(share)
         np.testing.assert_allclose(
             after.opt_state[name][0].mu, 0.1 * (metrics[entropy] - aim), rtol=1e-5
         )
