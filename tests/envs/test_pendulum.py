@@ -60,9 +60,14 @@ def test_the_pendulum_moves_as_in_gymnasium():
 
 
 def test_a_pendulum_turns_by_8_rad_a_second_at_most():
+    theirs: Any = gymnasium.make("Pendulum-v1").unwrapped
+    theirs.reset()
+    theirs.state = np.array([0.5, 7.9])
+    theirs.step(np.array([2.0]))
     env = envs.make("pendulum_upright")
     start = env.reset(jax.random.key(0))
     fast = env.step(start.replace(physics=jnp.array([0.5, 7.9])), jnp.ones(1))
+    np.testing.assert_allclose(fast.obs, theirs.state, rtol=1e-6)
     assert fast.obs[1] == 8.0  # 7.9 and 0.05 (15 sin(0.5) + 6) are more
 
 
