@@ -1,5 +1,6 @@
 """Barrier certificates, by hand on a line and in full on the true pendulum."""
 
+import dataclasses
 import math
 from types import SimpleNamespace
 
@@ -198,6 +199,53 @@ def test_a_certified_region_is_never_left_on_the_true_pendulum():
     cost, height, overruled = run(jax.random.split(jax.random.key(1), 300))
     assert (cost == 0).all() and (height < 0).all()
     assert 0.001 < overruled.mean() < 0.9
+
+
+FRESH = 100.0  # where `scripted_search` begins anew
+
+
+def scripted_search(monkeypatch, violations):
+    """What `certify` comes to where a walk counts its steps, where it begins anew from FRESH, 2 FRESH,
+    ... on, and those in `violations` find one. Each violation adds 1 to f."""
+
+    def counted(system, core, search, cfg):
+        return dataclasses.replace(search, z=search.z + 1)
+
+    def anew(system, barrier, key, cfg):
+        count = jax.random.key_data(key)[0] + 1
+        return Search(jnp.full((1, 1), count * FRESH), jnp.zeros(1), BOX, jnp.array([count, 0]))
+
+    def scripted(system, core, obs, reference, keep, cfg):
+        return lambda barrier: -barrier, jnp.isin(obs[:, 0], jnp.array(violations))
+
+    ascent = SimpleNamespace(update=lambda slope, state, net: (-slope, state))
+    for name, value in {"walk": counted, "begun": anew, "barrier_loss": scripted}.items():
+        monkeypatch.setattr(certificate, name, value)
+    monkeypatch.setattr(certificate, "decayed_adam", lambda *_: ascent)
+    begin = Search(jnp.zeros((1, 1)), jnp.zeros(1), BOX, jnp.zeros(2, jnp.uint32))
+    cfg = config(quiet_steps=3, check_steps=2, barrier_steps=30)
+    return certify(line(), Core(jnp.float32(0), (), ()), (), 0.0, (), begin, cfg)
+
+
+BOX = Box(jnp.zeros(1), jnp.ones(1))
+# It is quiet for 3 steps and then needs 2 of a search that began anew.
+CLOCK = [
+    ([], 3 + 2, 100, True),
+    ([1.0, 2.0], 2 + 3 + 2, 100, True),
+    ([3.0], 3 + 3 + 2, 100, True),
+    ([FRESH + 2], 3 + 2 + 3 + 2, 200, True),  # what is quiet need not be so anew
+    ([n * FRESH + 1 for n in range(1, 9)], 30, 700, False),
+]
+
+
+@pytest.mark.parametrize("violations, steps, begun, certified", CLOCK)
+def test_a_certificate_is_quiet_and_then_passes_a_search_that_begins_anew(
+    monkeypatch, violations, steps, begun, certified
+):
+    found = scripted_search(monkeypatch, violations)
+    assert (found.certified, found.at_once) == (certified, not violations)
+    assert found.steps == steps and found.search.z[0, 0] // FRESH * FRESH == begun
+    assert found.barrier == len([x for x in violations if x < begun + FRESH])  # each moved f, no more
 
 
 def test_an_environment_without_a_safe_set_is_refused():
