@@ -1,5 +1,7 @@
 """What a faithful rebuild of Safety Gym keeps, each worked out by hand."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +9,7 @@ import pytest
 from tasks import ROBOT_AT_ORIGIN, change, put, task, with_qpos
 
 from jaxsafe.envs import make
-from jaxsafe.envs.safety_gym import sensing
+from jaxsafe.envs.safety_gym import costs, sensing
 
 BARE = {"hazards_num": 0, "gremlins_num": 0, "vases_num": 0, "pillars_num": 0}
 UPRIGHT = (jnp.array([0.0, 0.0, 0.1]), jnp.eye(3))
@@ -188,6 +190,27 @@ def test_a_vase_costs_while_it_slides_untouched():
         after.costs[:, t.env.cost_names.index("vases_velocity")], [0, 1, 1, 1]
     )
     np.testing.assert_array_equal(after.cost, [0, 1, 1, 1])
+
+
+def test_a_vase_costs_its_speed_along_the_floor_and_how_far_it_is_from_its_place():
+    """One slides, one turns on the spot, one was moved, and one was moved a little."""
+    options: dict[str, Any] = {"constrain_indicator": False, "vases_displace_cost": 3.0}
+    t = task("point_goal2", **ROBOT_AT_ORIGIN, hazards_num=0, vases_num=1, **options)
+    vase, rows = (s("vases").start for s in (t.env.scene.qpos_slice, t.env.scene.qvel_slice))
+    state = t.begin()
+    place = state.physics.layout[:, t.env.place.slice("vases")][:, 0]
+    away = jnp.array([[0.0, 0.0], [0.0, 0.0], [0.03, 0.04], [5e-4, 0.0]])
+    state = with_qpos(state, slice(vase, vase + 2), place + away)
+    qvel = jnp.zeros_like(state.physics.bodies.qvel)
+    qvel = qvel.at[0, rows : rows + 2].set(jnp.array([3.0, 4.0])).at[1, rows + 5].set(5.0)
+    unread: Any = ()
+
+    def paid(world: Any) -> jax.Array:
+        both = costs.vases_velocity, costs.vases_displace
+        return jnp.array([cost(t.env.arena, world, unread) for cost in both])
+
+    found = jax.vmap(paid)(change(state, {"qvel": qvel}).physics)
+    np.testing.assert_allclose(found, [[5, 0], [0, 0], [0, 0.15], [0, 0]], rtol=1e-4, atol=1e-6)
 
 
 def test_the_vase_of_level_one_is_free():
