@@ -21,7 +21,7 @@ from jaxsafe.algos import ALGOS, ambs, dreamer
 from jaxsafe.config import ConfigError
 from jaxsafe.learn import dreaming
 from jaxsafe.learn.acting import Learned, Player
-from jaxsafe.learn.dreaming import Judged, Scene, no_range
+from jaxsafe.learn.dreaming import Judged, Range, Scene, no_range
 from jaxsafe.learn.next_step_rollout import collect_records, started
 from jaxsafe.learn.replay import Record
 from jaxsafe.learn.rollout import init_rollout
@@ -215,6 +215,7 @@ class Heard:
     with_rows: the critics that also learn from the rows.
     found: the advantages before penalties.
     loss: the sum of losses, each of which is 1.
+    memory: what is remembered.
     """
 
     def __init__(self) -> None:
@@ -224,9 +225,10 @@ class Heard:
         self.with_rows: list[str] = []
         self.found: list[ambs.Advantages] = []
         self.loss: Any = None
+        self.memory: Any = None
 
 
-def listen(monkeypatch, says: dict[str, Any], cfg: Any, **critics: Any) -> Heard:
+def listen(monkeypatch, says: dict[str, Any], cfg: Any, past: Any = None, **critics: Any) -> Heard:
     """`ambs.learn`, where the actor number i dreams `says`, float [2, H + 1, S] by name, at i: 0 is the
     task's policy, 1 the safe one. `features` are i everywhere. A critic of cost says what `critics` has
     under its name, or 0. The safe policy's critic says the features."""
@@ -272,8 +274,8 @@ def listen(monkeypatch, says: dict[str, Any], cfg: Any, **critics: Any) -> Heard
     unused: Any = None
     scene = Listening(unused, unused, params, batch, unused, (), cfg, None)
     actors = {"actor": jnp.float32(0), "safe": jnp.float32(1)}
-    memory = ambs.shielded_behaviour.memory(cfg)
-    heard.loss = ambs.learn(actors, memory, scene, jax.random.key(0)).loss
+    past = past or ambs.shielded_behaviour.memory(cfg)
+    heard.loss, heard.memory, _ = ambs.learn(actors, past, scene, jax.random.key(0))
     return heard
 
 
@@ -306,6 +308,26 @@ def test_each_policy_and_critic_learns_of_the_dreams_that_are_its_own(monkeypatc
     np.testing.assert_allclose(task, reward[0, 1:] - 0.5 + 2 * (-cost[0, 1:] - 0.5), rtol=1e-5)
     (found,) = heard.found
     assert (found.value_safe == 0).all()  # V_safe in the task's dreams
+
+
+def test_each_advantage_is_divided_by_the_range_of_its_own_returns(monkeypatch):
+    """Ranges of 2, 3 and 4 move by a hundredth towards those of the rewards, which are 50 wide, and of
+    the costs of either policy, 8 and 6 wide."""
+    ramp = jnp.linspace(0, 1, 101).reshape(1, 1, 101) / 0.9 * jnp.ones((2, 2, 1))
+    cost = ramp * jnp.array([8.0, 6.0]).reshape(2, 1, 1)
+    ones = jnp.ones_like(ramp)
+    says = {"reward": 50 * ramp, "cost": cost, "cont": ones, "safe": ones}
+    widths = {"reward": 2.0, "penalty": 3.0, "safe": 4.0}
+    past = {name: Range(jnp.float32(0), jnp.float32(x)) for name, x in widths.items()}
+    cfg = dataclasses.replace(CFG, penalty="none", least_scale=1e-3)
+    heard = listen(monkeypatch, says, cfg, past)
+    now = {"reward": 2 + 0.01 * 48, "penalty": 3 + 0.01 * 5, "safe": 4 + 0.01 * 2}
+    for name, width in now.items():
+        np.testing.assert_allclose(heard.memory[name].scale(0.0), width, rtol=1e-5)
+    (found,), (_, safe) = heard.found, heard.climbed[0]
+    np.testing.assert_allclose(found.reward, (50 * ramp[0, 1:] - 0.5) / now["reward"], rtol=1e-5)
+    np.testing.assert_allclose(found.penalty, (-cost[0, 1:] - 0.5) / now["penalty"], rtol=1e-5)
+    np.testing.assert_allclose(safe, (-cost[1, 1:] - 0.5) / now["safe"], rtol=1e-5)
 
 
 def test_what_copt_sums_goes_on_after_a_violation(monkeypatch):
@@ -592,6 +614,30 @@ def test_dreams_begin_with_the_proposed_action_if_told_to(monkeypatch):
 
     assert (p(1.0), p(-2.0)) == (1, 1)
     assert (p(1.0, verify_action=True), p(-2.0, verify_action=True)) == (1, 0)
+
+
+def test_a_dream_is_read_state_by_state_and_the_critics_are_asked_at_its_end(monkeypatch):
+    """In a model that counts steps: a cost lies within [0, C], and the episode goes on where that is
+    likelier than not."""
+
+    class Counting(Chain):
+        def imagine(self, latent, action, key):
+            return Latent(latent.deter + 1, latent.stoch)
+
+    def says(world, params, x):
+        of_steps = {"cost": [-5.0, 4.0, 25.0], "cont": [0.51, 0.49, 1.0], "safe": [1.0, 1.0, 1.0]}
+        return {name: jnp.array(told)[x[..., 0].astype(int) - 1] for name, told in of_steps.items()}
+
+    monkeypatch.setattr(ambs, "world_of", lambda *_: Counting())
+    monkeypatch.setattr(ambs, "chosen", lambda *_: jnp.zeros(2))
+    monkeypatch.setattr(ambs, "safety_value", lambda params, features, cfg: features[..., 0])
+    monkeypatch.setattr(ambs, "read", says)
+    cfg = dataclasses.replace(CFG, shield_steps=3, shield_rollouts=2)
+    learned, latent = Learned(cfg, {"model": ()}, (), ()), Latent(jnp.zeros(1), jnp.zeros(1))
+    found = ambs.dreamt(Corridor(), learned, latent, jnp.zeros(2), jax.random.key(0))
+    np.testing.assert_array_equal(found.cost, [[0, 0], [4, 4], [10, 10]])
+    np.testing.assert_array_equal(found.alive, [[True, True], [False, False], [True, True]])
+    np.testing.assert_array_equal(found.value, [3, 3])
 
 
 def test_violations_and_ends_are_drawn_apart(monkeypatch):
