@@ -12,6 +12,7 @@ import optax
 import pytest
 import scipy.stats
 from compiling import FAST
+from jax.flatten_util import ravel_pytree
 from learners import likeliest_latents
 from toys import START, Corridor, Ticker
 
@@ -94,6 +95,54 @@ def test_the_divergence_of_latents_is_summed_over_them():
     p, q = jnp.log(jnp.array([[0.5, 0.5], [0.9, 0.1]])), jnp.log(jnp.array([[0.25, 0.75], [0.9, 0.1]]))
     np.testing.assert_allclose(rssm.kl(p, q), 0.5 * np.log(2) + 0.5 * np.log(2 / 3), rtol=1e-5)
     assert rssm.kl(p, p) == 0
+
+
+def test_the_memory_by_hand():
+    """Two blocks of two units: h <- s(g - 1) tanh(s(r) c) + (1 - s(g - 1)) h."""
+    size = rssm.Size(4, 3, classes=2, units=3, channels=(), latents=2, layers=1, blocks=2)
+    unit, keys = rssm.Memory(size), jax.random.split(jax.random.key(0), 4)
+    h, z, a = (jax.random.normal(key, (n,)) for key, n in zip(keys, (4, 4, 1), strict=False))
+    latent = rssm.Latent(h, z)
+    flat, unravel = ravel_pytree(unit.init(keys[3], latent, a))
+    params: Any = unravel(jax.random.normal(keys[3], flat.shape))
+    found: Any = unit.apply(params, latent, a)
+    p = params["params"]
+
+    def sigmoid(x):
+        return 1 / (1 + np.exp(-x))
+
+    def normed(x, norm):
+        x = x / np.sqrt((x**2).mean() + 1e-4) * norm["scale"]
+        return x * sigmoid(x)
+
+    def hidden(x, layer):
+        return normed(x @ layer["Dense_0"]["kernel"] + layer["Dense_0"]["bias"], layer["RMSNorm_0"])
+
+    def of_blocks(x, layer):
+        rows = zip(x, layer["kernel"], layer["bias"], strict=True)
+        return np.array([x @ kernel + bias for x, kernel, bias in rows])
+
+    u = np.concatenate([hidden(x, p[f"Hidden_{i}"]) for i, x in enumerate((h, z, a))])
+    inputs = np.array([np.concatenate([x, u]) for x in h.reshape(2, 2)])
+    y = normed(of_blocks(inputs, p["BlockDense_0"]).reshape(4), p["RMSNorm_0"]).reshape(2, 2)
+    r, c, g = of_blocks(y, p["BlockDense_1"]).reshape(2, 3, 2).swapaxes(0, 1).reshape(3, 4)
+    expected = sigmoid(g - 1) * np.tanh(sigmoid(r) * c) + (1 - sigmoid(g - 1)) * h
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_the_model_takes_actions_as_environments_do_with_a_gradient_beyond_the_bounds():
+    action = jnp.array([-3.0, -1.0, 0.5, 4.0])
+    np.testing.assert_array_equal(rssm.within(action), [-1, -1, 0.5, 1])
+    slope = jax.grad(lambda x: rssm.within(x).sum())(action)
+    np.testing.assert_allclose(slope, [1 / 3, 1, 1, 1 / 4], rtol=1e-6)
+
+
+def test_an_actor_s_outputs_are_a_mean_within_bounds_and_a_deviation_from_a_tenth_to_1():
+    """tanh, and 0.1 + 0.9 sigmoid(x + 2)."""
+    found = world_model.policy_of(jnp.array([0.5, -9.0, 0.0, -2.0]))
+    np.testing.assert_allclose(found.mean, np.tanh([0.5, -9.0]), rtol=1e-5)
+    std = 0.1 + 0.9 / (1 + np.exp([-2.0, 0.0]))
+    np.testing.assert_allclose(jnp.exp(found.log_std), std, rtol=1e-5)
 
 
 # ---- returns, weights, percentiles, steps ---------------------------------------------------------
