@@ -10,7 +10,7 @@ import numpy as np
 from toys import Corridor
 
 from jaxsafe.algos import ALGOS, dreamer
-from jaxsafe.learn.dreaming import Judged, Scene, no_range
+from jaxsafe.learn.dreaming import Judged, Range, Scene, no_range
 from jaxsafe.learn.treatments import CappedPID
 from jaxsafe.learn.world_model import CHANCE
 from jaxsafe.nn.two_hot import BINS
@@ -24,6 +24,33 @@ class Averaging(Scene):
 
     def over_dreams(self, x: jax.Array) -> jax.Array:
         return x.mean()
+
+
+def test_advantages_are_divided_by_the_range_that_their_own_returns_have_moved():
+    """A range of 2 moves by a hundredth towards that of the returns, which is 50 wide."""
+    returns, value = jnp.linspace(0, 50 / 0.9, 101)[None], jnp.full((2, 101), 0.5)
+    heard: list[jax.Array] = []
+
+    def actor_loss(dreams, advantage):
+        heard.append(advantage)
+        return jnp.float32(3)
+
+    scene: Any = SimpleNamespace(
+        cfg=dreamer.DreamerConfig(),
+        axis_name=None,
+        batch=SimpleNamespace(rows=SimpleNamespace(reward=jnp.zeros((3, 2)))),
+        dream=lambda actor, key: SimpleNamespace(read={"reward": value}, entropy=returns),
+        judge=lambda *args: Judged(returns, value),
+        actor_loss=actor_loss,
+        critic_loss_with_rows=lambda *args: jnp.float32(4),
+        over_dreams=jnp.mean,
+    )
+    past = Range(jnp.float32(0), jnp.float32(2))
+    found = dreamer.learn_reward({"actor": ()}, past, scene, jax.random.key(0))
+    np.testing.assert_allclose(heard[0], (returns - 0.5) / 2.48, rtol=1e-5)
+    np.testing.assert_allclose(found.range.scale(0.0), 2.48, rtol=1e-5)
+    np.testing.assert_allclose(found.metrics["train/return_scale"], 2.48, rtol=1e-5)
+    assert found.loss == 7
 
 
 def test_the_multiplier_rises_by_the_violation_from_the_second_step_on():

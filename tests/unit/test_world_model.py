@@ -156,6 +156,20 @@ def test_the_returns_of_dreams_by_hand():
     np.testing.assert_allclose(got, [[4.1875], [4.5]])
 
 
+def test_dreams_are_judged_by_the_critic_that_is_asked_as_far_as_td_lambda_says(monkeypatch):
+    """The returns above, of a critic that says the state's number times its own."""
+    monkeypatch.setattr(Scene, "value", lambda self, critic, features: critic * features[..., 0])
+    cfg = dreamer.DreamerConfig(td_lambda=0.75, discount=0.9)
+    unused: Any = None
+    critics: Any = {"critic_r": 7.0, "critic_c": 2.0}
+    scene = Scene(Corridor(), unused, critics, unused, unused, (), cfg, None)
+    reward, value, cont = ([[9.0], [2.0], [3.0]], [[3.5], [2.0], [3.0]], [[0.1], [1.0], [0.5]])
+    dreams: Any = SimpleNamespace(features=jnp.array(value)[..., None], read={"cont": jnp.array(cont)})
+    judged = scene.judge("critic_c", dreams, jnp.array(reward), 0.5)
+    np.testing.assert_allclose(judged.returns, [[4.1875], [4.5]])
+    np.testing.assert_allclose(judged.advantage, [[4.1875 - 7], [4.5 - 4]])
+
+
 def test_a_dream_weighs_how_likely_it_still_goes_on():
     """k_0 is what happened, 1 or 0, and not what a head says. Then 0.5 k of each state."""
 
@@ -211,23 +225,57 @@ def test_a_dream_tells_of_each_state_the_action_that_leads_on_from_it():
     np.testing.assert_allclose(dreams.entropy, scipy.stats.norm.entropy(*dist), rtol=1e-4)
 
 
-def test_a_critic_is_told_of_each_state_the_return_that_follows_it(monkeypatch):
+def test_what_a_dream_tells_of_its_actions_is_a_function_of_the_actor_alone():
+    """Also by backprop, where states and actions are functions of the actor as well: the slopes of log
+    probabilities and entropies are those of reinforce, whose states and actions are fixed."""
+
+    class Adding:
+        def apply(self, params, *args, method):
+            return getattr(self, method)(*args)
+
+        def imagine(self, latent, action, key):
+            return rssm.Latent(latent.deter + action, latent.stoch)
+
+        def read(self, features):
+            return {"cont": features[..., :1]}
+
+    def actor(params, features):
+        x = params * features[..., :1]
+        return Gaussian(jnp.sin(x), 0.1 * x)
+
+    world: Any = Adding()
+    start = rssm.Latent(jnp.linspace(-3, 3, 6)[:, None], jnp.zeros((6, 1)))
+
+    def told(params, actor_grad):
+        cfg = dreamer.DreamerConfig(imagine_steps=4, actor_grad=actor_grad)
+        dreams = world_model.dream(world, {}, actor, params, start, jnp.ones(6), jax.random.key(0), cfg)
+        return jnp.stack([x.sum() for x in (dreams.log_prob, dreams.entropy, dreams.features)])
+
+    slopes = {by: jax.jacobian(told)(jnp.float32(0.7), by) for by in ("reinforce", "backprop")}
+    np.testing.assert_allclose(slopes["backprop"][:2], slopes["reinforce"][:2], rtol=1e-5)
+    assert slopes["reinforce"][2] == 0 and abs(slopes["backprop"][2]) > 0.1
+
+
+@pytest.mark.parametrize("limit_ends", [False, True])
+def test_a_critic_is_told_of_each_state_the_return_that_follows_it(monkeypatch, limit_ends):
     """A critic that says the state's first number has nothing to learn, in dreams and of rows, where
-    the returns and rewards are those that make it right. An episode ends in one of the rows."""
+    the returns and rewards are those that make it right. An episode ends in one of the rows, or runs
+    out of time there, where that is an end."""
 
     def error(scene, trained, name, features, returns):
         return (features[..., 0] - returns) ** 2
 
     monkeypatch.setattr(Scene, "_loss", error)
     value = jax.random.normal(jax.random.key(0), (4, 2))  # of the rows
-    terminated = jnp.zeros((4, 2), bool).at[2, 0].set(True)
+    no = jnp.zeros((4, 2), bool)
+    ends = no.at[2, 0].set(True)
     discount = 0.5
-    earned = value[:-1] - discount * value[1:] * ~terminated[1:]
+    earned = value[:-1] - discount * value[1:] * ~ends[1:]
     reward = jnp.concatenate([jnp.full((1, 2), 9.0), earned])
-    zeros, no = jnp.zeros((4, 2, 1)), jnp.zeros((4, 2), bool)
-    rows = Record(zeros, zeros, reward, reward, zeros, no, terminated, no)
+    zeros, terminated, truncated = jnp.zeros((4, 2, 1)), ends & (not limit_ends), ends & limit_ends
+    rows = Record(zeros, zeros, reward, reward, zeros, no, terminated, truncated)
     latents = rssm.Latent(value[..., None], zeros)
-    cfg = dreamer.DreamerConfig(replay_value=1.0)
+    cfg = dreamer.DreamerConfig(replay_value=1.0, limit_ends=limit_ends)
     batch = SequenceBatch(rows, jnp.array([0.75, 0.25]))
     unused: Any = None
     scene: Any = Scene(Corridor(), unused, {}, batch, latents, (), cfg, None)
