@@ -410,12 +410,14 @@ def test_every_named_sensor_of_a_joint_is_observed(tmp_path):
     assert "heading" in env.observation_spec
 
 
-def test_the_reward_of_an_exception_is_an_option(tmp_path, monkeypatch):
+def test_the_reward_of_an_exception_is_an_option_and_its_cost_is_none(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # MuJoCo writes MUJOCO_LOG.TXT
-    t = task("point_goal0", reward_exception=-3.0)
+    t = task("point_goal1", reward_exception=-3.0, constrain_indicator=False, hazards_size=9.0)
     state = t.begin()
     after = t.idle(change(state, {"qvel": state.physics.bodies.qvel.at[1].set(jnp.inf)}))
     np.testing.assert_array_equal(after.reward == -3, [False, True, False, False])
+    np.testing.assert_array_equal(after.cost > 0, [True, False, True, True])
+    assert after.cost[1] == 0 and (after.costs[1] == 0).all()
 
 
 def test_frames_are_skipped_at_random():
