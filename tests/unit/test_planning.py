@@ -311,3 +311,19 @@ def test_mean_and_variance_keep_their_shares_of_what_they_were():
     proposals = (jnp.full((1, 2, 1), 0.5),)
     plan = cem(last, best_alone, jnp.ones((2, 1)), proposals, jax.random.key(0), cfg)
     np.testing.assert_allclose(plan, 0.5 + 0.3**2 * 0.5, rtol=1e-6)
+
+
+def test_a_plan_that_is_narrow_in_some_of_its_numbers_is_improved_further():
+    """Two plans share the weight. They agree on the first action alone, whose variance is soon 0."""
+    momenta: dict[str, Any] = {"mean_momentum": 0.3, "var_momentum": 0.5}
+    cfg = pets.PETSConfig(plans=4, plan_var=1.0, var_stop=0.3, cem_iterations=5, **momenta)
+
+    def score(plans, key):
+        return jnp.arange(6.0), jnp.zeros(6)
+
+    def last_two(ret, cost, cfg):
+        return 0.5 * (ret >= 4)
+
+    proposals = (jnp.array([[[0.5], [1.0]], [[0.5], [-1.0]]]),)
+    plan = cem(score, last_two, jnp.ones((2, 1)), proposals, jax.random.key(0), cfg)
+    np.testing.assert_allclose(plan[:, 0], [0.5 + 0.3**5 * 0.5, 0.3**5], rtol=1e-5)
