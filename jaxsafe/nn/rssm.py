@@ -153,7 +153,7 @@ class BlockDense(nn.Module):
 class Memory(nn.Module):
     """(latent, a) -> the next h, [..., D]: a gated recurrent unit whose weights are blocks.
 
-    u = [W_h h, W_z z, W_a a],   y = SiLU(norm(W_k [h_k, u])) for each block k
+    u = [W_h h, W_z z, W_a a],   x_k = W_k [h_k, u] for each block k,   y = SiLU(norm(x)), of all blocks
     r, c, g = V_k y_k;   h <- sigmoid(g - 1) tanh(sigmoid(r) c) + (1 - sigmoid(g - 1)) h
     """
 
