@@ -42,12 +42,11 @@ def iterations(train_cfg: TrainConfig, clocks: Clocks) -> int:
     Raises:
         ConfigError: an update does not take any of the steps that are to be counted.
     """
-    name, total, each, kind = "total_steps", train_cfg.total_steps, clocks.steps, "environment"
-    if train_cfg.total_updates is not None:
-        name, total, kind = "total_updates", train_cfg.total_updates, "gradient"
-        each = clocks.gradient_steps
+    name, total = end(train_cfg)
+    kinds = {"steps": ("environment", clocks.steps), "updates": ("gradient", clocks.gradient_steps)}
+    kind, each = kinds[name]
     if not each:
-        raise ConfigError(f"{name}={total}: the algorithm takes no {kind} steps")
+        raise ConfigError(f"total_{name}={total}: the algorithm takes no {kind} steps")
     return -(-total // each)
 
 

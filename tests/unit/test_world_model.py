@@ -196,26 +196,30 @@ def test_a_dream_weighs_how_likely_it_still_goes_on():
     np.testing.assert_allclose(dreams.read["cont"], [[1, 0], [0.8, 0.8], [0.25, 0.25]], rtol=1e-5)
 
 
+class Adding:
+    """A model that adds the actions up, and says that an episode goes on by as much."""
+
+    start = rssm.Latent(jnp.linspace(-3, 3, 6)[:, None], jnp.zeros((6, 1)))
+
+    def apply(self, params, *args, method):
+        return getattr(self, method)(*args)
+
+    def imagine(self, latent, action, key):
+        return rssm.Latent(latent.deter + action, latent.stoch)
+
+    def read(self, features):
+        return {"cont": features[..., :1]}
+
+
 def test_a_dream_tells_of_each_state_the_action_that_leads_on_from_it():
     """In a model that adds the actions up, by an actor whose mean and deviation depend on the state."""
-
-    class Adding:
-        def apply(self, params, *args, method):
-            return getattr(self, method)(*args)
-
-        def imagine(self, latent, action, key):
-            return rssm.Latent(latent.deter + action, latent.stoch)
-
-        def read(self, features):
-            return {"cont": jnp.ones((*features.shape[:-1], 1))}
 
     def actor(params, features):
         x = features[..., :1]
         return Gaussian(jnp.sin(x), 0.1 * x)
 
     world: Any = Adding()
-    start = rssm.Latent(jnp.linspace(-3, 3, 6)[:, None], jnp.zeros((6, 1)))
-    args = start, jnp.ones(6), jax.random.key(0), dreamer.DreamerConfig(imagine_steps=4)
+    args = Adding.start, jnp.ones(6), jax.random.key(0), dreamer.DreamerConfig(imagine_steps=4)
     dreams = world_model.dream(world, {}, actor, (), *args)
     x, action = np.asarray(dreams.features[..., 0]), np.asarray(dreams.action[..., 0])
     np.testing.assert_allclose(x[1:] - x[:-1], action, atol=1e-5)
@@ -229,26 +233,16 @@ def test_what_a_dream_tells_of_its_actions_is_a_function_of_the_actor_alone():
     """Also by backprop, where states and actions are functions of the actor as well: the slopes of log
     probabilities and entropies are those of reinforce, whose states and actions are fixed."""
 
-    class Adding:
-        def apply(self, params, *args, method):
-            return getattr(self, method)(*args)
-
-        def imagine(self, latent, action, key):
-            return rssm.Latent(latent.deter + action, latent.stoch)
-
-        def read(self, features):
-            return {"cont": features[..., :1]}
-
     def actor(params, features):
         x = params * features[..., :1]
         return Gaussian(jnp.sin(x), 0.1 * x)
 
     world: Any = Adding()
-    start = rssm.Latent(jnp.linspace(-3, 3, 6)[:, None], jnp.zeros((6, 1)))
 
     def told(params, actor_grad):
         cfg = dreamer.DreamerConfig(imagine_steps=4, actor_grad=actor_grad)
-        dreams = world_model.dream(world, {}, actor, params, start, jnp.ones(6), jax.random.key(0), cfg)
+        args = Adding.start, jnp.ones(6), jax.random.key(0), cfg
+        dreams = world_model.dream(world, {}, actor, params, *args)
         return jnp.stack([x.sum() for x in (dreams.log_prob, dreams.entropy, dreams.features)])
 
     slopes = {by: jax.jacobian(told)(jnp.float32(0.7), by) for by in ("reinforce", "backprop")}
