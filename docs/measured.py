@@ -127,20 +127,22 @@ def best() -> str:
     return "\n".join([summary, "", *lines])
 
 
-def mean_actions(training: Sequence[Group], final: Sequence[Group]) -> str:
-    """By how much mean actions earn and cost more than the sampled ones of training, by task: means
-    over algorithms with a limit."""
-    before = {(g.env, g.name): g for g in training}
+def mean_actions(runs: Sequence[SettingRun]) -> str:
+    """By how much the mean actions of final policies earn and cost more than their sampled ones, by
+    task: means over the algorithms with a limit that were evaluated both ways."""
     lines = ["| | algorithms | return | cost |", "|---|---:|---:|---:|"]
     found: dict[str, list[tuple[float, float]]] = {}
-    for g in final:
-        if constrained(g.name):
-            sampled = before[g.env, g.name]
-            change = g.ret.mean - sampled.ret.mean, g.cost.mean - sampled.cost.mean
-            found.setdefault(g.env, []).append(change)
+    for run in runs:
+        if constrained(run.config["algo.name"]) and "final sampled cost" in run.values:
+            means = {k: run.values[f"final {k}"].mean() for k in ("return", "cost")}
+            sampled = {k: run.values[f"final sampled {k}"].mean() for k in means}
+            found.setdefault(run.env, []).append(tuple(means[k] - sampled[k] for k in means))
     means = {env: np.mean(changes, axis=0) for env, changes in found.items()}
     for env, (ret, cost) in sorted(means.items(), key=lambda item: -item[1][1]):
         lines.append(f"| `{env}` | {len(found[env])} | {ret:+.1f} | {cost:+.1f} |")
+    every = np.array([change for changes in found.values() for change in changes])
+    ret, cost = (stats.estimate(x) for x in every.T)
+    lines.append(f"| all | {len(every)} | {cell(ret, '+.1f')} | {cell(cost, '+.1f')} |")
     return "\n".join(lines)
 
 
@@ -486,7 +488,7 @@ def pages() -> dict[Path, str]:
             "held": held(groups, final),
         },
         RESULTS / "cells.md": {"cells": cells.table(PUBLISHED)},
-        RESULTS / "causes" / "README.md": {"mean actions": mean_actions(groups, final)},
+        RESULTS / "causes" / "README.md": {"mean actions": mean_actions(runs)},
         RESULTS / "omnisafe" / "README.md": {
             "conventions": conventions(groups, group(theirs, ["algo.name"]))
         },
