@@ -27,7 +27,10 @@ def mean(rows: list[dict[str, str]], name: str, **where: str) -> float:
     return statistics.mean(float(row[name]) for row in found)
 
 
-@pytest.mark.parametrize("study", ["velocity", "velocity_settings", "off_policy"])
+@pytest.mark.parametrize(
+    "study",
+    ["velocity", "velocity_settings", "off_policy", "td3", "fast", "planning_velocity"],
+)
 @pytest.mark.parametrize("when", ["", "final "])
 def test_no_agent_within_the_limit_outruns_what_is_allowed(study, when):
     seeds = [row for row in rows_of(study) if row["env"] in CEILING and row[when + "cost"]]
