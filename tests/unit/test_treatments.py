@@ -97,7 +97,7 @@ def test_no_treatment_keeps_nothing_and_sees_only_reward():
 def test_the_controller_by_hand():
     cfg = CPPOPIDConfig(
         cost_limit=25.0,
-        lam_init=0.5,
+        lam_init=2.0,
         pid_kp=0.1,
         pid_ki=0.01,
         pid_kd=0.2,
@@ -105,17 +105,17 @@ def test_the_controller_by_hand():
         pid_delay=2,
     )
     dual = pid.init(cfg)
-    assert dual.lam == 0.5
+    assert dual.lam == 2.0
     dual = pid.update(dual, jnp.float32(35.0), cfg, 0)
-    # error 10: I = 0.5 + 0.1, P = 0.5 10, smoothed cost 17.5, which rose from 0
-    np.testing.assert_allclose(dual.lam, 0.1 * 5 + 0.6 + 0.2 * 17.5, rtol=1e-6)
+    # error 10: I = 2 + 0.1, P = 0.5 10, smoothed cost 17.5, which rose from 0
+    np.testing.assert_allclose(dual.lam, 0.1 * 5 + 2.1 + 0.2 * 17.5, rtol=1e-6)
     dual = pid.update(dual, jnp.float32(5.0), cfg, 0)
-    # error -20: I = 0.6 - 0.2, P = 0.5 5 - 10, smoothed cost 11.25, two iterations after 0
-    np.testing.assert_allclose(dual.lam, 0.1 * -7.5 + 0.4 + 0.2 * 11.25, rtol=1e-6)
+    # error -20: I = 2.1 - 0.2, P = 0.5 5 - 10, smoothed cost 11.25, two iterations after 0
+    np.testing.assert_allclose(dual.lam, 0.1 * -7.5 + 1.9 + 0.2 * 11.25, rtol=1e-6)
     dual = pid.update(dual, jnp.float32(5.0), cfg, 0)
-    # I = 0.4 - 0.2, P = -3.75 - 10, smoothed cost 8.125, below the 17.5 of two iterations ago
-    np.testing.assert_allclose(dual.lam, 0.0, atol=1e-7)
-    for _ in range(5):
+    # I = 1.9 - 0.2, P = -3.75 - 10, smoothed cost 8.125: that it fell from 17.5 takes nothing off
+    np.testing.assert_allclose(dual.lam, 0.1 * -13.75 + 1.7, rtol=1e-5)
+    for _ in range(8):
         dual = pid.update(dual, jnp.float32(0.0), cfg, 0)
     assert dual.integral == 0 and dual.lam == 0  # neither winds up below
 
