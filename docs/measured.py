@@ -14,6 +14,7 @@ import cells
 import matplotlib.pyplot as plt
 import numpy as np
 
+from jaxsafe.commands.study import states
 from jaxsafe.report import plots, scores, stats, studies, trade_off
 from jaxsafe.report.comparison_tables import SCORES, aggregates
 from jaxsafe.report.group import Group, group, has_limit, ordered, suite
@@ -144,6 +145,17 @@ def mean_actions(runs: Sequence[SettingRun]) -> str:
     ret, cost = (stats.estimate(x) for x in every.T)
     lines.append(f"| all | {len(every)} | {cell(ret, '+.1f')} | {cell(cost, '+.1f')} |")
     return "\n".join(lines)
+
+
+def left() -> str:
+    """Which studies have runs that were cut off or are not begun, and how many of how many are done."""
+    counts = []
+    for path in sorted(RESULTS.glob("*/study.yaml")):
+        study = studies.read(path.parent)
+        done = list(states(study).values()).count("done")
+        if done < len(study.runs):
+            counts.append(f"[{study.title}]({path.parent.name}/README.md) {done} of {len(study.runs)}")
+    return f"All runs are done but in these studies: {', '.join(counts)}."
 
 
 def apart(groups: Sequence[Group], known: Mapping[tuple[str, str], Published]) -> str:
@@ -481,6 +493,7 @@ def pages() -> dict[Path, str]:
             "matrix": apart(groups, {}),
             "evaluated": apart(final, PUBLISHED),
             "held": held(groups, final),
+            "left": left(),
         },
         RESULTS / "published.md": {
             "best": best(),

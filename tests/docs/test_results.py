@@ -1,13 +1,15 @@
 """What the results pages say must hold of the runs that they are made from."""
 
 import itertools
+import re
 import statistics
 from collections import Counter
 from pathlib import Path
 
 import pytest
 
-from jaxsafe.report import study_files
+from jaxsafe.commands.study import states
+from jaxsafe.report import studies, study_files
 
 RESULTS = Path(__file__).parents[2] / "docs" / "results"
 # the return of an episode at the velocity that is just allowed, from the thresholds
@@ -25,6 +27,18 @@ def mean(rows: list[dict[str, str]], name: str, **where: str) -> float:
     """Over the seeds of the rows with these values."""
     found = [row for row in rows if all(part in row[key] for key, part in where.items())]
     return statistics.mean(float(row[name]) for row in found)
+
+
+@pytest.mark.parametrize("name", sorted(path.parent.name for path in RESULTS.glob("*/study.yaml")))
+def test_a_page_counts_the_runs_of_its_study_that_are_done(name):
+    found = list(states(studies.read(RESULTS / name)).values())
+    text = (RESULTS / name / "README.md").read_text()
+    words = {"None": "0", "One": "1", "Eight": "8", "four": "4", "nine": "9"}
+    counted = re.findall(r"(\w+) (?:of )?(?:the )?(\w+) runs (?:is|are) (?:done|begun)", text)
+    for done, of in counted:
+        of = words.get(of, of)
+        done = of if done == "All" else words.get(done, done)
+        assert (done, of) == (str(found.count("done")), str(len(found)))
 
 
 @pytest.mark.parametrize(
