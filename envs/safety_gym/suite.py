@@ -246,7 +246,7 @@ def alias(name: str) -> str:
     """Safety Gym's id of a name: car_push1 -> Safexp-CarPush1-v0."""
     robot, task = name.split("_", 1)
     head = "Testing" if task.startswith("grid") else "Safexp"
-    task = task.replace("gridwall", "GridWall").capitalize() if task != "gridwall" else "GridWall"
+    task = "GridWall" if task == "gridwall" else task.capitalize()
     return f"{head}-{robot.capitalize()}{task}-v0"
 
 
