@@ -221,17 +221,14 @@ def model_loss(
     prior, posterior = believed
     fixed = jax.lax.stop_gradient
 
-    def mean(x: jax.Array) -> jax.Array:
-        return (batch.weight * x.mean(0)).sum()
-
     decoded = world.apply(params, latents, method="decode")
     read: Any = world.apply(params, latents.features, method="read")
-    losses = {"obs": mean(world.decoder.loss(decoded, batch.rows.obs))}
-    losses |= {name: mean(head_loss(read[name], target)) for name, target in targets.items()}
-    dyn = mean(jnp.maximum(cfg.free_nats, kl(fixed(posterior), prior)))
-    rep = mean(jnp.maximum(cfg.free_nats, kl(posterior, fixed(prior))))
+    losses = {"obs": batch.mean(world.decoder.loss(decoded, batch.rows.obs))}
+    losses |= {name: batch.mean(head_loss(read[name], target)) for name, target in targets.items()}
+    dyn = batch.mean(jnp.maximum(cfg.free_nats, kl(fixed(posterior), prior)))
+    rep = batch.mean(jnp.maximum(cfg.free_nats, kl(posterior, fixed(prior))))
     metrics = {f"train/model_{name}_loss": loss for name, loss in losses.items()}
-    metrics |= {"train/model_kl": mean(kl(posterior, prior))}
+    metrics |= {"train/model_kl": batch.mean(kl(posterior, prior))}
     total = sum(losses.values()) + cfg.dyn_scale * dyn + cfg.rep_scale * rep
     if cfg.overshoot:
         ahead = overshoot_loss(world, params, batch, latents, targets, jax.random.fold_in(key, 1), cfg)
