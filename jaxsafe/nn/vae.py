@@ -12,20 +12,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxsafe.nn.gaussian import Gaussian, kl
-from jaxsafe.nn.networks import LOG_STD, MLP
+from jaxsafe.nn.gaussian import Gaussian, kl, sample
+from jaxsafe.nn.networks import LOG_STD, MLP, coarse_mlp
 from jaxsafe.types import PyTree
 
 
 def net(cfg: Any, out: int) -> MLP:
-    return MLP(
-        cfg.vae_hidden,
-        out,
-        cfg.init,
-        cfg.activation,
-        precision=jax.lax.Precision.DEFAULT,
-        hidden_dtype=cfg.hidden_dtype,
-    )
+    return coarse_mlp(cfg, out).clone(hidden=cfg.vae_hidden)
 
 
 def init_vae(key: jax.Array, obs_size: int, action_size: int, cfg: Any) -> PyTree:
@@ -63,7 +56,7 @@ def vae_losses(
     """The squared error of the reconstruction, a mean over action numbers, and KL(q(z | s, a) ||
     N(0, 1)), a mean over latent numbers: float [B] each."""
     q = encode(vae, obs, action, cfg)
-    z = q.mean + jnp.exp(q.log_std) * jax.random.normal(key, q.mean.shape)
+    z = sample(q, key)
     error = ((decode(vae, obs, z, cfg) - action) ** 2).mean(-1)
     prior = Gaussian(jnp.zeros_like(q.mean), jnp.zeros_like(q.mean))
     return error, kl(q, prior) / z.shape[-1]
