@@ -30,6 +30,7 @@ from jaxsafe.learn.dreaming import (
     seen,
 )
 from jaxsafe.learn.off_policy import off_policy
+from jaxsafe.learn.planning import particles_of
 from jaxsafe.learn.row import Examined, Row
 from jaxsafe.learn.world_model import CHANCE, dream_returns, read, value_of, world_of
 from jaxsafe.nn.rssm import Latent
@@ -289,8 +290,7 @@ def dreamt(env: Env, learned: Learned, latent: Latent, proposed: jax.Array, key:
     cfg, params = learned.config, learned.params
     steps = cfg.shield_horizon if cfg.verdict == "drawn" else cfg.shield_steps
     world = world_of(env, shielded_behaviour.all_heads(cfg), cfg)
-    rollouts = (cfg.shield_rollouts,)
-    start = jax.tree.map(lambda x: jnp.broadcast_to(x, (*rollouts, *x.shape)), latent)
+    start = particles_of(latent, (cfg.shield_rollouts,))
 
     def step(now: Latent, x: tuple[jax.Array, jax.Array]) -> tuple[Latent, jax.Array]:
         h, key = x
