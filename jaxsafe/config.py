@@ -121,14 +121,10 @@ def fields_of(cls: type, *kinds: Any) -> list[str]:
     return [f.name for f in dataclasses.fields(cls) if hints[f.name] in kinds]  # type: ignore[arg-type]
 
 
-def float_fields(cls: type) -> list[str]:
-    return fields_of(cls, float)
-
-
 def is_float(cls: type, name: str) -> bool:
     """Whether `name` is a float of the config: 'clip', or by name as in 'cost_limits.hazards'."""
     field, _, inside = name.partition(".")
-    return field in (fields_of(cls, dict[str, float] | None) if inside else float_fields(cls))
+    return field in fields_of(cls, dict[str, float] | None if inside else float)
 
 
 def flat(values: dict[str, Any]) -> dict[str, Any]:

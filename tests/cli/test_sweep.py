@@ -14,7 +14,7 @@ import shell
 from toys import START, Corridor, run_episodes
 
 from jaxsafe import algos
-from jaxsafe.config import ConfigError, float_fields
+from jaxsafe.config import ConfigError, fields_of
 from jaxsafe.learn.offline import OfflineConfig, data_set_like
 from jaxsafe.report import plots, trade_off
 from jaxsafe.report.evaluation import evaluate
@@ -234,7 +234,7 @@ def test_every_float_of_every_algorithm_may_differ_between_members(name):
     }
     # a horizon that every `learn_every` divides
     cfg = kind(**small) if offline else kind(num_envs=256, horizon=80, **small)
-    other = replace(cfg, **{field: 0.25 for field in float_fields(kind)})
+    other = replace(cfg, **{field: 0.25 for field in fields_of(kind, float)})
     data = data_set_like(Corridor()) if offline else ()
     train = TrainConfig(num_seeds=2, total_updates=1) if offline else TrainConfig(num_seeds=2)
     program = build(Corridor(), algos.ALGOS[name].make, (cfg, other), train, data)
