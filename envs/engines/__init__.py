@@ -18,6 +18,7 @@ from jaxsafe.envs.engines.simulation import (
     Readings,
     Room,
     Simulation,
+    is_bad,
     mocap_at,
 )
 
@@ -31,6 +32,7 @@ __all__ = [
     "Room",
     "Simulation",
     "default_engine",
+    "is_bad",
     "make_engine",
     "mocap_at",
 ]

@@ -186,3 +186,8 @@ def mocap_at(base: Any, orbits: np.ndarray, time: Any, xp: Any) -> Any:
     """Where mocap bodies are at `time` (s), [..., nmocap, 3]: see `Simulation.orbits`."""
     circle = xp.stack([xp.sin(time), xp.cos(time), xp.zeros_like(time)], -1)
     return base + orbits[:, None] * circle[..., None, :]
+
+
+def is_bad(*parts: jax.Array) -> jax.Array:
+    """Whether a number is NaN or beyond MuJoCo's mjMAXVAL: the physics failed, bool []."""
+    return ~jnp.stack([(jnp.abs(x) < mujoco.mjMAXVAL).all() for x in parts]).all()

@@ -31,8 +31,6 @@ from jaxsafe.envs.safety_gym.arena import Arena, World
 from jaxsafe.envs.safety_gym.config import SafetyGymConfig
 from jaxsafe.types import PyTree, State
 
-MAX_VALUE = 1e10  # MuJoCo's mjMAXVAL: beyond it a state is bad
-
 
 class Drive(NamedTuple):
     """What the physics of a step is given, and the keys for what comes after it."""
@@ -227,9 +225,7 @@ class SafetyGym:
             terminated = success & ~found & cfg.terminate_resample_failure
         obs = self._observed(moved, readings, drive.ctrl)
 
-        bad = ~jnp.stack(
-            [(jnp.abs(x) < MAX_VALUE).all() for x in (physics.qpos, physics.qvel, physics.warmstart)]
-        ).all()
+        bad = engines.is_bad(physics.qpos, physics.qvel, physics.warmstart)
         kept = world.replace(key=key, steps=world.steps + 1)
         zero = jnp.zeros(())
         return State(

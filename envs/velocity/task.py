@@ -30,7 +30,6 @@ from jaxsafe.envs.velocity.config import ROBOTS, VelocityConfig
 from jaxsafe.types import State
 
 ASSETS = Path(__file__).parent / "assets"
-MAX_VALUE = 1e10  # MuJoCo's mjMAXVAL: beyond it a state is bad
 SEEN = ("cinert", "cvel", "qfrc_actuator", "cfrc_ext")  # what Humanoid observes beside its state
 
 
@@ -165,8 +164,7 @@ class Velocity:
         reward = cfg.forward_reward_weight * velocity[0] + cfg.healthy_reward * paid
         reward -= cfg.ctrl_cost_weight * jnp.square(ctrl).sum()
 
-        parts = (physics.qpos, physics.qvel, physics.warmstart, reward)
-        bad = ~jnp.stack([(jnp.abs(x) < MAX_VALUE).all() for x in parts]).all()
+        bad = engines.is_bad(physics.qpos, physics.qvel, physics.warmstart, reward)
         good: State = State(
             physics=World(physics, place),
             obs=self.observe(physics, readings),
