@@ -29,7 +29,7 @@ OURS: dict[str, Any] = {**SUITE, **suite.circles_and_runs(), **suite.seditor()}
 # that makes another environment
 ENVS: dict[str, Any] = {**OURS, **velocities.suite(), **racing.ROWS, **pendulum.ROWS}
 Config = SafetyGymConfig | VelocityConfig
-PLAIN = (type(None), bool, int, float, str, list, tuple, dict)
+PLAIN = (type(None), bool, int, float, str, list, tuple, dict)  # types of what a config file keeps
 ANY_ENV = "wrap"  # the option that every environment has
 OF_MAKE = ("engine", ANY_ENV)  # options of our environments that are no field of their config
 ALIASES: dict[str, str] = {suite.alias(name): name for name in SUITE}

@@ -13,6 +13,7 @@ from jaxsafe.config import ConfigError, flat, nearest
 from jaxsafe.envs import SafetyGym, Velocity, VelocityConfig
 from jaxsafe.envs.check import check_env
 from jaxsafe.envs.engines import default_engine
+from jaxsafe.envs.registry import PLAIN
 from jaxsafe.envs.wrap import Wrapper, innermost, wrap_config_of
 from jaxsafe.run.plain import to_plain
 from jaxsafe.run.progress import Reporter
@@ -20,7 +21,6 @@ from jaxsafe.run.settings import DEFAULT, EnvEntry, Extras, TrainConfig, find_en
 from jaxsafe.types import Algorithm, Env
 
 RUN_OPTIONS = [f.name for f in dataclasses.fields(TrainConfig)]
-PLAIN = (bool, int, float, str, list, tuple, dict, type(None))
 BY_OPTIONS = (dict, VelocityConfig)  # entries whose name and options say it all
 
 
