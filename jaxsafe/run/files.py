@@ -139,7 +139,7 @@ def in_turn(folder: Path) -> Iterator[None]:
         os.close(descriptor)
 
 
-def below(folder: Path, most: int = 100_000) -> list[str]:
+def below(folder: Path) -> list[str]:
     """The names of all files at any depth below a folder, sorted.
 
     Raises:
@@ -156,8 +156,8 @@ def below(folder: Path, most: int = 100_000) -> list[str]:
                     found.append(path.relative_to(folder).as_posix())
                 else:
                     raise ConfigError(f"{path} is {kind_of(path)}; expected a plain file")
-                if len(found) + len(todo) > most:
-                    raise ConfigError(f"{folder} holds more than {most:,} files")
+                if len(found) + len(todo) > 100_000:
+                    raise ConfigError(f"{folder} holds more than 100,000 files")
     return sorted(found)
 
 
