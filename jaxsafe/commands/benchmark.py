@@ -21,7 +21,6 @@ import statistics
 import subprocess
 import sys
 import time
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -240,12 +239,7 @@ def measure_peer(spec: str, sizes: dict[str, int]) -> list[dict]:
 def versions() -> dict[str, str]:
     packages = ("jax", "mujoco", "mujoco-mjx", "warp-lang", "jaxsafe")
     found = {"python": platform.python_version(), "device": device_name(), "cores": str(os.cpu_count())}
-    for package in packages:
-        try:
-            found[package] = version(package)
-        except ImportError:
-            continue
-    return found
+    return found | {name: x for name in packages if (x := run_folder.installed(name))}
 
 
 def show(row: dict) -> str:
