@@ -132,18 +132,6 @@ class SafetyGym:
         """Simulated seconds in a step."""
         return self.scene.model.opt.timestep * self.substeps
 
-    def robot_pose(self, world: World) -> tuple[jax.Array, jax.Array]:
-        """Position [3] and rotation [3, 3] (columns are the body's axes) of the robot."""
-        return self.arena.robot_pose(world)
-
-    def positions(self, world: World, kind: str) -> jax.Array:
-        """Current positions [n, 2] of the objects of a kind (m)."""
-        return self.arena.positions(world, kind)
-
-    def goal_position(self, world: World) -> jax.Array:
-        """Position [3] of the goal, or of the button to press; the origin where there is neither."""
-        return self.arena.goal_position(world)
-
     # Episode ---------------------------------------------------------------------------------------
 
     def reset(self, key: jax.Array) -> State:

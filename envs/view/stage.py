@@ -67,7 +67,7 @@ class Stage:
             radius = 2 * cfg.buttons_size
             size = (radius, min(radius, 0.3), 0)
             rgba = (*colour("button")[:3], 0.35)
-            self._add(geoms, "goal", CYLINDER, size, env.goal_position(world), rgba)
+            self._add(geoms, "goal", CYLINDER, size, env.arena.goal_position(world), rgba)
         if cfg.render_lidar_markers:
             self._mark_halo(geoms, state.obs)
         if state.cost > 0:

@@ -187,7 +187,7 @@ def test_a_linear_probe_tells_the_goals_bearing_from_pictures_and_not_from_shuff
         reset_key, bearing_key = jax.random.split(key)
         world, _ = env.begin(reset_key)
         bearing = jax.random.uniform(bearing_key, minval=-side, maxval=side)
-        x, y = env.goal_position(world)[:2] - world.start[:2]
+        x, y = env.arena.goal_position(world)[:2] - world.start[:2]
         qpos = world.bodies.qpos.at[2].set(jnp.arctan2(y, x) - bearing)
         return env._picture(world.replace(bodies=world.bodies.replace(qpos=qpos))), bearing
 

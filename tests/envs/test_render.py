@@ -74,13 +74,13 @@ def test_the_goal_is_green_where_it_is_and_only_there(display):
 def test_bodies_hazards_and_the_robot_are_drawn_where_the_state_has_them(display):
     env, state = reset("point_goal2", render_lidar_markers=False)
     frame = render.Renderer(env, WIDTH, HEIGHT, from_above()).frame(state).astype(int)
-    for xy in env.positions(state.physics, "hazards"):
+    for xy in env.arena.positions(state.physics, "hazards"):
         red, green, blue = frame[pixel(xy)]
         assert blue > max(red, green) + 30
-    for xy in env.positions(state.physics, "vases"):
+    for xy in env.arena.positions(state.physics, "vases"):
         red, green, blue = frame[pixel(xy)]
         assert min(green, blue) > red + 60
-    red, green, blue = frame[pixel(env.robot_pose(state.physics)[0])]
+    red, green, blue = frame[pixel(env.arena.robot_pose(state.physics)[0])]
     assert red > max(green, blue) + 60
 
 
@@ -90,7 +90,7 @@ def test_the_active_button_alone_is_marked_in_orange(display):
     for active in range(2):
         world = state.physics.replace(goal_button=jnp.int32(active))
         red, _, blue = np.moveaxis(renderer.frame(state.replace(physics=world)).astype(int), -1, 0)
-        beside = env.positions(world, "buttons") + jnp.array([0.15, 0.0])
+        beside = env.arena.positions(world, "buttons") + jnp.array([0.15, 0.0])
         marked = [bool((red - blue)[pixel(xy)] > 30) for xy in beside[:2]]
         assert marked == [active == 0, active == 1]
 
@@ -111,8 +111,8 @@ def test_the_halo_shows_the_lidars_of_the_observation(display, flat):
     assert {k: v.size for k, v in parts.items()} == {
         k: np.prod(v) for k, v in env.observation_spec.items()
     }
-    robot, _ = env.robot_pose(state.physics)
-    goal = env.goal_position(state.physics)
+    robot, _ = env.arena.robot_pose(state.physics)
+    goal = env.arena.goal_position(state.physics)
     closeness = 1 - jnp.linalg.norm((robot - goal)[:2]) / env.config.lidar_max_dist
     np.testing.assert_allclose(parts["goal_lidar"].max(), closeness, rtol=1e-3)
     renderer = render.Renderer(env, WIDTH, HEIGHT)
@@ -158,9 +158,9 @@ def test_seditor_s_goal_and_hazards_are_drawn_as_high_as_they_are():
         np.testing.assert_allclose((geom.size[2], geom.pos[2]), (0.2, 0.21), atol=1e-7)
     assert goal.size[0] == np.float32(env.config.buttons_size)
     np.testing.assert_allclose(
-        [hazard.pos[:2] for hazard in hazards], env.positions(state.physics, "hazards")
+        [hazard.pos[:2] for hazard in hazards], env.arena.positions(state.physics, "hazards")
     )
-    np.testing.assert_allclose(goal.pos[:2], env.goal_position(state.physics)[:2])
+    np.testing.assert_allclose(goal.pos[:2], env.arena.goal_position(state.physics)[:2])
     np.testing.assert_allclose(goal.rgba, [0, 1, 0, 0.25])
 
 

@@ -59,7 +59,7 @@ def test_the_goal_seen_is_the_button_to_press_and_not_the_mark():
     t = task("point_button1", **THEIRS)
     world = jax.tree.map(lambda x: x[0], t.begin().physics)
     button = world.layout[t.env.place.slice("buttons")][world.goal_button]
-    np.testing.assert_allclose(t.env.goal_position(world)[:2], button)
+    np.testing.assert_allclose(t.env.arena.goal_position(world)[:2], button)
 
 
 def test_the_box_is_placed_last():

@@ -81,8 +81,8 @@ def oracle(env, world):
     spec, cfg = stage.scene.spec, env.config
     cylinder = native.mjtGeom.mjGEOM_CYLINDER
     radius = cfg.buttons_size if cfg.task == "button" else cfg.goal_size
-    discs = [("goal", radius, env.goal_position(world)[:2])]
-    discs += [("hazard", cfg.hazards_size, xy) for xy in env.positions(world, "hazards")]
+    discs = [("goal", radius, env.arena.goal_position(world)[:2])]
+    discs += [("hazard", cfg.hazards_size, xy) for xy in env.arena.positions(world, "hazards")]
     for kind, radius, (x, y) in discs:
         size, place = (radius, 0.2, 0), (float(x), float(y), 0.21)
         spec.worldbody.add_geom(type=cylinder, size=size, pos=place, group=GROUP[kind], contype=0)

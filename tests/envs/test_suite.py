@@ -235,7 +235,7 @@ def test_an_episode_starts_at_rest_at_nominal_heights(robot):
     state = t.begin()
     physics = state.physics.bodies
     heights = {"point": 0.1, "car": 0.1, "doggo": 0.22}
-    position, _ = jax.vmap(t.env.robot_pose)(state.physics)
+    position, _ = jax.vmap(t.env.arena.robot_pose)(state.physics)
     np.testing.assert_allclose(position[:, 2], heights[robot], rtol=1e-6)
     vases = physics.qpos[:, t.env.scene.qpos_slice("vases")]
     np.testing.assert_allclose(vases[:, 2], 0.1 - 4e-5, rtol=1e-6)
