@@ -35,8 +35,6 @@ VARIANTS = {  # name -> options of the model, factors on the room for contacts a
     "room for rows x 0.6": ({}, 1.0, 0.6),
     "room for contacts x 0.6": ({}, 0.6, 1.0),
 }
-
-
 NAMES = ("qpos", "qvel", "qacc_warmstart", "mocap_pos", "mocap_quat")  # of MuJoCo's data
 
 

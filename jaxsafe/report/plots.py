@@ -31,8 +31,6 @@ RATES = {
     "train/overruled": "override rate of the shield",
 }
 PANELS = (("train/return", "return of an episode"), ("train/cost", "cost of an episode"))
-
-
 # what evaluation during training adds to a panel: end of the column's name -> label and marker
 EVALUATED = {"": ("evaluated, mean action", "o"), "_sampled": ("evaluated, sampled", "s")}
 

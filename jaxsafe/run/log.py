@@ -18,8 +18,6 @@ from jaxsafe.run.programs import Member, Program
 from jaxsafe.run.progress import Reporter
 
 OVERFLOW = "train/overflow"  # steps of an episode in which engine warp ran out of room
-
-
 SHOWN = {  # what the progress report shows: the first of these that is known
     "ret": ("train/return_estimate", "eval/return"),
     "cost": ("train/cost_estimate", "eval/cost"),

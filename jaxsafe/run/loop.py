@@ -155,9 +155,6 @@ def resumed(program: Program, store: Path, report: Reporter) -> Start:
     return Start(distributed.place(ts, program.sharding), iteration, since)
 
 
-LONGEST = 1800.0  # seconds from one checkpoint with a replay to the next, if they take longer than 5%
-
-
 class Saver:
     """When the loop saves, and what.
 
@@ -213,8 +210,8 @@ class Saver:
 
 def pause_after(took: float, every: float) -> float:
     """Seconds to the next checkpoint after one with a replay: `every` or more, so that they take at
-    most 5% of the time. One that a slow disk held up puts the next off by `LONGEST` at most."""
-    return max(every, min(19 * took, LONGEST))
+    most 5% of the time. One that a slow disk held up puts the next off by half an hour at most."""
+    return max(every, min(19 * took, 1800.0))
 
 
 def of_members(program: Program, learned: PyTree) -> PyTree:
