@@ -12,12 +12,10 @@ from jaxsafe.envs.registry import (
     make,
     register,
 )
-from jaxsafe.envs.safety_gym import suite
-from jaxsafe.envs.safety_gym.config import SafetyGymConfig, config_from_plain, defaults
+from jaxsafe.envs.safety_gym.config import SafetyGymConfig
 from jaxsafe.envs.safety_gym.task import SafetyGym
 from jaxsafe.envs.velocity.config import VelocityConfig
 from jaxsafe.envs.velocity.task import Velocity
-from jaxsafe.envs.wrap import raw_steps
 
 __all__ = [
     "ALIASES",
@@ -31,12 +29,8 @@ __all__ = [
     "VelocityConfig",
     "canonical",
     "check_options",
-    "config_from_plain",
-    "defaults",
     "env_defaults",
     "load",
     "make",
-    "raw_steps",
     "register",
-    "suite",
 ]

@@ -13,16 +13,14 @@ Source: the configs of OmniSafe after 0.5.0 (2025), and Safety Gym's Engine.
 """
 
 from jaxsafe.interop.migrate.families import FAMILIES, algorithms, family_of, find_environment
-from jaxsafe.interop.migrate.found import Line, Migrated, as_option, flatten, read_file, report
+from jaxsafe.interop.migrate.found import Migrated, flatten, read_file, report
 from jaxsafe.interop.migrate.from_engine import safety_gym
 from jaxsafe.interop.migrate.from_omnisafe import omnisafe
 
 __all__ = [
     "FAMILIES",
-    "Line",
     "Migrated",
     "algorithms",
-    "as_option",
     "family_of",
     "find_environment",
     "flatten",
