@@ -32,6 +32,7 @@ Config = SafetyGymConfig | VelocityConfig
 PLAIN = (type(None), bool, int, float, str, list, tuple, dict)  # types of what a config file keeps
 ANY_ENV = "wrap"  # the option that every environment has
 OF_MAKE = ("engine", ANY_ENV)  # options of our environments that are no field of their config
+OF_ENGINE = ("engine", "awake", "contact_room")  # options that leave a task what it is
 ALIASES: dict[str, str] = {suite.alias(name): name for name in SUITE}
 ALIASES |= {suite.their_id(name): name for name in [*suite.circles_and_runs(), *suite.ruled()]}
 ALIASES |= {alias: name for alias, (name, _) in velocities.aliases().items()}

@@ -6,8 +6,8 @@ from pathlib import Path
 from jaxsafe.commands import viewing
 from jaxsafe.commands.guard import guarded
 from jaxsafe.config import ConfigError
-from jaxsafe.report.film import check_one_task, check_video, film, labels
-from jaxsafe.run.policies import CODE
+from jaxsafe.report.film import check_video, film, labels
+from jaxsafe.run.policies import CODE, check_same_task
 
 
 def main() -> int:
@@ -34,7 +34,7 @@ def command() -> int:
     out = args.out or (Path("compared.mp4") if several else folders[0] / "video.mp4")
     check_video(out)
     policies = what.policies(args.index)
-    check_one_task(folders, policies)
+    check_same_task(folders, [policy.settings for policy in policies])
     names = labels(folders, [policy.settings.algo_name for policy in policies]) if several else None
     task = policies[0].settings.env_name
     print(f"filming {len(policies)} x 1 episode of {task} ...", file=sys.stderr)

@@ -11,8 +11,6 @@ from jaxsafe.envs.view.backend import NoDisplay
 from jaxsafe.run import files
 from jaxsafe.run.policies import RunPolicy
 
-OF_PHYSICS = ("engine", "awake")  # options that leave a task what it is
-
 
 class NoVideo(RuntimeError):
     """Nothing to render with. The message is one line for the user."""
@@ -47,22 +45,6 @@ def film(policies: list[RunPolicy], path: Path, seed: int, labels: list[str] | N
     path.parent.mkdir(parents=True, exist_ok=True)
     with files.replacing(path) as part:
         render.write_video(render.side_by_side(films), part)
-
-
-def check_one_task(folders: list[Path], policies: list[RunPolicy]) -> None:
-    """Raise ConfigError where layouts would differ."""
-    tasks = [
-        {"env": a.settings.env_name}
-        | {f"env.{k}": v for k, v in a.settings.env_options.items() if k not in OF_PHYSICS}
-        for a in policies
-    ]
-    for folder, task in zip(folders, tasks, strict=True):
-        for name, value in tasks[0].items():
-            if task[name] != value:
-                raise ConfigError(
-                    f"side by side, expected runs of one task: {name}={value} in {folders[0]}, "
-                    f"{task[name]} in {folder}"
-                )
 
 
 def labels(folders: list[Path], algos: list[str]) -> list[str]:

@@ -11,13 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxsafe
-from jaxsafe.config import Bounds, ConfigError, flat, one_line
+from jaxsafe.config import Bounds, ConfigError, one_line
 from jaxsafe.learn.acting import Player, Playing
 from jaxsafe.learn.constraints import cost_title, limits_of
 from jaxsafe.learn.observations import observation_like, vector_of, with_vector
 from jaxsafe.learn.offline import DataSet, data_set
 from jaxsafe.run import checkpoint, dataset, files, run_folder
-from jaxsafe.run.policies import RunPolicies
+from jaxsafe.run.policies import RunPolicies, check_same_task
 from jaxsafe.types import PyTree, State
 
 AT_ONCE = 1000  # episodes that one call of the compiled program plays, at most
@@ -97,20 +97,6 @@ def data_file(path: str | Path) -> Path:
     except OSError as error:
         raise ConfigError(f"out={out}: cannot write to {above}: {error.strerror}") from error
     return out
-
-
-def check_same_task(runs: Sequence[RunPolicies]) -> None:
-    """Raise ConfigError if the runs were trained on different environments."""
-    first = flat(runs[0].settings.plain()["env"])
-    for run in runs[1:]:
-        other = flat(run.settings.plain()["env"])
-        names = sorted({*first, *other} - {"engine", "name"})
-        for name in ("name", *names):  # another name is why other fields differ
-            if first.get(name) != other.get(name):
-                raise ConfigError(
-                    f"env.{name} is {first.get(name)} in {runs[0].folder}, {other.get(name)} in "
-                    f"{run.folder}; expected runs of the same task"
-                )
 
 
 def episode(player: Player, key: jax.Array, obs_size: int, sampled: bool) -> Steps:
@@ -195,7 +181,7 @@ def collect(
     Raises:
         ConfigError: runs of different tasks, or a run whose every episode has such numbers.
     """
-    check_same_task([x.run for x in ingredients])
+    check_same_task([x.run.folder for x in ingredients], [x.run.settings for x in ingredients])
     parts: list[dict[str, Any]] = []
     recipe = []
     for number, (run, share) in enumerate(ingredients):

@@ -40,6 +40,7 @@ import h5py
 import numpy as np
 
 from jaxsafe.config import ConfigError, flat, nearest, one_line
+from jaxsafe.envs.registry import OF_ENGINE
 from jaxsafe.learn.observations import vector_of
 from jaxsafe.learn.offline import DataSet, data_set
 from jaxsafe.run import checkpoint, files
@@ -71,7 +72,6 @@ MINARI = {  # Minari's name of what each step of an episode has -> the field
     "terminations": "terminated",
     "truncations": "truncated",
 }
-OF_ENGINE = ("engine", "awake", "contact_room")  # options that leave the task what it is
 BROKEN = (  # of files that hold something else
     OSError, ValueError, EOFError, TypeError, LookupError, RuntimeError, MemoryError, OverflowError,
     zipfile.BadZipFile, zlib.error,

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsafe.config import ConfigError, flat
+from jaxsafe.envs.registry import OF_ENGINE
 from jaxsafe.learn.acting import Player
 from jaxsafe.learn.offline import data_set_like
 from jaxsafe.run import checkpoint, files, run_folder
@@ -104,6 +105,19 @@ class RunPolicy(NamedTuple):
     @property
     def player(self) -> Player:
         return Player(self.algo.policy, self.learned, self.algo.task(self.learned))
+
+
+def check_same_task(folders: Sequence[Path], settings: Sequence[Settings]) -> None:
+    """Raise ConfigError if runs were trained on different environments."""
+    first, *others = (flat(each.plain()["env"]) for each in settings)
+    for folder, other in zip(folders[1:], others, strict=True):
+        names = sorted({*first, *other} - {"name", *OF_ENGINE})
+        for name in ("name", *names):  # another name is why other fields differ
+            if first.get(name) != other.get(name):
+                raise ConfigError(
+                    f"env.{name} is {first.get(name)} in {folders[0]}, {other.get(name)} in {folder}; "
+                    "expected runs of the same task"
+                )
 
 
 def member_policies(settings: Settings, env: Env, folder: Path) -> tuple[Algorithm, PyTree]:

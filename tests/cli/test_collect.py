@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,7 +17,7 @@ from toys import Corridor, Ticker
 import jaxsafe
 from jaxsafe.config import ConfigError
 from jaxsafe.learn.augment import Budget
-from jaxsafe.run import collect, dataset
+from jaxsafe.run import collect, dataset, policies
 from jaxsafe.run.dataset import other_task, read_about, read_dataset, write_dataset
 from jaxsafe.run.policies import open_run
 from jaxsafe.types import Policy
@@ -167,16 +168,19 @@ def test_a_disk_that_fails_at_the_end_is_one_line_and_status_1(run, tmp_path, ca
     assert not [*tmp_path.iterdir()]
 
 
-def test_two_tasks_are_told_by_their_names():
-    def of(env: str, **fields: int) -> Any:
-        plain = {"env": {"name": env, **fields}}
-        return SimpleNamespace(folder=env[-1], settings=SimpleNamespace(plain=lambda: plain))
+def test_two_tasks_are_told_by_their_names_and_options_but_not_by_their_engines():
+    def check(*tasks: dict[str, Any]) -> None:
+        settings: list[Any] = [SimpleNamespace(plain=lambda env=env: {"env": env}) for env in tasks]
+        policies.check_same_task([Path("a"), Path("b"), Path("c")][: len(tasks)], settings)
 
+    one = {"name": "task_a", "bounds": 2, "engine": "c", "awake": None, "contact_room": 1.0}
+    check(one)
+    check(one, one | {"engine": "warp", "awake": 2, "contact_room": 3.0})
     with pytest.raises(ConfigError) as error:
-        collect.check_same_task([of("task_a", bounds=2), of("task_b", bounds=0)])
+        check(one, {"name": "task_b", "bounds": 0})
     assert str(error.value) == "env.name is task_a in a, task_b in b; expected runs of the same task"
-    with pytest.raises(ConfigError, match=r"env\.bounds is 2 in a, 0 in a; expected runs of the same"):
-        collect.check_same_task([of("task_a", bounds=2), of("task_a", bounds=0)])
+    with pytest.raises(ConfigError, match=r"env\.bounds is 2 in a, 0 in c; expected runs of the same"):
+        check(one, one, one | {"bounds": 0})
 
 
 def test_each_policy_meets_the_task_as_it_was_trained_in():

@@ -246,22 +246,6 @@ def test_render_refuses_in_one_line(monkeypatch, capsys):
     assert "expected a run folder" in said(monkeypatch, capsys, render_command.main, "env=a:b")
 
 
-def test_runs_of_different_tasks_do_not_stand_side_by_side():
-    def actor(name: str, **options) -> Any:
-        return SimpleNamespace(settings=SimpleNamespace(env_name=name, env_options=options))
-
-    folders = [Path("a"), Path("b")]
-    one, same = (
-        actor("point_goal1", hazards_num=8, engine="c"),
-        actor("point_goal1", hazards_num=8, engine="warp"),
-    )
-    film.check_one_task(folders, [one, same])
-    with pytest.raises(ConfigError, match=r"env=point_goal1 in a, car_goal1 in b"):
-        film.check_one_task(folders, [one, actor("car_goal1", hazards_num=8)])
-    with pytest.raises(ConfigError, match=r"env\.hazards_num=8 in a, 4 in b"):
-        film.check_one_task(folders, [one, actor("point_goal1", hazards_num=4)])
-
-
 def test_panels_are_labelled_with_what_tells_them_apart():
     folders = [Path("/runs/x/1"), Path("/runs/y/1")]
     assert film.labels(folders, ["cpo", "ppo_lag"]) == ["cpo", "ppo_lag"]
