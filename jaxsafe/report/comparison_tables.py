@@ -7,6 +7,7 @@ only normalised scores, and comparisons within a task, are averaged.
 
 import csv
 import io
+import itertools
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -139,14 +140,11 @@ def aggregates(s: Suite) -> dict[tuple[str, str, str], Estimate]:
 
 def improvements(s: Suite) -> dict[tuple[str, str, str], Estimate]:
     """P(a seed of one setting beats one of another), in return (higher) and in cost (lower)."""
-    names, found = list(s.groups), {}
-    for i, a in enumerate(names):
-        for b in names[i + 1 :]:
-            more = [s.samples(name, "return") for name in (a, b)]
-            less = [s.samples(name, "cost") for name in (b, a)]
-            found[a, b, "return"] = stats.probability_of_improvement(more[0], more[1])
-            found[a, b, "cost"] = stats.probability_of_improvement(less[0], less[1])
-    return found
+    return {
+        (a, b, measure): stats.probability_of_improvement(*(s.samples(name, measure) for name in pair))
+        for a, b in itertools.combinations(s.groups, 2)
+        for measure, pair in {"return": (a, b), "cost": (b, a)}.items()
+    }
 
 
 def across(s: Suite, found: Mapping, pairs: Mapping) -> list[Table]:
