@@ -640,12 +640,6 @@ PENALTIES: dict[str, dict[str, Any]] = {
 PIXELS: dict[str, Any] = PENALTIES["plpg"] | dreamer.PIXELS
 # for two cores, on which foresight takes too long
 CPU: dict[str, Any] = dreamer.CPU_FORESIGHT | {"overshoot": 0, "shield_rollouts": 32}
-# for a problem of a ledge, some steps away
-LEDGE: dict[str, Any] = dreamer.LEVER | {
-    "overshoot": 0, "discount": 0.9, "imagine_steps": 6, "penalty": "plpg", "penalty_coef": 0.8,
-    "rule": "hoeffding", "delta": 0.1, "eps": 0.05, "shield_rollouts": 32, "shield_steps": 6,
-    "shield_horizon": 4,
-}  # fmt: skip
 
 ROWS = {
     "ambs": Row(

@@ -11,6 +11,7 @@ import numpy as np
 import optax
 from jax.flatten_util import ravel_pytree
 
+from jaxsafe.algos import dreamer
 from jaxsafe.learn.acting import Player
 from jaxsafe.learn.certificate import interval_barrier
 from jaxsafe.learn.steps import Context, Trainable
@@ -249,6 +250,13 @@ class Ledge:
     def _state(self, x: jax.Array) -> State:
         cost = (x > 0.5).astype(jnp.float32)
         return State(x, x[None], x, cost, cost[None], jnp.bool_(False), {})
+
+
+SHIELDED: dict[str, Any] = dreamer.LEVER | {  # settings of AMBS that hold it on the ledge
+    "overshoot": 0, "discount": 0.9, "imagine_steps": 6, "penalty": "plpg", "penalty_coef": 0.8,
+    "rule": "hoeffding", "delta": 0.1, "eps": 0.05, "shield_rollouts": 32, "shield_steps": 6,
+    "shield_horizon": 4,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from compiling import FAST
 from learners import at, copy, member, two_members
-from toys import START, Corridor, Ledge, Lever, training
+from toys import SHIELDED, START, Corridor, Ledge, Lever, training
 from two_devices import on_two_devices, same_parameters_own_replays
 
-from jaxsafe.algos import ALGOS, ambs
+from jaxsafe.algos import ALGOS
 from jaxsafe.config import ConfigError
 from jaxsafe.learn.acting import Player
 from jaxsafe.learn.world_model import CHANCE, WorldModelConfig
@@ -279,7 +279,7 @@ def test_a_shield_keeps_from_a_ledge_that_dreamer_goes_beyond():
     """8.9 to earn with 9 violations in an episode, 4.8 without."""
     ret, cost = trained("dreamer", 30, Ledge(), discount=0.9, imagine_steps=6)
     assert (ret > 8).all() and (cost > 8).all()
-    ret, cost = trained("ambs", 60, Ledge(), **ambs.LEDGE)
+    ret, cost = trained("ambs", 60, Ledge(), **SHIELDED)
     assert (ret > 3).all() and (cost < 0.3).all()
 
 

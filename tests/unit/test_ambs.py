@@ -14,7 +14,7 @@ import pytest
 import scipy.stats
 from compiling import FAST
 from jax.flatten_util import ravel_pytree
-from toys import START, Corridor, Ledge, Ticker
+from toys import SHIELDED, START, Corridor, Ledge, Ticker
 
 from jaxsafe import envs
 from jaxsafe.algos import ALGOS, ambs, dreamer
@@ -41,7 +41,7 @@ def newborn() -> tuple[Algorithm, Any]:
     """The shield in the corridor with four dreams, and what it has learned before the first step."""
     algo = ALGOS["ambs"].make(Corridor())
     sizes: dict[str, Any] = {"num_envs": 4, "replay_ratio": 32, "shield_rollouts": 4}
-    cfg = ambs.AMBSConfig(**ambs.LEDGE | sizes)
+    cfg = ambs.AMBSConfig(**SHIELDED | sizes)
     init = jax.jit(lambda key: algo.init(key, cfg, START), compiler_options=FAST)
     return algo, algo.learned(init(jax.random.key(0)))
 
