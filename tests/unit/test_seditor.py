@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import math
+import operator
 from typing import Any
 
 import chex
@@ -501,6 +502,43 @@ def test_each_network_moves_along_its_own_objective_alone():
         np.testing.assert_allclose(
             after.opt_state[name][0].mu, 0.1 * (metrics[entropy] - aim), rtol=1e-5
         )
+
+
+def test_two_devices_take_the_step_of_one_with_gradients_as_short(monkeypatch):
+    """Without chance: the policies take their modes."""
+    sampled = seditor.beta_sample
+    monkeypatch.setattr(seditor, "beta_sample", lambda dist, key: sampled(dist, None))
+    learner = seditor.seditor_learner(Lever())
+    here = batch_of(jax.random.key(5))
+    whole = SequenceBatch(
+        jax.tree.map(lambda x: jnp.concatenate([x, x[:, :1]], 1), here.rows),
+        jnp.array([1 / 3, 1 / 3, 0, 1 / 3]),
+    )
+    halves = SequenceBatch(
+        jax.tree.map(lambda x: jnp.stack(jnp.split(x, 2, 1)), whole.rows),
+        2 * whole.weight.reshape(2, 2),
+    )
+
+    def momenta(batch, clip, axis_name=None):
+        cfg = dataclasses.replace(CFG, n_step=3, batch_size=8, concentration_clip=clip)
+        cfg = jax.tree.map(jnp.float32, cfg)
+        dual = seditor.init_soft_multiplier(cfg)
+        at = GradientStep(jnp.int32(0), jnp.float32(1), jax.random.key(7), dual)
+        before = moved(learner.init(jax.random.key(6), 2, 2, cfg))
+        after, _ = learner.step(before, batch, at, cfg, axis_name)
+        return {name: momentum(after, name) for name in seditor.optimisers(cfg, 1.0)}
+
+    def on_two(half, clip):
+        return momenta(half, clip, "devices")
+
+    one = jax.jit(momenta, compiler_options=EXACT)
+    two = jax.jit(jax.vmap(on_two, (0, None), axis_name="devices"), compiler_options=EXACT)
+    short, free, found = one(whole, 0.01), one(whole, jnp.inf), two(halves, 0.01)
+    for i in range(2):
+        of_device = jax.tree.map(operator.itemgetter(i), found)
+        chex.assert_trees_all_close(of_device, short, rtol=1e-3, atol=1e-6)
+    for name in ("proposer", "editor"):
+        assert optax.tree.norm(short[name]) < 0.9 * optax.tree.norm(free[name])
 
 
 @pytest.mark.parametrize("failed", [False, True])
