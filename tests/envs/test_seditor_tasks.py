@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 from compiling import FAST
-from tasks import Task, change, in_parts, put, with_qpos
+from tasks import Task, change, in_parts, physics_of, put, with_qpos
 
 from jaxsafe import envs
 from jaxsafe.envs.safety_gym import layout as layouts
@@ -190,6 +190,21 @@ def test_a_success_ends_the_episode_and_its_value_goes_on():
     np.testing.assert_array_equal(after.truncated, [True, False] * 2)
     np.testing.assert_array_equal(after.info["goal_met"], [1, 0] * 2)
     assert not after.terminated.any() and not state.truncated.any()
+
+
+def test_a_success_with_a_physics_error_is_a_failure():
+    """A vase flies off in the last substep, after which MuJoCo does not look for errors."""
+    t = fork("seditor_point_goal2")
+    drive, judge = (jax.jit(jax.vmap(f), compiler_options=FAST) for f in (t.env.drive, t.env.judge))
+    run, _ = physics_of(t.env._engine)
+    state = t.begin()
+    state = put(t, state, "goal", state.physics.start[:, :2])
+    given = drive(state.physics, jnp.zeros((4, 2)))
+    physics, readings = run(state.physics.bodies, given.ctrl, given.substeps)
+    physics = physics.replace(qvel=physics.qvel.at[2, -1].set(jnp.inf))
+    after = judge(state, given, physics, readings)
+    np.testing.assert_array_equal(after.truncated, [True, True, False, True])
+    np.testing.assert_array_equal(after.terminated, ~after.truncated)
 
 
 def test_several_violations_cost_one_and_fast_vases_nothing():
