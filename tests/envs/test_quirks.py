@@ -366,6 +366,8 @@ def test_a_physics_error_ends_its_own_world_only(field, robot, tmp_path, monkeyp
     for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(good), strict=True):
         if not jnp.issubdtype(a.dtype, jax.dtypes.prng_key):
             np.testing.assert_array_equal(np.asarray(a)[others], np.asarray(b)[others])
+    for name in ("key", "steps"):  # which go on in all four
+        assert (getattr(after.physics, name) == getattr(good.physics, name)).all()
     assert (t.idle(after).info["exception"] == after.info["exception"]).all()
 
 
