@@ -911,13 +911,25 @@ def test_the_shield_is_examined_in_the_episodes_of_evaluation(sampled):
     assert len({*evaluated.ret.tolist()}) > 1
 
 
+def test_nothing_counts_after_the_end_of_an_episode():
+    """It fails with its second step. Each step earns 1 and is a violation, and the shield overrules."""
+    said = {"risk": jnp.float32(1), "overruled": jnp.bool_(True)}
+    policy = Policy(lambda learned: (), lambda learned, carry, obs, key: (jnp.zeros(1), carry, said))
+    player = Player(policy, Learned(CFG, {}, (), ()), Ticker(lives=(2, 2)))
+    found = ambs.course(player, jax.random.key(0), sampled=False)
+    for x in (found.alive, found.overruled, found.reward, found.violation):
+        np.testing.assert_array_equal(x, [1, 1, 0, 0, 0])
+    np.testing.assert_array_equal(found.failed, [0, 1, 0, 0, 0])
+
+
 @pytest.mark.parametrize("sampled, violations", [(False, 0), (True, 9)])
 def test_the_risk_is_scored_by_sampled_actions_without_the_shield(sampled, violations):
-    """A sampled action goes beyond the ledge, a mean one stays, and the shield's goes back. The policy
-    says that a violation is certain, which is right for sampled actions alone."""
+    """A sampled action goes beyond the ledge, and the shield's goes back. A mean action stays, and is
+    never overruled. The policy says that a violation is certain, which is right for sampled actions
+    alone."""
 
     def act(learned, carry, obs, key):
-        overruled = learned.config.delta < 1
+        overruled = (learned.config.delta < 1) & (key is not None)
         proposed = 0.0 if key is None else 1.0
         action = jnp.where(overruled, -1.0, proposed)[None]
         return action, carry, {"risk": jnp.float32(1), "overruled": overruled}
@@ -930,7 +942,7 @@ def test_the_risk_is_scored_by_sampled_actions_without_the_shield(sampled, viola
     measures = found.measures
     assert (measures["Brier score"] == 0).all()
     assert (measures["violations, no shield"] == violations).all()
-    assert (measures["violations"] == 0).all() and (measures["override rate"] == 1).all()
+    assert (measures["violations"] == 0).all() and (measures["override rate"] == sampled).all()
     steps, risk, violated = np.asarray(found.calibration)[0]
     assert steps[-1] > 9 and (steps == risk).all() and (steps == violated).all()
     assert not steps[:-1].any()
