@@ -470,6 +470,28 @@ def test_a_learner_is_told_the_time_and_sees_normalised_observations_to_act_and_
         np.testing.assert_allclose(log.next_obs[step], now[env, row + 1], atol=1e-4)
 
 
+def test_gradient_steps_learn_from_all_that_the_replay_holds_up_to_the_newest_row():
+    """Ticker counts the steps of an episode. An update has six rows, and there is room for twelve."""
+
+    def step(nets, batch, at, cfg, axis_name):
+        count = batch.next_obs[:, 1]
+        return nets, {"train/oldest": count.min(), "train/newest": count.max()}
+
+    learner = Learner(
+        init=lambda *_: Trainable({}, {}),
+        step=step,
+        act=lambda learned, obs, key: jnp.zeros((*obs.shape[:-1], 1)),
+    )
+    algo = off_policy(Ticker(episode_length=99), learner)
+    sizes: dict[str, Any] = TINY | {"learn_every": 6, "learning_starts": 0}
+    sizes |= {"replay_size": 8 * 12, "batch_size": 8 * 12}
+    cfg = OffPolicyConfig(**sizes, stagger=False, obs_normalize=False)
+    ts, update = algo.init(jax.random.key(0), cfg, START), jax.jit(algo.update)
+    for iteration, ends in enumerate([(1, 5), (1, 11), (7, 17)]):
+        ts, metrics = update(ts, at(iteration))
+        assert (metrics["train/oldest"], metrics["train/newest"]) == ends
+
+
 def test_none_of_a_rounds_gradient_steps_takes_effect_if_they_end_in_what_is_not_finite():
     ts, update = told(listening(steps=12, fails=9))
     for iteration in range(2):
