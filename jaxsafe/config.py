@@ -171,13 +171,13 @@ def from_dict(cls: type[T], values: dict[str, Any], where: str = "") -> T:
 
 
 def check_values(cfg: Any, where: str = "") -> None:
-    """Raise ConfigError for a number of the dataclass `cfg` that is out of its bounds.
+    """Raise ConfigError for a number of `cfg`, a dataclass, out of its bounds, or for an unknown word.
 
     JAX's traced values are not checked.
     """
     hints = hints_of(type(cfg), bounds=True)
     for name in (f.name for f in dataclasses.fields(cfg)):
-        if isinstance(value := getattr(cfg, name), numbers.Real | tuple):
+        if isinstance(value := getattr(cfg, name), numbers.Real | tuple | str):
             convert(value, hints[name], f"{where}{name}")
 
 

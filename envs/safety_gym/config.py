@@ -19,7 +19,6 @@ from jaxsafe.config import (
     Weight,
     check_values,
     from_dict,
-    nearest,
 )
 
 Distance = Annotated[float, Bounds(0, 1000)]  # m
@@ -33,7 +32,6 @@ Rectangle = tuple[Coordinate, Coordinate, Coordinate, Coordinate]  # xmin, ymin,
 Rectangles = tuple[Rectangle, ...]
 Points = tuple[Point2, ...]
 
-TASKS = ("goal", "button", "push", "x", "z", "circle", "run", "none")
 # Observations that Safety-Gymnasium does not have.
 OURS_ALONE = tuple(
     f"observe_{part}" for part in ["goal_dist", "remaining", "qpos", "qvel", "ctrl", "freejoint", "com"]
@@ -269,8 +267,6 @@ def check_config(cfg: SafetyGymConfig) -> None:
     check_values(cfg, "env.")
     if cfg.rules == "safety_gymnasium":
         check_rules(cfg)
-    if cfg.task not in TASKS:
-        raise ConfigError(f"env.task={cfg.task!r}{nearest(cfg.task, TASKS)}")
     if cfg.observation == "coordinates" and cfg.task != "goal":
         raise ConfigError(f"env.observation=coordinates: expected env.task=goal, not {cfg.task}")
     if cfg.task == "button" and cfg.buttons_num < 1:

@@ -14,7 +14,17 @@ from toys import Corridor
 
 import jaxsafe
 from jaxsafe import algos, envs
-from jaxsafe.config import Amount, Bounds, ConfigError, Share, convert, flat, from_dict, shown
+from jaxsafe.config import (
+    Amount,
+    Bounds,
+    ConfigError,
+    Share,
+    check_values,
+    convert,
+    flat,
+    from_dict,
+    shown,
+)
 from jaxsafe.envs.wrap import WrapConfig
 from jaxsafe.learn.conventions import conventions
 from jaxsafe.run.arguments import compose, read_values
@@ -53,6 +63,15 @@ def test_every_number_of_a_config_has_bounds(name):
     hints = typing.get_type_hints(CONFIGS[name], include_extras=True)
     fields = [f.name for f in dataclasses.fields(CONFIGS[name])]
     assert [field for field in fields if bare(hints[field])] == []
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_an_unknown_word_is_refused_from_python_too(name):
+    needed = {"robot": "ant"} if CONFIGS[name] is envs.VelocityConfig else {}
+    for field, kind in typing.get_type_hints(CONFIGS[name]).items():
+        if typing.get_origin(kind) is typing.Literal:
+            with pytest.raises(ConfigError, match=f"{field}='golf'"):
+                check_values(CONFIGS[name](**needed | {field: "golf"}))
 
 
 @pytest.mark.parametrize(
