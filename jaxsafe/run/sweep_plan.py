@@ -59,7 +59,7 @@ def plan(given: dict[str, Any], several: dict[str, list[Any]], extras: Extras = 
             "nothing to sweep: give an option several values, as in algo.cost_limit=5,10,25, "
             "or train one setting with the command train"
         )
-    check_values(several)
+    check_grid(several)
     floats = floats_among(several, given, extras)
     grid = combinations({name: several[name] for name in floats})
     side_by_side = {name: [setting[name] for setting in grid] for name in floats}
@@ -85,7 +85,7 @@ def check_names(given: dict[str, Any], several: dict[str, list[Any]]) -> None:
             raise ConfigError(f"{name}: expected one value")
 
 
-def check_values(several: dict[str, list[Any]]) -> None:
+def check_grid(several: dict[str, list[Any]]) -> None:
     """Refuse a value that occurs twice, and more settings than anybody trains."""
     for name, values in several.items():
         if (value := repeated(values)) is not None:
