@@ -60,6 +60,21 @@ def test_the_best_plan_of_a_linear_system_with_a_quadratic_cost_is_found_within_
     np.testing.assert_allclose(plan, best, atol=0.05)
 
 
+def test_plans_are_drawn_anew_each_time():
+    """Mean and variance stay, so that plans differ by their draws alone."""
+    momenta: dict[str, Any] = {"mean_momentum": 1.0, "var_momentum": 1.0}
+    cfg = pets.PETSConfig(plans=2, elites=1, cem_iterations=3, plan_var=0.01, **momenta)
+    tried = []
+
+    def score(plans, key):
+        tried.append(plans)
+        return jnp.zeros(2), jnp.zeros(2)
+
+    with jax.disable_jit():
+        cem(score, elites, jnp.zeros((4, 1)), (), jax.random.key(0), cfg)
+    assert len(np.unique(tried)) == 3 * 2 * 4
+
+
 @dataclass(frozen=True)
 class Shore:
     """A walk along a line: x <- x + a / 5, which pays what it goes ahead. Beyond 1/2 a step costs 1."""
@@ -165,6 +180,16 @@ def test_a_particle_keeps_its_model_its_plan_and_its_penalty():
     none_feasible = pets.CAPConfig(elites=3, cost_limit=0.0)
     weights = elites(jnp.zeros(s), cost[shuffled] + 1.0, none_feasible)
     np.testing.assert_allclose(weights, np.where(shuffled < 3, 1 / 3, 0), rtol=1e-6)
+
+
+def test_each_step_of_a_plan_has_chances_of_its_own():
+    def predict(fitted, latent, action, key, cfg):
+        reward = jax.random.uniform(key, latent.shape[:-1])
+        return Prediction(latent, reward, 0 * reward, reward, reward > 1)
+
+    model, plans = Model(lambda cfg: (2, 3), predict, lambda latent: latent), jnp.zeros((4, 5, 1))
+    imagined = imagine(model, learned_by(pets.PETSConfig()), jnp.zeros(1), plans, jax.random.key(0))
+    assert len(np.unique(imagined.reward)) == 5 * 2 * 3 * 4
 
 
 def test_mixed_uncertainty_is_that_of_other_plans():
@@ -283,6 +308,23 @@ def test_what_the_actor_does_in_each_model_is_among_the_plans():
     assert plans.shape == (5 * 2, 3, 1)
     seen = np.arange(5)[:, None] * np.arange(3)  # [M, H]
     np.testing.assert_allclose(plans[..., 0], np.repeat(np.tanh(seen / 4), 2, 0), atol=1e-4)
+
+
+def test_each_action_of_the_actors_plans_is_drawn_anew():
+    """In a model in which nothing moves."""
+    cfg = loop.LOOPConfig(hidden=(), plan_steps=3, actor_plans=2, obs_normalize=False)
+    actor = {"params": {"Dense_0": {"kernel": jnp.zeros((1, 2)), "bias": jnp.zeros(2)}}}
+
+    def predict(fitted, latent, action, key, cfg):
+        zero = jnp.zeros(latent.shape[:-1])
+        return Prediction(latent, zero, zero, zero, zero > 0)
+
+    model, learned = (
+        Model(lambda cfg: (5, 1), predict, lambda latent: latent),
+        learned_by(cfg, actor=actor),
+    )
+    (plans,) = loop.planner(SHORE).propose(model, learned, jnp.zeros(1), jax.random.key(0))
+    assert len(np.unique(plans)) == 5 * 2 * 3
 
 
 def test_a_narrow_plan_is_not_improved_any_further():
