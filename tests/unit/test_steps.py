@@ -157,6 +157,19 @@ def test_on_a_gpu_small_networks_are_one_array_to_adam_and_take_the_same_step(jo
 fit_jitted = jax.jit(fit_critic, static_argnums=5, compiler_options=FAST)
 
 
+def test_each_pass_of_a_critic_has_minibatches_of_its_own(monkeypatch):
+    """In place of a pass, a number that its key draws is its error."""
+
+    def one_draw(step, critic, data, key, minibatches):
+        return critic, (jax.random.uniform(key, (1,)), jnp.zeros(1, int))
+
+    monkeypatch.setattr("jaxsafe.learn.steps.one_pass", one_draw)
+    cfg, critic = PPOConfig(**SMALL, critic_epochs=3), Trainable(jnp.zeros(1), ())
+    data, key = (jnp.zeros((8, 3)), jnp.zeros(8)), jax.random.key(0)
+    errors = {fit_critic(critic, data, passes, key, cfg, None)[1].item() for passes in (1, 2, 3)}
+    assert len(errors) == 3
+
+
 def test_a_critic_learns_its_targets():
     cfg = PPOConfig(**SMALL, critic_epochs=200, critic_lr=1e-2, critic_norm_coef=0.0)
     params, batch = problem()
