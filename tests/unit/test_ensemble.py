@@ -1,6 +1,7 @@
 """The ensemble knows the noise of what it is fitted to, and where it does not know."""
 
 import dataclasses
+import operator
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -264,7 +265,8 @@ def test_a_fit_goes_on_as_long_as_any_model_becomes_better_by_a_hundredth():
 
 
 def rows_that_count(rows, **options):
-    """Which of `rows` rows train each model, bool [rows, M], and which measure the error, bool [rows].
+    """Which of `rows` rows train each model, bool [rows, M], and which measure the error, bool [rows];
+    their x [rows], and the scale of the inputs.
 
     A row counts if its reward makes a difference: to Adam's moments or, as the learning rate is 0, to
     the error of models that stay what they are.
@@ -276,25 +278,29 @@ def rows_that_count(rows, **options):
 
     def found(y):
         after, metrics = fit(model, ring_of(x, y), span, jax.random.key(2), cfg)
-        return after.opt_state[0].mu.layers[0].bias, metrics["train/model_error"]
+        moment = after.opt_state[0].mu.layers[0].bias
+        return moment, metrics["train/model_error"], after.params.scale
 
     rewards = y + 10 * jnp.eye(rows + 1)[:, :, None]  # another one of each row; the last does not count
-    moments, error = jax.jit(jax.vmap(found), compiler_options=FAST)(rewards)
-    return (moments[:-1] != moments[-1]).any(-1), error[:-1] != error[-1]
+    moments, error, scale = jax.jit(jax.vmap(found), compiler_options=FAST)(rewards)
+    of_one = jax.tree.map(operator.itemgetter(0), scale)
+    return (moments[:-1] != moments[-1]).any(-1), error[:-1] != error[-1], x[:-1, 0], of_one
 
 
-def test_rows_either_train_all_models_or_measure_their_error():
-    trained, held_out = rows_that_count(40, epoch_steps=20, model_batch=64)
+def test_rows_either_train_all_models_and_scale_the_inputs_or_measure_the_error():
+    trained, held_out, x, scale = rows_that_count(40, epoch_steps=20, model_batch=64)
     assert 10 < held_out.sum() < 30
     np.testing.assert_array_equal(trained, np.stack([~held_out] * 3, 1))
+    seen = x[~held_out]
+    np.testing.assert_allclose((scale.mean[0], scale.std[0]), (seen.mean(), seen.std()), rtol=1e-5)
 
 
 def test_each_model_has_batches_of_its_own_in_each_epoch():
-    trained, _ = rows_that_count(40, epoch_steps=1, model_batch=4)
+    trained, *_ = rows_that_count(40, epoch_steps=1, model_batch=4)
     count = trained.sum(0)
     assert (count >= 1).all() and (count <= 4).all()
     assert all((trained[:, i] != trained[:, j]).any() for i, j in ((0, 1), (0, 2), (1, 2)))
-    trained, _ = rows_that_count(40, epoch_steps=1, model_batch=4, max_epochs=2)
+    trained, *_ = rows_that_count(40, epoch_steps=1, model_batch=4, max_epochs=2)
     assert (trained.sum(0) > 4).all()
 
 
