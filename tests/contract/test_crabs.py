@@ -2,6 +2,7 @@
 
 import dataclasses
 from functools import cache, partial
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -15,9 +16,10 @@ from toys import START, Corridor, Ticker, momentum, training
 from jaxsafe.algos import ALGOS, crabs
 from jaxsafe.config import ConfigError
 from jaxsafe.learn.acting import Player
-from jaxsafe.learn.certificate import interval_barrier
+from jaxsafe.learn.certificate import Core, Found, decayed_adam, interval_barrier
 from jaxsafe.learn.learner import GradientStep
 from jaxsafe.learn.replay import Transitions
+from jaxsafe.learn.steps import Trainable
 from jaxsafe.types import State
 
 ROW = ALGOS["crabs"]
@@ -186,6 +188,61 @@ def test_a_run_that_starts_with_a_certificate_does_not_begin_with_random_actions
     ring = update(dataclasses.replace(ts, params=params), at(0))[0].replay
     taken = ring.action[jnp.array([0, 1, 3, 4]), :4]  # of environments that are not random later
     assert (jnp.abs(taken).max() < 1e-3) == bool(certified)
+
+
+# ---- after a search, and against violations ----------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "certified, at_once, before, after",
+    [
+        (True, True, 2.0, 1.0),
+        (True, True, 0.15, 0.1),
+        (True, False, 6.0, 5.0),
+        (False, False, 2.0, 4.0),
+        (False, False, 6.0, 10.0),
+    ],
+)
+@pytest.mark.parametrize("earlier", [True, False])
+def test_a_search_that_succeeds_makes_the_certificate_and_the_policy_takes_fewer_steps_then(
+    certified, at_once, before, after, earlier, monkeypatch
+):
+    new, old = Core(*jnp.array([5.0, 2.0, 3.0])), Core(*-jnp.ones(3))
+    nothing: Any = ()
+    found = Found(new.barrier, nothing, nothing, *map(jnp.asarray, (certified, at_once, 7)))
+    monkeypatch.setattr(crabs, "certify", lambda *_: found)
+    monkeypatch.setattr(crabs, "volume", lambda *_: jnp.float32(0.25))
+    params = {"barrier": jnp.float32(1), "actor": new.actor, "model": new.model, "safe": old}
+    state = {"pressure": jnp.float32(before), "barrier": nothing, "search": nothing}
+    nets = Trainable(params | {"certified": jnp.float32(earlier)}, state)
+    here: Any = None  # nobody asks it
+    (params, state), metrics = crabs.renew(here, nets, ROW.config())
+    assert state["pressure"] == pytest.approx(after)
+    assert params["certified"] == (certified or earlier)
+    assert params["safe"] == (new if certified else old)
+    assert params["barrier"] == (old.barrier if earlier and not certified else new.barrier)
+    assert metrics["train/certified"] == certified
+
+
+def test_the_policy_takes_all_steps_against_violations_that_it_owes(monkeypatch):
+    """Of two states one violates the condition, by the policy's only number and 1. Adam moves that by
+    `adversary_lr` each time."""
+    search = SimpleNamespace(obs=jnp.zeros((2, 1)))
+    monkeypatch.setattr(crabs, "walk", lambda *_: search)
+    here: Any = SimpleNamespace(
+        judge=lambda core, *_: (jnp.array([-1.0, 1.0]), core.actor + jnp.ones(2))
+    )
+    cfg, zero = ROW.config(adversary_lr=1e-3), jnp.zeros(())
+    adversary = decayed_adam(0.0, 0.0).init(zero)
+    state = {"search": search, "adversary": adversary, "owed": zero, "pressure": jnp.float32(1.25)}
+    params = dict.fromkeys(("barrier", "actor", "model"), zero)
+    free, metrics = crabs.resist(here, Trainable(params | {"certified": zero}, state), cfg)
+    assert free.params["actor"] == 0 and jnp.isnan(metrics["train/violating"])
+    nets = Trainable(params | {"certified": jnp.ones(())}, state)
+    for taken in (1, 2, 3, 5):
+        nets, metrics = crabs.resist(here, nets, cfg)
+        assert nets.params["actor"] == pytest.approx(-1e-3 * taken, rel=1e-3)
+        assert metrics["train/violating"] == 0.5
 
 
 # ---- a gradient step by hand -------------------------------------------------------------------
