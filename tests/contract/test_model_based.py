@@ -202,7 +202,7 @@ def test_a_plan_is_carried_along_and_needs_no_key():
     assert action.shape == (2,) and carry.mean.shape == (3, 2) and (jnp.abs(action) <= 1).all()
     np.testing.assert_array_equal(action, act(player.begin())[0])
     assert (act(carry)[0] != action).any()
-    elsewhere = player.begin()._replace(step=jnp.int32(7))  # other draws, and nothing else
+    elsewhere = player.begin()._replace(step=carry.step)  # other draws, and nothing else
     assert (act(elsewhere)[0] != action).any()
 
 

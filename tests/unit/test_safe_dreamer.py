@@ -77,6 +77,16 @@ def test_it_takes_what_earns_most_without_a_cost_and_all_where_none_is_minded(le
     np.testing.assert_allclose([action, carry.mean[0]], 1.0, atol=0.1)
 
 
+def test_mean_actions_have_the_draws_of_their_step(learned):
+    env: Any = Corridor(action_size=1)
+    policy = safe_dreamer.dream_planning_policy(env, safe_dreamer.planned, no_treatment)
+    act = jax.jit(lambda carry: policy.act(learned, carry, jnp.zeros(4), None), compiler_options=FAST)
+    begun = policy.init(learned)
+    action, carry, _ = act(begun)
+    assert carry.step == 1 and act(begun)[0] == action
+    assert act(begun._replace(step=carry.step))[0] != action
+
+
 def test_the_price_by_hand():
     """Smoothed by a half: J = 4, then 3; with a limit of 2, gains .01, .02 and .03."""
     cfg = dataclasses.replace(CFG, pid_kp=0.01, pid_ki=0.02, pid_kd=0.03, pid_smoothing=0.5)
