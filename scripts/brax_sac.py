@@ -14,14 +14,17 @@ environments and gradient steps:
 import argparse
 import sys
 
-import brax.envs
+from jaxsafe.commands.jaxsafe import leaving_at_ctrl_c
 
-import jaxsafe
-from jaxsafe.commands.guard import guarded
-from jaxsafe.config import ConfigError, flat
-from jaxsafe.interop.brax import FromBrax, from_brax
-from jaxsafe.run.arguments import read_values
-from jaxsafe.run.flags import Parser
+with leaving_at_ctrl_c():
+    import brax.envs
+
+    import jaxsafe
+    from jaxsafe.commands.guard import guarded
+    from jaxsafe.config import ConfigError, flat
+    from jaxsafe.interop.brax import FromBrax, from_brax
+    from jaxsafe.run.arguments import read_values
+    from jaxsafe.run.flags import Parser
 
 BACKENDS = ("generalized", "spring", "positional", "mjx")
 

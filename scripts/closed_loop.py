@@ -12,14 +12,17 @@ import sys
 from functools import partial
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
-import numpy as np
+from jaxsafe.commands.jaxsafe import leaving_at_ctrl_c
 
-from jaxsafe import envs
-from jaxsafe.commands.benchmark import versions
-from jaxsafe.config import ConfigError
-from jaxsafe.learn.rollout import collect, init_rollout, memoryless
+with leaving_at_ctrl_c():
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    from jaxsafe import envs
+    from jaxsafe.commands.benchmark import versions
+    from jaxsafe.config import ConfigError
+    from jaxsafe.learn.rollout import collect, init_rollout, memoryless
 
 TURN, NOISE = 4.0, 0.3  # action per radian, and its standard deviation
 

@@ -10,17 +10,20 @@ import argparse
 import sys
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
-import numpy as np
+from jaxsafe.commands.jaxsafe import leaving_at_ctrl_c
 
-from jaxsafe import Run
-from jaxsafe.algos import ambs, dreamer, safe_dreamer
-from jaxsafe.config import ConfigError
-from jaxsafe.learn.acting import Player
-from jaxsafe.learn.dreaming import Behaviour
-from jaxsafe.learn.world_model import read, world_of
-from jaxsafe.report.dreams import Episode, foreseen, play
+with leaving_at_ctrl_c():
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    from jaxsafe import Run
+    from jaxsafe.algos import ambs, dreamer, safe_dreamer
+    from jaxsafe.config import ConfigError
+    from jaxsafe.learn.acting import Player
+    from jaxsafe.learn.dreaming import Behaviour
+    from jaxsafe.learn.world_model import read, world_of
+    from jaxsafe.report.dreams import Episode, foreseen, play
 
 BEHAVIOURS: dict[str, Behaviour] = {
     "dreamer_lag": dreamer.priced,

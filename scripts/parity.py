@@ -10,11 +10,14 @@ import sys
 from importlib.metadata import version
 from pathlib import Path
 
-import jax
-import numpy as np
+from jaxsafe.commands.jaxsafe import leaving_at_ctrl_c
 
-from jaxsafe.config import ConfigError
-from jaxsafe.envs.safety_gym.recording import Comparison, Recording, compare
+with leaving_at_ctrl_c():
+    import jax
+    import numpy as np
+
+    from jaxsafe.config import ConfigError
+    from jaxsafe.envs.safety_gym.recording import Comparison, Recording, compare
 
 FORCES = ("accelerometer", "touch")
 BODIES = ("robot pose", "robot velocity", "object pose", "object velocity", "reward")

@@ -19,15 +19,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
-import numpy as np
+from jaxsafe.commands.jaxsafe import leaving_at_ctrl_c
 
-from jaxsafe import algos
-from jaxsafe.commands.benchmark import Timing, config_of, timed, training
-from jaxsafe.config import ConfigError, nearest
-from jaxsafe.learn.offline import DataSet, OfflineConfig, data_set
-from jaxsafe.types import State
+with leaving_at_ctrl_c():
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    from jaxsafe import algos
+    from jaxsafe.commands.benchmark import Timing, config_of, timed, training
+    from jaxsafe.config import ConfigError, nearest
+    from jaxsafe.learn.offline import DataSet, OfflineConfig, data_set
+    from jaxsafe.types import State
 
 
 @dataclass(frozen=True)

@@ -15,16 +15,19 @@ import sys
 import time
 from typing import Any
 
-import jax
-import mujoco
-import numpy as np
+from jaxsafe.commands.jaxsafe import leaving_at_ctrl_c
 
-from jaxsafe import envs
-from jaxsafe.config import ConfigError
-from jaxsafe.envs.engines import Simulation
-from jaxsafe.envs.safety_gym import scene as scenes
-from jaxsafe.envs.safety_gym import sleeping
-from jaxsafe.envs.velocity.task import Velocity
+with leaving_at_ctrl_c():
+    import jax
+    import mujoco
+    import numpy as np
+
+    from jaxsafe import envs
+    from jaxsafe.config import ConfigError
+    from jaxsafe.envs.engines import Simulation
+    from jaxsafe.envs.safety_gym import scene as scenes
+    from jaxsafe.envs.safety_gym import sleeping
+    from jaxsafe.envs.velocity.task import Velocity
 
 VARIANTS = {  # name -> options of the model, factors on the room for contacts and for rows
     "as it is": ({}, 1.0, 1.0),

@@ -51,7 +51,11 @@ def test_a_typo_names_the_nearest_command(monkeypatch, capsys):
     assert capsys.readouterr().err == "error: unknown command trian; did you mean 'train'?\n"
 
 
-@pytest.mark.parametrize("words", [["-m", "jaxsafe", "plot"], [str(SCRIPTS / "plot.py")]])
+@pytest.mark.parametrize(
+    "words",
+    [["-m", "jaxsafe", "plot"], *([path] for path in sorted(SCRIPTS.glob("*.py")))],
+    ids=lambda words: Path(words[-1]).name,
+)
 def test_ctrl_c_while_a_command_loads_is_one_line(words, tmp_path):
     (tmp_path / "jax.py").write_text(
         "import signal\n\n"
