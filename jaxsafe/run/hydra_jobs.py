@@ -18,6 +18,7 @@ from hydra._internal.utils import get_args_parser
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import Override
+from hydra.errors import MissingConfigException
 from hydra.types import RunMode
 from omegaconf import OmegaConf
 
@@ -100,6 +101,14 @@ def each_job(argv: list[str], job: Job) -> None:
         hydra.main(version_base="1.3", config_path=None, config_name="train")(as_hydra_calls(job))()
     except JobFailed as failed:  # the job's own output says why, Hydra's line which one
         raise SystemExit(*failed.args) from None
+    except MissingConfigException as error:
+        group, _, name = (error.missing_cfg_file or "").rpartition("/")
+        if group != "hydra/launcher":
+            raise
+        raise ConfigError(
+            f"hydra/launcher={name}: it is not installed; pip install 'jaxsafe[launchers]' brings "
+            "joblib, submitit_local and submitit_slurm"
+        ) from None
     except ValueError as error:
         if not str(error).startswith("Only one of --run"):  # Hydra's, of its own flags
             raise

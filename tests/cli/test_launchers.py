@@ -53,3 +53,9 @@ def test_jobs_of_joblib_can_take_a_gpu_each(tmp_path):
     status, _, err = multirun("joblib", tmp_path, "env=which:world", "seed=0,1", gpu)
     assert status == 0, err
     assert (tmp_path / "0").exists() and (tmp_path / "1").exists()
+
+
+def test_a_launcher_that_is_not_installed_is_one_line_that_says_what_to_do(tmp_path):
+    status, out, err = call("train", "-m", *SMALL, "hydra/launcher=nowhere", cwd=tmp_path)
+    assert (status, out) == (2, "") and err.count("\n") == 1
+    assert err.startswith("error: hydra/launcher=nowhere: it is not installed; pip install ")
