@@ -21,6 +21,7 @@ with leaving_at_ctrl_c():
 
     from jaxsafe import envs
     from jaxsafe.commands.benchmark import versions
+    from jaxsafe.commands.guard import guarded
     from jaxsafe.config import ConfigError
     from jaxsafe.learn.rollout import collect, init_rollout, memoryless
 
@@ -112,7 +113,7 @@ def table(rows: list[dict]) -> str:
     return "\n".join(lines)
 
 
-def main() -> int:
+def command() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("envs", nargs="*", metavar="ENV")
     parser.add_argument("--variants", nargs="+", default=["c", "c:3"], metavar="ENGINE[:K]")
@@ -122,20 +123,20 @@ def main() -> int:
     rows = []
     if args.json and args.json.exists():
         rows = [json.loads(line) for line in args.json.read_text().splitlines()]
-    try:
-        for name in args.envs:
-            for variant in args.variants:
-                sums = run(envs.canonical(name), variant, args.episodes)
-                rows.append({"env": name, "variant": variant, "sums": sums, **versions()})
-                if args.json:
-                    with args.json.open("a") as file:
-                        file.write(json.dumps(rows[-1]) + "\n")
-                print(f"{name} {variant}: return {np.mean(sums['return']):.2f}", file=sys.stderr)
-    except ConfigError as error:
-        print(error, file=sys.stderr)
-        return 2
+    for name in args.envs:
+        for variant in args.variants:
+            sums = run(envs.canonical(name), variant, args.episodes)
+            rows.append({"env": name, "variant": variant, "sums": sums, **versions()})
+            if args.json:
+                with args.json.open("a") as file:
+                    file.write(json.dumps(rows[-1]) + "\n")
+            print(f"{name} {variant}: return {np.mean(sums['return']):.2f}", file=sys.stderr)
     print(table(rows))
     return 0
+
+
+def main() -> int:
+    return guarded(command)
 
 
 if __name__ == "__main__":

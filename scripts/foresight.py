@@ -19,6 +19,7 @@ with leaving_at_ctrl_c():
 
     from jaxsafe import Run
     from jaxsafe.algos import ambs, dreamer, safe_dreamer
+    from jaxsafe.commands.guard import guarded
     from jaxsafe.config import ConfigError
     from jaxsafe.learn.acting import Player
     from jaxsafe.learn.dreaming import Behaviour
@@ -88,29 +89,25 @@ def explained(predicted: np.ndarray, paid: np.ndarray) -> float:
     return float(1 - ((predicted - paid) ** 2).mean() / paid.var())
 
 
-def main() -> int:
+def command() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("run", metavar="RUN")
     parser.add_argument("--episodes", type=int, default=40)
     parser.add_argument("--depth", type=int, default=15)
     parser.add_argument("--seed", type=int, default=1)
     args = parser.parse_args()
-    try:
-        run = Run(args.run)
-        name = run.config["algo"]["name"]
-        if name not in BEHAVIOURS:
-            raise ConfigError(f"algo={name}: expected one whose model predicts cost: {[*BEHAVIOURS]}")
-        play_key, dream_key = jax.random.split(jax.random.key(args.seed))
-        player = run.player()
-        most = player.task.episode_length - FIRST - 1
-        if not (1 <= args.depth <= most and args.episodes >= 1):
-            raise ConfigError(
-                f"--episodes {args.episodes} --depth {args.depth}: expected at least one episode, and "
-                f"a depth from 1 to {most}"
-            )
-    except ConfigError as error:
-        print(error, file=sys.stderr)
-        return 2
+    run = Run(args.run)
+    name = run.config["algo"]["name"]
+    if name not in BEHAVIOURS:
+        raise ConfigError(f"algo={name}: expected one whose model predicts cost: {[*BEHAVIOURS]}")
+    play_key, dream_key = jax.random.split(jax.random.key(args.seed))
+    player = run.player()
+    most = player.task.episode_length - FIRST - 1
+    if not (1 <= args.depth <= most and args.episodes >= 1):
+        raise ConfigError(
+            f"--episodes {args.episodes} --depth {args.depth}: expected at least one episode, and "
+            f"a depth from 1 to {most}"
+        )
     keys = jax.random.split(play_key, args.episodes)
     episodes = jax.jit(jax.vmap(lambda key: play(player, key)))(keys)
     found = costs_ahead(player, BEHAVIOURS[name], episodes, args.depth, dream_key)
@@ -120,6 +117,10 @@ def main() -> int:
     for k, (predicted, paid) in enumerate(zip(*found, strict=True), 1):
         print(f"{k:5}  {roc_area(predicted, paid > 0):8.3f}  {explained(predicted, paid):9.2f}")
     return 0
+
+
+def main() -> int:
+    return guarded(command)
 
 
 if __name__ == "__main__":

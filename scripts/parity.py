@@ -16,6 +16,7 @@ with leaving_at_ctrl_c():
     import jax
     import numpy as np
 
+    from jaxsafe.commands.guard import guarded
     from jaxsafe.config import ConfigError
     from jaxsafe.envs.safety_gym.recording import Comparison, Recording, compare
 
@@ -112,7 +113,7 @@ def table(comparisons: list[Comparison]) -> str:
     )
 
 
-def main(argv: list[str] | None = None) -> int:
+def command(argv: list[str] | None) -> int:
     parser = argparse.ArgumentParser(description="Replay recordings of the original engine.")
     parser.add_argument("recordings", nargs="+", type=Path, metavar="RECORDING", help=".npz files")
     parser.add_argument("--engine", default="auto", help="auto (default), c, warp or jax")
@@ -126,10 +127,13 @@ def main(argv: list[str] | None = None) -> int:
             print(report(comparisons[-1]), flush=True)
         if args.table:
             args.table.write_text(table(comparisons))
-    except (ConfigError, OSError) as error:
-        print(f"parity: {error}", file=sys.stderr)
-        return 2
+    except OSError as error:
+        raise ConfigError(str(error)) from error
     return int(any(c.failures() for c in comparisons))
+
+
+def main(argv: list[str] | None = None) -> int:
+    return guarded(lambda: command(argv))
 
 
 if __name__ == "__main__":

@@ -28,6 +28,7 @@ with leaving_at_ctrl_c():
 
     from jaxsafe import algos
     from jaxsafe.commands.benchmark import Timing, config_of, timed, training
+    from jaxsafe.commands.guard import guarded
     from jaxsafe.config import ConfigError, nearest
     from jaxsafe.learn.offline import DataSet, OfflineConfig, data_set
     from jaxsafe.types import State
@@ -132,7 +133,7 @@ def show(kernels: list[Kernel], most: int) -> None:
         print(f"{k.ms:9.2f} ms {k.count:7,} x {each:8.1f} us  {k.name[:40]:40}  {k.source}")
 
 
-def main() -> int:
+def command() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("algo", metavar="ALGO")
     parser.add_argument("options", nargs="*", metavar="key=value")
@@ -144,18 +145,14 @@ def main() -> int:
     args = parser.parse_intermixed_args()
     if args.kernels:  # read when JAX first looks for a device
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_gpu_enable_command_buffer="
-    try:
-        if args.algo not in algos.ALGOS:
-            raise ConfigError(f"unknown algo {args.algo!r}{nearest(args.algo, algos.ALGOS)}")
-        offline = issubclass(algos.ALGOS[args.algo].config, OfflineConfig)
-        if offline and (args.num_envs or args.horizon):
-            raise ConfigError(f"{args.algo} has no environments: leave out --num-envs and --horizon")
-        cfg = config_of(args.algo, args.options, num_envs=args.num_envs, horizon=args.horizon)
-        data = transitions(Weightless()) if offline else ()
-        state, update = training(Weightless(), args.algo, cfg, args.seeds, devices=1, data=data)
-    except ConfigError as error:
-        print(error, file=sys.stderr)
-        return 2
+    if args.algo not in algos.ALGOS:
+        raise ConfigError(f"unknown algo {args.algo!r}{nearest(args.algo, algos.ALGOS)}")
+    offline = issubclass(algos.ALGOS[args.algo].config, OfflineConfig)
+    if offline and (args.num_envs or args.horizon):
+        raise ConfigError(f"{args.algo} has no environments: leave out --num-envs and --horizon")
+    cfg = config_of(args.algo, args.options, num_envs=args.num_envs, horizon=args.horizon)
+    data = transitions(Weightless()) if offline else ()
+    state, update = training(Weightless(), args.algo, cfg, args.seeds, devices=1, data=data)
     size = f"{cfg.updates} gradient steps" if offline else f"{cfg.num_envs} x {cfg.horizon}"
     warm_up = 0 if offline else -(-getattr(cfg, "learning_starts", 0) // (cfg.num_envs * cfg.horizon))
     products = products_of(jax.make_jaxpr(update)(state, np.int32(0)).jaxpr) / 1e12
@@ -169,6 +166,10 @@ def main() -> int:
     if args.kernels:
         show(kernels_of(timing), args.kernels)
     return 0
+
+
+def main() -> int:
+    return guarded(command)
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ with leaving_at_ctrl_c():
     import numpy as np
 
     from jaxsafe import envs
+    from jaxsafe.commands.guard import guarded
     from jaxsafe.config import ConfigError
     from jaxsafe.envs.engines import Simulation
     from jaxsafe.envs.safety_gym import scene as scenes
@@ -71,20 +72,15 @@ def simulated(env: envs.SafetyGym | Velocity, state) -> tuple[Simulation, dict[s
     return small.simulation(env.config), dict(zip(NAMES, fields, strict=True))
 
 
-def main() -> int:
+def command() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("env", metavar="ENV")
     parser.add_argument("--num-envs", type=int, default=16384)
     parser.add_argument("--top", type=int, default=22, help="kernels to list")
     args = parser.parse_args()
-    try:
-        env = envs.make(args.env, engine="warp")
-    except ConfigError as error:
-        print(error, file=sys.stderr)
-        return 2
+    env = envs.make(args.env, engine="warp")
     if jax.default_backend() == "cpu":
-        print("profile_warp: needs an NVIDIA GPU", file=sys.stderr)
-        return 2
+        raise ConfigError("profile_warp needs an NVIDIA GPU")
     import warp as wp
     from mujoco.mjx.third_party import mujoco_warp
 
@@ -160,6 +156,10 @@ def main() -> int:
         for name, times in sorted(spent.items(), key=lambda item: -sum(item[1]))[: args.top]:
             print(f"  {sum(times) / steps:8.3f} ms {len(times) / steps:6.1f}  {name[:80]}")
     return 0
+
+
+def main() -> int:
+    return guarded(command)
 
 
 if __name__ == "__main__":

@@ -212,7 +212,7 @@ def test_engines_are_not_compared_where_there_is_no_goal_or_no_interval(
 ):
     monkeypatch.setattr(sys, "argv", ["closed_loop.py", *words.split(), "--variants", "c"])
     assert closed_loop["main"]() == 2
-    assert capsys.readouterr().err == f"{message}\n"
+    assert capsys.readouterr().err == f"error: {message}\n"
 
 
 def test_the_products_of_a_program_are_counted_in_loops_branches_and_gradients():

@@ -100,7 +100,7 @@ def test_the_script_tells_a_failure_from_bad_input(tmp_path, capsys):
     for bad in (["text.npz"], ["missing.npz"], ["wrong.npz", "--engine", "warped"]):
         assert parity(tmp_path / bad[0], *bad[1:]) == 2
         error = capsys.readouterr().err
-        assert error.startswith("parity: ") and error.count("\n") == 1
+        assert error.startswith("error: ") and error.count("\n") == 1
 
 
 def test_a_recording_without_steps_is_not_a_recording(tmp_path):
