@@ -135,9 +135,11 @@ def mean_actions(runs: Sequence[SettingRun]) -> str:
     found: dict[str, list[tuple[float, float]]] = {}
     for run in runs:
         if constrained(run.config["algo.name"]) and "final sampled cost" in run.values:
-            means = {k: run.values[f"final {k}"].mean() for k in ("return", "cost")}
-            sampled = {k: run.values[f"final sampled {k}"].mean() for k in means}
-            found.setdefault(run.env, []).append(tuple(means[k] - sampled[k] for k in means))
+            ret, cost = (
+                (run.values[f"final {k}"] - run.values[f"final sampled {k}"]).mean()
+                for k in ("return", "cost")
+            )
+            found.setdefault(run.env, []).append((ret, cost))
     means = {env: np.mean(changes, axis=0) for env, changes in found.items()}
     for env, (ret, cost) in sorted(means.items(), key=lambda item: -item[1][1]):
         lines.append(f"| `{env}` | {len(found[env])} | {ret:+.1f} | {cost:+.1f} |")
@@ -149,13 +151,14 @@ def mean_actions(runs: Sequence[SettingRun]) -> str:
 
 def left() -> str:
     """Which studies have runs that were cut off or are not begun, and how many of how many are done."""
-    counts = []
+    lines = ["| studies with runs that are not done | done | listed |", "|---|---:|---:|"]
     for path in sorted(RESULTS.glob("*/study.yaml")):
         study = studies.read(path.parent)
         done = list(states(study).values()).count("done")
         if done < len(study.runs):
-            counts.append(f"[{study.title}]({path.parent.name}/README.md) {done} of {len(study.runs)}")
-    return f"All runs are done but in these studies: {', '.join(counts)}."
+            page = f"[{study.title}]({path.parent.name}/README.md)"
+            lines.append(f"| {page} | {done} | {len(study.runs)} |")
+    return "\n".join(lines)
 
 
 def apart(groups: Sequence[Group], known: Mapping[tuple[str, str], Published]) -> str:

@@ -121,14 +121,14 @@ def command(argv: list[str] | None) -> int:
     parser.add_argument("--table", type=Path, metavar="FILE", help="also write a Markdown table")
     args = parser.parse_args(argv)
     comparisons = []
-    try:
-        for path in args.recordings:
-            comparisons.append(compare(Recording(path), args.engine, args.awake))
-            print(report(comparisons[-1]), flush=True)
-        if args.table:
+    for path in args.recordings:
+        comparisons.append(compare(Recording(path), args.engine, args.awake))
+        print(report(comparisons[-1]), flush=True)
+    if args.table:
+        try:
             args.table.write_text(table(comparisons))
-    except OSError as error:
-        raise ConfigError(str(error)) from error
+        except OSError as error:
+            raise ConfigError(f"--table: {error}") from error
     return int(any(c.failures() for c in comparisons))
 
 
