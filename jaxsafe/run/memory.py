@@ -21,24 +21,29 @@ class TooLarge(ConfigError):
     """What was asked cannot fit the memory."""
 
 
+def too_large(needed: str, advice: str) -> TooLarge:
+    limit, what = device_memory()
+    return TooLarge(f"{needed}, {what} has {limit / 2**30:,.1f}; {advice}")
+
+
+def gib(size: float) -> str:
+    return f"{size / 2**30:,.1f} GiB"
+
+
 def check_memory(env: Env, settings: Settings) -> None:
     """Refuse, before anything is built, a trajectory or an evaluation that cannot fit the device.
 
     Lower bounds. Of a trajectory: observations before and after each step, actions and a few scalars.
     """
-    limit, what = device_memory()
     seen = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(observation_like(env)))
     step = 2 * seen + 4 * (env.action_size + 8 + len(env.cost_names))  # bytes
     steps = settings.row.make(env, None).clocks(settings.algo).steps
     members = len(settings.configs) * settings.train.num_seeds
     need = step * steps * members // settings.train.devices
-    if need > limit:
-        raise TooLarge(
-            f"{steps:,} environment steps an update x {members} seeds needs at least "
-            f"{need / 2**30:,.1f} GiB a device, {what} has {limit / 2**30:,.1f}; use fewer num_envs"
-            + " or a smaller env.vision_size"
-            * sees_pictures(env, settings)
-        )
+    if need > device_memory()[0]:
+        what = f"{steps:,} environment steps an update x {members} seeds"
+        smaller = " or a smaller env.vision_size" * sees_pictures(env, settings)
+        raise too_large(f"{what} needs at least {gib(need)} a device", f"use fewer num_envs{smaller}")
     if isinstance(settings.algo, ModelBasedConfig):
         check_plans(env, settings, members)
     check_episodes(env, settings.train.eval_episodes, members)
@@ -52,60 +57,50 @@ def sees_pictures(env: Env, settings: Settings) -> bool:
 def check_plans(env: Env, settings: Settings, members: int) -> None:
     """Refuse plans that cannot fit the device, for the environments of training or, if they are more,
     for the episodes of an evaluation."""
-    limit, what = device_memory()
     train = settings.train
     worlds = members * max(settings.algo.num_envs // train.devices, train.eval_episodes)
     need = worlds * planning_bytes(env, settings.algo)
-    if need > limit:
-        raise TooLarge(
-            f"planning in {worlds:,} environments at once needs at least {need / 2**30:,.1f} GiB a "
-            f"device, {what} has {limit / 2**30:,.1f}; use fewer num_envs, eval_episodes or algo.plans"
+    if need > device_memory()[0]:
+        raise too_large(
+            f"planning in {worlds:,} environments at once needs at least {gib(need)} a device",
+            "use fewer num_envs, eval_episodes or algo.plans",
         )
 
 
 def check_episodes(env: Env, episodes: int, policies: int) -> None:
     """Refuse an evaluation whose rewards and costs of each step cannot fit the device."""
-    limit, what = device_memory()
     need = 4 * (5 + len(env.cost_names)) * env.episode_length * episodes * policies  # bytes
-    if need > limit:
-        raise TooLarge(
-            f"{episodes:,} episodes of {policies} policies need at least {need / 2**30:,.1f} GiB, "
-            f"{what} has {limit / 2**30:,.1f}; evaluate fewer"
-        )
+    if need > device_memory()[0]:
+        needed = f"{episodes:,} episodes of {policies} policies need at least {gib(need)}"
+        raise too_large(needed, "evaluate fewer")
 
 
 def check_state_memory(program: Program, env: Env, settings: Settings) -> None:
     """Like `check_memory`, for the train state itself, known once it is traced: old and new, but a
     replay only once, as it is written in place. Every device has the whole data set."""
-    limit, what = device_memory()
     devices = settings.train.devices
     like = jax.eval_shape(program.init, program.start, program.shared())
     whole = sum(x.size * x.dtype.itemsize for x in checkpoint.as_data(like).values())
     replay = checkpoint.replay_bytes(like)
     data = sum(x.nbytes for x in jax.tree.leaves(program.data))
     need = (2 * (whole - replay) + replay) / devices + data
-    if need > limit:
-        part = f" ({replay / devices / 2**30:,.1f} GiB of it replay)" if replay else ""
-        part += f" ({data / 2**30:,.1f} GiB of it the data set)" if data else ""
+    if need > device_memory()[0]:
+        part = f" ({gib(replay / devices)} of it replay)" if replay else ""
+        part += f" ({gib(data)} of it the data set)" if data else ""
         sizes = ["algo.replay_size"] + ["env.vision_size"] * sees_pictures(env, settings)
         less = f"a smaller {', '.join(sizes)}" if replay > whole / 2 else "fewer num_envs"
-        raise TooLarge(
-            f"the train state needs {need / 2**30:,.1f} GiB a device{part}, {what} has "
-            f"{limit / 2**30:,.1f}; use {less} or num_seeds"
-        )
+        needed = f"the train state needs {gib(need)} a device{part}"
+        raise too_large(needed, f"use {less} or num_seeds")
 
 
 def check_work_memory(update: Any, cfg: Any) -> None:
     """Refuse a compiled update whose arrays between its operations cannot fit the device. The system
     would end the process without a word. `cfg` is of an algorithm, whose sizes the refusal names."""
-    limit, what = device_memory()
     need = update.memory_analysis().temp_size_in_bytes
-    if need > limit:
+    if need > device_memory()[0]:
         sizes = ["num_envs", "num_seeds", *(f"algo.{n}" for n in WORKING_SIZES if hasattr(cfg, n))]
-        raise TooLarge(
-            f"an update works in {need / 2**30:,.1f} GiB a device, {what} has {limit / 2**30:,.1f}; "
-            f"use a smaller {', '.join(sizes[:-1])} or {sizes[-1]}"
-        )
+        needed = f"an update works in {gib(need)} a device"
+        raise too_large(needed, f"use a smaller {', '.join(sizes[:-1])} or {sizes[-1]}")
 
 
 def capacity(program: Program) -> int:
