@@ -39,18 +39,6 @@ from jaxsafe.run.settings import load, nested, settings_from_options, settings_o
 from jaxsafe.run.sweep_plan import plan
 from jaxsafe.types import Env, PyTree
 
-__all__ = [
-    "ConfigError",
-    "Run",
-    "SweepResult",
-    "collect",
-    "evaluate",
-    "make",
-    "render",
-    "sweep",
-    "train",
-]
-
 
 def make(env: str | SafetyGymConfig | VelocityConfig, **options: Any) -> Any:
     """Build an environment: `reset(key)` and `step(state, action)`, pure and without a batch axis.
