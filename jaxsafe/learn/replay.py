@@ -81,8 +81,9 @@ class Transitions(NamedTuple):
 
     obs: pytree [B, ...]. action: float [B, A]. next_obs: pytree [B, ...], the observation after
     `steps` steps, int [B]. reward, cost: float [B], costs: float [B, K], discounted sums over those
-    steps. terminated: bool [B], next_obs has no value. weight: float [B], 0 for what must not count,
-    else 1; a learner gets weights whose sum is 1, for `mean`.
+    steps; K are the environment's costs, or those under a limit in a batch of a data set. terminated:
+    bool [B], next_obs has no value. weight: float [B], 0 for what must not count, else 1; a learner
+    gets weights whose sum is 1, for `mean`.
     """
 
     obs: PyTree
