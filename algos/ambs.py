@@ -39,6 +39,7 @@ from jaxsafe.types import Algorithm, Env, Metrics, Policy, PyTree, State
 
 MOST_ROLLOUTS = 2**16  # beyond that 32 bits do not tell the exact bound
 PARTS = 10  # of [0, 1], by which the risk is compared with what came
+LEAST_SHARE = 1e-6  # more than float32 is off by, and less than one of the most rollouts
 ROUNDING = 1e-5  # a sum of costs that is above a bound by less is at the bound
 
 
@@ -365,7 +366,7 @@ def overrules(p: jax.Array, cfg: Any) -> jax.Array:
     """Whether the shield acts where a share `p` of the dreams is unsafe, bool []. An infinite
     `delta` turns it off."""
     if cfg.rule == "hoeffding":
-        return p > cfg.delta - cfg.eps
+        return p > cfg.delta - cfg.eps + LEAST_SHARE
     m = cfg.shield_rollouts
     count = jnp.round(p * m)
     # P(B <= count), of a binomial with m draws at delta

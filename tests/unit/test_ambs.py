@@ -71,6 +71,19 @@ def test_one_side_takes_fewer_dreams_and_a_learned_model_four_times_as_many():
     assert "too few" in ambs.note(dataclasses.replace(CFG, shield_rollouts=200))
 
 
+@pytest.mark.parametrize(
+    "rollouts, delta, eps, least",
+    [(100, 0.1, 0.09, 2), (200, 0.1, 0.09, 3), (512, 0.1, 0.09, 6), (500, 0.3, 0.09, 106),
+     (65_536, 0.3, 0.05, 16_385)],
+)  # fmt: skip
+def test_hoeffdings_bound_is_in_a_run_what_is_told_of_it(rollouts, delta, eps, least):
+    """A share of delta - eps is not above it, however 32 bits round the three. m = 65,536 is the most
+    that a run takes."""
+    cfg = dataclasses.replace(CFG, shield_rollouts=rollouts, delta=delta, eps=eps)
+    assert ambs.overruled_from(cfg) == least
+    assert ambs.overruled_from(jax.tree.map(jnp.float32, cfg)) == least
+
+
 @pytest.mark.parametrize("rollouts, allowed", [(44, 0), (64, 1), (128, 5), (256, 14), (512, 35)])
 def test_the_exact_bound_allows_more_than_hoeffdings(rollouts, allowed):
     cfg = dataclasses.replace(CFG, rule="binomial", shield_rollouts=rollouts)
