@@ -595,10 +595,13 @@ def test_divergences_below_a_nat_are_left_alone_row_by_row():
 
 
 def test_overshooting_reads_dreams_of_the_replayed_actions_until_an_episode_ends():
-    """Against a loop over starts and steps, with sequences that begin anew."""
-    rows = recorded(Ticker(episode_length=5), 12)
+    """Against a loop over starts and steps, with sequences that begin anew. No two rows earn the same,
+    and the heads tell them apart. So a target or an action a step off is noticed."""
+    rows = recorded(Echo(episode_length=5, lives=(3, 9)), 12)
     world, params = tiny()
-    params = jax.tree.map(lambda x: x + 0.01, params)  # the heads are 0 at first
+    params = jax.tree.map(
+        lambda x: x + 0.3 * jnp.sin(jnp.arange(x.size)).reshape(x.shape), params
+    )  # the heads are 0 at first
     cfg, ahead = dreamer.DreamerConfig(size="tiny", n_step=11, overshoot=4), 4
     weight, key = jnp.array([0.5, 0.25, 0.25]), jax.random.key(3)
     batch = SequenceBatch(rows, weight)
