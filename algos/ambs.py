@@ -489,16 +489,18 @@ def note(cfg: Any) -> str:
     line = f"shield: overrules from {least} of {m} {what} with a violation"
     line += f" within {cfg.shield_horizon} steps, half the time where that has P = {half:.2g}"
     allowed = f"the policy act with probability {confidence:g} at most where P >= {float(cfg.delta):g}"
-    unknown = ""
-    if cfg.shield == "dreams":
-        unknown = "; how wrong the learned model is, nobody knows"
-        if cfg.verdict == "summed":
-            unknown += "; and verdict=summed takes means for violations, for which none of this holds"
+    exact = required_rollouts(eps, confidence)
+    enough = "enough" if m >= exact else "too few"
+    if cfg.shield == "true_dynamics":
+        if cfg.rule == "binomial":
+            return f"{line}; lets {allowed}"
+        return f"{line}. To let {allowed} takes {exact} ({m} are {enough})"
+    unknown = "; how wrong the learned model is, nobody knows"
+    if cfg.verdict == "summed":
+        unknown += "; and verdict=summed takes means for violations, for which none of this holds"
     if cfg.rule == "binomial":
         return f"{line}; lets {allowed}, if the model is exact{unknown}"
-    exact = required_rollouts(eps, confidence)
     off = required_rollouts(eps, confidence, learned=True)
-    enough = "enough" if m >= exact else "too few"
     return (
         f"{line}. To let {allowed} takes {exact} with an exact model ({m} are {enough}), and {off} "
         f"with a model that is off by {eps:g} / {cfg.shield_horizon} a step at most{unknown}"

@@ -71,6 +71,15 @@ def test_one_side_takes_fewer_dreams_and_a_learned_model_four_times_as_many():
     assert "too few" in ambs.note(dataclasses.replace(CFG, shield_rollouts=200))
 
 
+def test_of_a_shield_in_the_simulator_nothing_is_told_of_a_model():
+    cfg = dataclasses.replace(CFG, shield="true_dynamics")
+    line = ambs.note(cfg)
+    assert "copies of the simulator" in line and line.endswith("takes 285 (512 are enough)")
+    exact = ambs.note(dataclasses.replace(cfg, rule="binomial"))
+    assert exact.endswith("lets the policy act with probability 0.01 at most where P >= 0.1")
+    assert "model" not in line + exact
+
+
 @pytest.mark.parametrize(
     "rollouts, delta, eps, least",
     [(100, 0.1, 0.09, 2), (200, 0.1, 0.09, 3), (512, 0.1, 0.09, 6), (500, 0.3, 0.09, 106),
