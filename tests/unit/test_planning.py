@@ -14,7 +14,7 @@ from scipy.special import softmax
 
 from jaxsafe.algos import ALGOS, loop, pets
 from jaxsafe.learn.acting import Learned
-from jaxsafe.learn.models import Model, Prediction
+from jaxsafe.learn.models import Model, Prediction, init_fitted
 from jaxsafe.learn.planning import (
     Imagined,
     by_return,
@@ -216,6 +216,44 @@ def test_the_mean_and_the_worst_cost_by_hand():
     assert worst_cost(imagined, learned)[0] == 3 + 2
 
 
+@pytest.mark.parametrize(
+    "name, least, most",
+    [
+        ("pets", 1.8, 2.0),
+        ("cce_pets", 1.8, 2.0),
+        ("cap_pets", 1.8, 2.0),
+        ("rce_pets", 0.3, 0.7),
+        ("loop", 1.8, 2.0),
+        ("safe_loop", 0.3, 0.7),
+    ],
+)
+def test_the_worst_case_counts_for_the_rows_that_say_so(name, least, most):
+    """Two steps, which pay what they go ahead. One model of three is sure that they cost three times as
+    much, the others that they cost nothing. A mean cost of 2.1 allows all plans, and a worst cost of
+    2.1 those that go 0.7 ahead."""
+    env: Any = dataclasses.replace(SHORE, episode_length=2)
+    row, nets = ALGOS[name], STEEP if "loop" in name else {}
+    settings: dict[str, Any] = {
+        "models": 3, "model_hidden": (), "particles": 1, "plan_steps": 2, "plans": 200,
+        "cem_iterations": 8, "plan_var": 1.0, "cost_limit": 2.1,
+    }  # fmt: skip
+    cfg = row.config(**settings | ({"hidden": (), "layer_norm": False} if nets else {}))
+    model = init_fitted(jax.random.key(0), env, cfg).params
+    weight = jnp.zeros((3, 2, 6)).at[:, 1, 0].set(1.0).at[0, 1, 1].set(3.0)  # reward and cost, of a
+    layers = (model.ensemble.layers[0].replace(weight=weight),)
+    low = jnp.full_like(model.ensemble.low, -30.0)
+    model = model.replace(ensemble=model.ensemble.replace(layers=layers, low=low, high=low + 1e-3))
+    learned = learned_by(cfg, dual=jnp.zeros(()), model=model, **nets)
+    policy = row.make(env).policy
+
+    def act(key):
+        action, carry, _ = policy.act(learned, policy.init(learned), jnp.zeros(1), key)
+        return action[0] + carry.mean[0, 0]
+
+    ahead = jax.jit(act, compiler_options=FAST)(jax.random.key(0))
+    assert least <= ahead <= most + 1e-3
+
+
 # ---- the border of the feasible ------------------------------------------------------------------
 
 RET = jnp.array([5.0, 4.0, 3.0, 2.0, 1.0])
@@ -268,15 +306,25 @@ def test_soft_weights_by_hand():
 # ---- LOOP ----------------------------------------------------------------------------------------
 
 
+def linear(*kernel: Any) -> dict[str, Any]:
+    """A network, or a stack of them, of one layer without a bias."""
+    weight = jnp.array(kernel)
+    bias = jnp.zeros((*weight.shape[:-2], weight.shape[-1]))
+    return {"params": {"Dense_0": {"kernel": weight, "bias": bias}}}
+
+
+# Q_1(s, a) = a + s / 2 and Q_2 = a - s / 2, so that either may be the smaller; the actor: tanh(-5 s)
+STEEP: dict[str, Any] = {
+    "critic_r": linear([[0.5], [1.0]], [[-0.5], [1.0]]),
+    "actor": linear([-5.0, 0.0]),
+}
+
+
 def test_the_plan_is_worth_the_smaller_value_of_what_the_actor_does_at_its_end():
-    """Q_1(s, a) = a + s / 2 and Q_2 = a - s / 2, so that either may be the smaller, and the actor does
-    tanh(-5 s). From s' = s + a the plan should go down, where Q(s', a) of the action before would have
-    it go up."""
+    """From s' = s + a the plan should go down, where Q(s', a) of the action before would have it go
+    up."""
     cfg = loop.LOOPConfig(hidden=(), layer_norm=False, plan_steps=2, discount=0.5, true_model=True)
-    weight = jnp.array([[[0.5], [1.0]], [[-0.5], [1.0]]])
-    critics = {"params": {"Dense_0": {"kernel": weight, "bias": jnp.zeros((2, 1))}}}
-    actor = {"params": {"Dense_0": {"kernel": jnp.array([[-5.0, 0.0]]), "bias": jnp.zeros(2)}}}
-    learned = learned_by(cfg, critic_r=critics, actor=actor)
+    learned = learned_by(cfg, **STEEP)
     planner = loop.planner(SHORE)
 
     def ret(s, alive=True):
