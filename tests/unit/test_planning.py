@@ -340,6 +340,26 @@ def test_the_plan_is_worth_the_smaller_value_of_what_the_actor_does_at_its_end()
     assert jnp.argmax(ret(s)) == 0
 
 
+def test_the_first_action_leads_to_where_the_actor_does_most():
+    """One step ahead, unpaid: the actor does most where s' = s + a / 5 is low. Q of the action that
+    leads there is the larger the more that goes up."""
+
+    @dataclass(frozen=True)
+    class Unpaid(Shore):
+        def _state(self, x: jax.Array, reward: jax.Array) -> State:
+            return super()._state(x, 0.0 * reward)
+
+    env: Any = Unpaid()
+    options: dict[str, Any] = {"plan_steps": 1, "plan_var": 1.0, "true_model": True}
+    cfg = loop.LOOPConfig(hidden=(), layer_norm=False, **options)
+    policy, learned = planning_policy(env, loop.planner(env)), learned_by(cfg, **STEEP)
+
+    def act(key):
+        return policy.act(learned, policy.init(learned), env.at(0.0), key)[0]
+
+    np.testing.assert_allclose(jax.jit(act, compiler_options=FAST)(jax.random.key(0)), -1, atol=0.1)
+
+
 def test_what_the_actor_does_in_each_model_is_among_the_plans():
     """In model m a step goes m ahead, and the actor does tanh(s / 4)."""
     cfg = loop.LOOPConfig(hidden=(), plan_steps=3, actor_plans=2, particles=4)
