@@ -30,6 +30,7 @@ import io
 import json
 import math
 import re
+import textwrap
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
@@ -295,7 +296,8 @@ def opened(path: str, file: Path) -> Iterator[Source]:
                 f"dataset={path} is neither .hdf5 nor .npz, by how it begins and ends"
             ) from error
         kind = ".hdf5" if hdf5 else ".npz"
-        raise ConfigError(f"dataset={path} cannot be read as {kind}: {one_line(error)}") from error
+        reason = textwrap.shorten(one_line(error), 200)  # it may quote what the file holds
+        raise ConfigError(f"dataset={path} cannot be read as {kind}: {reason}") from error
 
 
 def in_text(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:

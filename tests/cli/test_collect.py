@@ -436,6 +436,17 @@ def test_a_strangers_hdf5_reads_no_other_file_and_takes_no_more_memory_than_it_h
     )
 
 
+def test_what_a_torn_npz_holds_is_not_said_at_length(tmp_path):
+    path = tmp_path / "data.npz"
+    write_dataset(path, made()[0])
+    torn = bytearray(path.read_bytes())
+    torn[26:28] = (1000).to_bytes(2, "little")  # the length of the first array's name
+    path.write_bytes(torn)
+    with pytest.raises(ConfigError, match=r"cannot be read as \.npz: File name in") as error:
+        read_dataset(str(path))
+    assert len(str(error.value)) < len(str(path)) + 250
+
+
 @pytest.mark.parametrize(
     "size, message",
     [
