@@ -308,10 +308,24 @@ def in_text(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
 
 
 def in_attributes(file: h5py.File) -> dict[str, Any]:
-    """Those that are one text or one number."""
-    lone = (name for name in file.attrs if file.attrs.get_id(name).shape == ())
-    said = {name: file.attrs[name] for name in lone}
-    return {name: x.item() if isinstance(x, np.generic) else x for name, x in said.items()}
+    """Those that are one number, or one text of a fixed length. In a damaged file HDF5 may crash at a
+    text of another length, or never end."""
+    kept = {name: file.attrs.get_id(name) for name in file.attrs}
+    plain = [name for name, x in kept.items() if x.shape == () and x.dtype.kind in "biufS"]
+    said: dict[str, Any] = {name: file.attrs[name] for name in plain}
+    return {
+        k: x.decode(errors="replace") if isinstance(x, bytes) else x.item() for k, x in said.items()
+    }
+
+
+def with_attributes(file: h5py.File, about: Mapping[str, str | int | float]) -> None:
+    """Adds what `in_attributes` reads."""
+    for name, said in about.items():
+        if isinstance(said, str):
+            text = said.encode()
+            file.attrs.create(name, text, dtype=h5py.string_dtype("utf-8", max(1, len(text))))
+        else:
+            file.attrs[name] = said
 
 
 def in_hdf5(path: str, file: h5py.File, size: int) -> Source:
@@ -386,11 +400,11 @@ def write_dataset(
             np.savez_compressed(part, **named)
             return
         memory = io.BytesIO()  # HDF5 may crash the process where a disk fails
-        with h5py.File(memory, "w") as file:
+        with h5py.File(memory, "w", libver=("v108", "v108")) as file:  # texts beyond 64 kB
             for name, x in arrays.items():
                 bytewise = x.dtype.itemsize == 1  # pictures and truth values; floats hardly shrink
                 file.create_dataset(name, data=x, compression="lzf" if bytewise else None)
-            file.attrs.update(dict(about or {}))
+            with_attributes(file, about or {})
         part.write_bytes(memory.getbuffer())
 
 

@@ -63,7 +63,7 @@ def test_whole_episodes_of_every_policy_with_dsrls_keys_and_a_recipe(run, tmp_pa
     assert not arrays["terminals"].any()
     assert len(np.unique(arrays["observations"][::20], axis=0)) == 11  # of one run given twice, too
     recipe = json.loads(attrs["recipe"])
-    assert [x["share"] for x in recipe["runs"]] == [0.25, 0.75] and attrs["actions"] == "mean"
+    assert [x["share"] for x in recipe["runs"]] == [0.25, 0.75] and attrs["actions"] == b"mean"
     assert recipe["runs"][0]["algo"] == "ppo_lag" and recipe["runs"][0]["seeds"] == 2
     # the recorded steps are those of the environment
     env, size = Corridor(), np.float32(0.02)
@@ -264,6 +264,16 @@ def test_both_kinds_of_file_say_the_same(run, tmp_path):
     recipe = json.loads(one["recipe"])
     assert recipe["seed"] == 3 and recipe["runs"][0]["seeds"] == 2
     assert json.loads(one["env"])["name"] == "toys:Corridor"
+
+
+def test_a_text_of_any_length_in_a_strangers_hdf5_is_passed_over(tmp_path):
+    """Where one is damaged, HDF5 crashes the process, or never ends. Ours have a fixed length."""
+    path, ours = tmp_path / "data.hdf5", {"env": "x" * 100_000, "commit": "", "count": 3}
+    write_dataset(path, made()[0], about=ours)
+    with h5py.File(path, "a") as file:
+        assert all(file.attrs.get_id(name).dtype.kind in "iS" for name in file.attrs)
+        file.attrs.update({"text": "text", "latin": np.bytes_(b"\xe4"), "several": [1, 2]})
+    assert read_about(str(path)) == ours | {"latin": "\ufffd"}
 
 
 @pytest.mark.parametrize("suffix", [".hdf5", ".npz"])
