@@ -25,6 +25,9 @@ from jaxsafe.run.progress import Reporter
 from jaxsafe.run.settings import TrainConfig
 from jaxsafe.types import PyTree
 
+# For XLA on a CPU. To optimise what runs once takes seconds, and saves none.
+RUN_ONCE = {"xla_backend_optimization_level": 1, "xla_llvm_disable_expensive_passes": True}
+
 
 class Hooks(NamedTuple):
     """What a session adds to the loop.
@@ -139,7 +142,8 @@ def train(
 def fresh(program: Program, hooks: Hooks) -> Start:
     """The train state before the first update."""
     given = distributed.place(program.start, program.sharding)
-    ts = jax.jit(program.init)(given, program.shared())
+    options = RUN_ONCE if jax.default_backend() == "cpu" else None
+    ts = jax.jit(program.init, compiler_options=options)(given, program.shared())
     return Start(distributed.place(hooks.adapt(ts), program.sharding))
 
 

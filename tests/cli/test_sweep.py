@@ -317,6 +317,17 @@ def test_the_memory_decides_how_many_members_run_at_once(monkeypatch):
         sweep.members_at_once(settings, None)
 
 
+def test_a_train_state_is_the_same_compiled_well_or_quickly():
+    (settings,) = planned(*SMALL, *GRID).groups.values()
+    _, program = session.prepare(settings)
+    well = {"xla_backend_optimization_level": 3, "xla_llvm_disable_expensive_passes": False}
+    expected = jax.jit(program.init, compiler_options=well)(program.start, program.shared())
+    found = loop.fresh(program, loop.Hooks("")).ts
+    jax.tree.map(
+        np.testing.assert_array_equal, checkpoint.to_arrays(found), checkpoint.to_arrays(expected)
+    )
+
+
 def test_a_folder_of_another_sweep_is_refused_and_a_longer_one_is_not(finished, tmp_path):
     def opened(*texts: str) -> dict[str, int]:
         asked = planned(*SMALL, *texts, f"run_dir={finished}")
