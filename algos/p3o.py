@@ -28,17 +28,15 @@ class P3OConfig(ppo.PPOConfig):
     Source: Zhang et al. (2022), "Penalized Proximal Policy Optimization for Safe Reinforcement
     Learning", arXiv:2205.11814, equation 13.
     Differs from it: the paper's c is the discounted violation, times (1 - gamma). Both are violations
-    per step, but weigh the steps differently. Here each minibatch subtracts its mean of A_c from the
-    cost's surrogate. That mean is noise around 0. The max would keep its positive part, and costs would
-    end well below the limit. OmniSafe does not subtract it (`centre_cost=False`), takes c per episode
-    (`per_step=False`) and does not clip the cost's surrogate (`clip_cost=False`).
+    per step, but weigh the steps differently. OmniSafe takes c per episode (`per_step=False`) and does
+    not clip the cost's surrogate (`clip_cost=False`).
     """
 
     CONVENTIONS: ClassVar = (
         Convention(
-            {"per_step": False, "clip_cost": False, "centre_cost": False},
+            {"per_step": False, "clip_cost": False},
             "the penalty is kappa max(0, E[w A_c] + J_c - cost_limit), per episode",
-            "it is the paper's, clipped and per step, without the noise of a minibatch's mean of A_c",
+            "it is the paper's, clipped and per step",
         ),
     )
 
@@ -48,8 +46,9 @@ class P3OConfig(ppo.PPOConfig):
     per_step: bool = True
     # Whether the cost's surrogate is max(w A_c, clip(w) A_c). OmniSafe's is w A_c.
     clip_cost: bool = True
-    # Whether the mean of A_c over each minibatch is subtracted. OmniSafe does not.
-    centre_cost: bool = True
+    # Whether the mean of A_c over each minibatch is subtracted. That mean is noise, whose positive part
+    # the penalty keeps as a margin: without it costs end over the limit.
+    centre_cost: bool = False
 
 
 def penalised(objectives: Pair, context: Context) -> Objective:
@@ -60,8 +59,8 @@ def penalised(objectives: Pair, context: Context) -> Objective:
     def objective(actor: PyTree, batch: Any) -> tuple[jax.Array, Metrics]:
         reward, metrics = objectives.reward(actor, batch)
         cost, _ = objectives.cost(actor, batch)
-        # A_c is centred over the whole batch. Its mean over a minibatch is noise, which max(0, x) would
-        # turn into a penalty.
+        # A_c is centred over the whole batch. Its mean over a minibatch is noise, which max(0, x) turns
+        # into a penalty.
         cost -= jnp.mean(batch.adv_c) if cfg.centre_cost else 0.0
         # max(0, x) of the mean over all devices, as a factor: its gradient is this device's share
         beyond = jax.lax.stop_gradient(pmean(cost, context.axis_name) + violation)

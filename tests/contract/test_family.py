@@ -154,10 +154,12 @@ def test_the_penalty_is_felt_beyond_the_limit_alone(excess, price, omnisafe):
 
 
 @pytest.mark.parametrize("noise", [-1.0, 1.0])
-@pytest.mark.parametrize("violation, penalty", [(-0.2, 0.0), (0.2, 3.0 * 0.2)])
-def test_the_mean_of_a_minibatchs_cost_advantages_is_not_a_violation(violation, penalty, noise):
-    """At the policy that acted, whatever states a minibatch happens to hold."""
-    cfg = p3o.P3OConfig(hidden=(8,), kappa=3.0)
+@pytest.mark.parametrize("violation", [-0.2, 0.2])
+@pytest.mark.parametrize("centred", [False, True])
+def test_noise_of_a_minibatch_is_a_violation_unless_it_is_centred(centred, violation, noise):
+    """The mean of A_c over a minibatch depends on the states that it happens to hold."""
+    cfg = p3o.P3OConfig(hidden=(8,), kappa=3.0, centre_cost=centred)
+    penalty = 3.0 * max(0.0, violation + (0.0 if centred else noise))
     actor, batch = problem(cfg)
     batch = dataclasses.replace(batch, adv_c=batch.adv_c + noise)
 
