@@ -1,7 +1,7 @@
 """PPO, and PPO with each treatment of the constraint and each augmentation of the task."""
 
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 from jaxsafe.algos import pg
 from jaxsafe.config import Bounds, config
@@ -98,6 +98,8 @@ class CPPOPIDConfig(PIDConfig, PPOConfig):
     several iterations, where the algorithm has the last violation and one iteration. I begins at
     `lam_init`, in the algorithm at 0.
     """
+
+    SUITS: ClassVar = {"parallel": ("hopper_velocity",)}
 
 
 @config

@@ -1,7 +1,7 @@
 """Soft actor-critic, alone and with each treatment of the constraint."""
 
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -80,6 +80,14 @@ class SACLagConfig(MultiplierConfig, SACConfig):
     its speed depends on `replay_ratio`. There is one critic of cost, without a floor, whose target
     takes the policy's mean action, and unit is 1.
     """
+
+    # Where the defaults hardly learn (docs/results/off_policy)
+    SUITS: ClassVar = {
+        "navigation": (
+            "point_goal2", "car_goal2", "point_button1", "car_button1", "point_button2", "car_button2",
+            "point_push1", "car_push1",
+        )
+    }  # fmt: skip
 
 
 @config

@@ -5,7 +5,7 @@ The parts of a deterministic policy are shared with DDPG.
 
 from collections.abc import Callable
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -96,6 +96,8 @@ class TD3LagConfig(MultiplierConfig, TD3Config):
     its speed depends on `replay_ratio`. There is one critic of cost, without a floor, whose target
     takes mu(s') without noise, and unit is 1.
     """
+
+    SUITS: ClassVar = {"decay": ("halfcheetah_velocity", "ant_velocity")}  # docs/results/td3
 
     # Standard deviation of the noise on actions in training, in the boldest environment. OmniSafe has
     # 0.1, too, and `td3` here 0.5. The price is learned for actions with noise, and with so much of it
@@ -256,7 +258,7 @@ ROWS = {
         TD3LagConfig,
         partial(make, treatment=damped_lagrangian),
         "TD3 with an adaptive price on cost",
-        published(sac.LAG, sac.LAG_NAVIGATION, BOLD),
+        published(sac.LAG, sac.LAG_NAVIGATION, BOLD) | {"decay": {"lr_decay": True}},
         total_steps=5_000_000,
         omnisafe="TD3Lag",
         lever=LEVER | sac.LEVER_LAG,

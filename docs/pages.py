@@ -20,7 +20,7 @@ from typing import Annotated, Any
 
 from jaxsafe.algos import ALGOS, Row
 from jaxsafe.algos.ambs import AMBSConfig
-from jaxsafe.envs import CarRacing, make, pendulum
+from jaxsafe.envs import ENVS, CarRacing, make, pendulum
 from jaxsafe.envs.racing import car as racing_car
 from jaxsafe.envs.racing import picture as racing_picture
 from jaxsafe.envs.racing import task as racing
@@ -41,7 +41,7 @@ from jaxsafe.report.published import read_published
 from jaxsafe.report.read import SettingRun, read
 from jaxsafe.run import compat, help
 from jaxsafe.run.plain import as_text
-from jaxsafe.run.settings import first_published
+from jaxsafe.run.settings import first_published, preset_for
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
@@ -462,10 +462,22 @@ def published(row: Row) -> str:
             f"`preset=published` ({origin})" if origin == first_published(row) else f"`preset={origin}`"
         )
         lines.append(f"{preset}: {changed}.")
+    if suits := suited(row):
+        tasks = "; ".join(f"`{name}` on {', '.join(tasks)}" for name, tasks in suits.items())
+        lines.append(f"A run that names no preset has {tasks}. On all others it has `fast`.")
     if conventions := compat.overrides("omnisafe", row.config):
         changed = ", ".join(f"`{name}={value}`" for name, value in conventions.items())
         lines.append(f"`compat=omnisafe` ([why](../howto/migrate.md#conventions)): {changed}.")
     return "\n\n".join(lines)
+
+
+def suited(row: Row) -> dict[str, list[str]]:
+    """The tasks on which `preset=auto` is another preset than fast, by that preset."""
+    found: dict[str, list[str]] = {}
+    for task in ENVS:
+        if (preset := preset_for(task, row)) != "fast":
+            found.setdefault(preset, []).append(f"`{task}`")
+    return found
 
 
 @functools.cache

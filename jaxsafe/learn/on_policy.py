@@ -78,6 +78,8 @@ class OnPolicyConfig(EncoderConfig):
     """What the on-policy algorithms share."""
 
     POLICY_STEPS: ClassVar = 1  # steps of the policy in an iteration
+    # The tasks whose default is a preset (docs/results/velocity)
+    SUITS: ClassVar = {"frequent": ("walker2d_velocity", "swimmer_velocity", "humanoid_velocity")}
 
     CONVENTIONS: ClassVar = (
         Convention(
@@ -171,9 +173,13 @@ OMNISAFE: dict[str, Any] = {
 FREQUENT: dict[str, Any] = {"num_envs": 128, "horizon": 160, "minibatches": 32, "critic_epochs": 20}
 
 
+# OmniSafe's settings with rollouts side by side, for Hopper (docs/results/velocity_settings)
+PARALLEL: dict[str, Any] = {"num_envs": 160, "horizon": 125}
+
+
 def presets(omnisafe: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """The presets of an on-policy algorithm whose published settings are `omnisafe`."""
-    return {"omnisafe": omnisafe, "frequent": FREQUENT}
+    return {"omnisafe": omnisafe, "frequent": FREQUENT, "parallel": omnisafe | PARALLEL}
 
 
 @flax.struct.dataclass

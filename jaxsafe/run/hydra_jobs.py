@@ -172,12 +172,16 @@ def check_arguments(argv: list[str]) -> Request:
         if name in given and given[name].is_sweep_override():
             raise ConfigError(f"{name} takes one value, not a sweep")
     top = {name: given[name].value() for name in ONE_VALUE if name in given}
+    if swept_otherwise(typed):  # what a sweeper of its own will choose is not known
+        top.setdefault("preset", "fast")
     known = every_default(typed, top)
+    check_presets(known)
     chosen = {kind: {each[kind]["name"]: each[kind] for each in known} for kind in DEFAULT}
     for override in typed.overrides:
         check_override(override, known, typed.multirun)
     check_agreement({name: o.value() for name, o in given.items() if not o.is_sweep_override()})
     base = {k: v for k, v in known[0].items() if k not in DEFAULT}
+    base |= {"preset": "auto"} if several(known) else {}  # each job has its own
     base |= {k: v for k, v in top.items() if v is not True}  # resume=true names no folder
     lengths = {name: given[name] for name in LENGTHS if name in given}
     firsts = {k: choices(o)[0] if o.is_sweep_override() else o.value() for k, o in lengths.items()}
@@ -197,6 +201,29 @@ def every_default(typed: Typed, top: dict[str, Any]) -> list[dict[str, Any]]:
         for env in names["env"]
         for algo in names["algo"]
     ]
+
+
+def swept_otherwise(typed: Typed) -> bool:
+    """Whether a sweeper is chosen or set that may pick environments and algorithms itself."""
+    return any(o.key_or_group.startswith(("hydra.sweeper", "hydra/sweeper")) for o in typed.overrides)
+
+
+def several(known: list[dict[str, Any]]) -> bool:
+    """Whether the `known` defaults are of several presets."""
+    return len({each["preset"] for each in known}) > 1
+
+
+def check_presets(known: list[dict[str, Any]]) -> None:
+    """Raise ConfigError where tasks of a sweep have different defaults of an algorithm: Hydra composes
+    one set of options for each."""
+    first: dict[str, dict[str, Any]] = {}
+    for each in known:
+        before = first.setdefault(each["algo"]["name"], each)
+        if several([before, each]):
+            tasks = ", ".join(f"{x['preset']} on {x['env']['name']}" for x in (before, each))
+            raise ConfigError(
+                f"the defaults of {each['algo']['name']} are {tasks}; give one, such as preset=fast"
+            )
 
 
 def check_override(override: Override, known: list[dict[str, Any]], multirun: bool) -> None:
@@ -243,8 +270,7 @@ def groups_of(typed: Typed, chosen: Groups, base: dict[str, Any]) -> Groups:
     """
     if isinstance(base["resume"], str):
         return chosen
-    names = [override.key_or_group for override in typed.overrides]
-    if any(name.startswith(("hydra.sweeper", "hydra/sweeper")) for name in names):
+    if swept_otherwise(typed):
         entries = every_entry(base["preset"], base["compat"])
     else:
         entries = {"env": {name: {} for name in envs.ENVS}, "algo": {name: {} for name in algos.ALGOS}}

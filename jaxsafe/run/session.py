@@ -29,7 +29,9 @@ from jaxsafe.run.settings import (
     NOT_COMPARED,
     Settings,
     TrainConfig,
+    algo_options,
     make_env,
+    preset_for,
     settings_of_run,
     unusual_in_words,
 )
@@ -226,7 +228,7 @@ def run_alone(session: Session, report: Reporter, finish: Finish, hooks: loop.Ho
             to_wandb = wandb_callback(session.folder, settings.plain(), program.members)
             hooks = hooks._replace(callbacks=(*hooks.callbacks, to_wandb))
     report.line(greeting(session))
-    if line := about_cpu(settings):
+    for line in filter(None, (about_preset(settings), about_cpu(settings))):
         report.line(line)
     for line in dict.fromkeys(filter(None, map(settings.row.note, settings.configs))):
         report.line(line)
@@ -288,13 +290,21 @@ def write_head(session: Session) -> None:
         run_folder.append_versions(folder, device_name(), engine_of(session.env), data)
 
 
+def about_preset(settings: Settings) -> str:
+    """That the task has defaults of its own, if these are they; else ''."""
+    preset = settings.train.preset
+    if preset == "fast" or preset != preset_for(settings.env_name, settings.row):
+        return ""
+    return f"preset={preset}, which suits {settings.env_name}; preset=fast has the general defaults"
+
+
 def about_cpu(settings: Settings) -> str:
     """On a CPU: that there are settings for it, if these are the defaults; else ''."""
     meant = settings.row.published.get("cpu")
     if jax.default_backend() != "cpu" or not meant:
         return ""
-    defaults = settings.row.config()
-    if any(getattr(settings.algo, name) != getattr(defaults, name) for name in meant):
+    defaults = algo_options(settings.row, preset_for(settings.env_name, settings.row))
+    if any(getattr(settings.algo, name) != defaults[name] for name in meant):
         return ""
     return "the defaults are for a GPU; preset=cpu is for two cores and half an hour"
 

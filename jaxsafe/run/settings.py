@@ -82,7 +82,9 @@ class TrainConfig:
     coordinator: str | None = None
     num_processes: Devices | None = None  # how many processes there are
     process_index: Period | None = None  # which of them this is, from 0
-    preset: str = "fast"  # the algorithm's defaults: fast, published, or another of docs/choosing.md
+    # the algorithm's defaults: fast, published, or another of docs/choosing.md. auto: those that were
+    # found to suit the task, fast where none were
+    preset: str = "auto"
     compat: str = "none"  # whose departures from the papers to follow: none, or omnisafe
     run_dir: str | None = None  # the run folder; null: runs/ENV-ALGO/TIME-seedN
     # true: go on in run_dir or, without it, with the newest unfinished run of these settings; or the
@@ -195,6 +197,7 @@ def settings_from_config(config: dict[str, Any], extras: Extras = NO_EXTRAS) -> 
     algo_name = algo.pop("name", None)
     row = find_algo(algo_name, extras)
     train = from_dict(TrainConfig, top)
+    train = dataclasses.replace(train, preset=preset_for(env_name, row, train.preset))
     if train.dataset is not None and train.total_updates is None:
         train = dataclasses.replace(train, total_updates=OFFLINE_UPDATES)
     if train.num_envs is not None:
@@ -281,7 +284,8 @@ def defaults_of(
     algo_name = names["algo"] or DEFAULT["algo"]
     row = find_algo(algo_name, extras)
     check_preset(algo_name, row, preset)
-    return dataclasses.asdict(TrainConfig(total_steps=row.total_steps)) | {
+    preset = preset_for(env_name, row, preset)
+    return dataclasses.asdict(TrainConfig(total_steps=row.total_steps, preset=preset)) | {
         "env": {"name": env_name, **entry.defaults},
         "algo": {"name": algo_name, **algo_options(row, preset, compat)},
     }
@@ -371,6 +375,18 @@ def algo_options(row: Row, preset: str = "fast", compat: str = "none") -> dict[s
     """The defaults of an algorithm; those of `preset` if it has that one."""
     options = {**presets(row).get(preset, {}), **overrides(compat, row.config)}
     return dataclasses.asdict(row.config(**options))
+
+
+def preset_for(env_name: str, row: Row, preset: str = "auto") -> str:
+    """`preset`, or what auto stands for on a task: the preset that a class of the algorithm's config
+    names for it in `SUITS`, if the row has that one; else fast."""
+    if preset != "auto":
+        return preset
+    suits = {}
+    for cls in reversed(row.config.__mro__):
+        suits |= {task: name for name, tasks in vars(cls).get("SUITS", {}).items() for task in tasks}
+    found = suits.get(env_name, "fast")
+    return found if found in presets(row) else "fast"
 
 
 def first_published(row: Row) -> str:
@@ -501,7 +517,7 @@ def check_compat(name: str) -> str:
 
 
 def check_preset(algo: str, row: Row, preset: str) -> None:
-    if preset not in (valid := presets(row)):
+    if preset not in (valid := ["auto", *presets(row)]):
         raise ConfigError(f"preset={preset} of {algo}{nearest(preset, valid)}")
 
 

@@ -91,7 +91,7 @@ BAD = {
     "+seed=1": "without '+'",
     "seed": "cannot read",
     "algo.clip=[1": "cannot read",
-    "preset=quick": "valid: fast",
+    "preset=quick": "valid: auto, fast",
     "compat=omnisaf": "did you mean 'omnisafe'?",
     f"run_dir={'long' * 70}": "at most 255 bytes",
     "resume=nowhere": "not a run folder",
@@ -529,3 +529,36 @@ def test_a_resumed_run_does_not_start_from_the_other_policy_again(
     assert "starting from" not in capsys.readouterr().out
     assert run_folder.read_config(tmp_path / "run")["init_from"] == "source"
     assert run_folder.newest_progress(tmp_path / "run") == (4, 4 * STEPS, 16)
+
+
+@pytest.mark.parametrize(
+    "task, algo, preset",
+    [
+        ("walker2d_velocity", "ppo_lag", "frequent"),
+        ("SafetyWalker2dVelocity-v1", "ppo_lag", "frequent"),
+        ("hopper_velocity", "cppo_pid", "parallel"),
+        ("hopper_velocity", "ppo_lag", "fast"),
+        ("ant_velocity", "td3_lag", "decay"),
+        ("point_button1", "sac_lag", "navigation"),
+        ("point_goal1", "sac_lag", "fast"),
+    ],
+)
+def test_a_run_has_the_preset_that_suits_its_task_unless_it_names_one(task, algo, preset):
+    chosen = [f"env={task}", f"algo={algo}"]
+    found = arguments.compose(chosen)
+    for named in ("auto", preset):
+        assert arguments.compose([*chosen, f"preset={named}"]).plain() == found.plain()
+    assert found.train.preset == preset
+    assert arguments.compose([*chosen, "preset=fast"]).algo == algos.ALGOS[algo].config()
+    assert (preset in session.about_preset(found)) == (preset != "fast")
+    assert settings.settings_from_config(found.plain()).plain() == found.plain()
+
+
+def test_tasks_of_a_sweep_must_have_one_preset_of_an_algorithm():
+    several = ["-m", "env=walker2d_velocity,ant_velocity"]
+    with pytest.raises(ConfigError, match=r"frequent on walker2d_velocity, fast on ant_velocity; give"):
+        hydra_jobs.check_arguments([*several, "algo=ppo"])
+    assert hydra_jobs.check_arguments([*several, "algo=ppo", "preset=fast"]).base["preset"] == "fast"
+    assert hydra_jobs.check_arguments([*several, "algo=sac"]).base["preset"] == "fast"
+    each = hydra_jobs.check_arguments(["-m", "env=walker2d_velocity", "algo=ppo,sac"])
+    assert each.base["preset"] == "auto" and each.groups["algo"]["ppo"]["horizon"] == 160

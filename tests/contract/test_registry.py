@@ -11,7 +11,7 @@ from jaxsafe.config import ConfigError
 from jaxsafe.interop import migrate
 from jaxsafe.learn.on_policy import OnPolicyConfig
 from jaxsafe.run.arguments import compose
-from jaxsafe.run.settings import find_algo
+from jaxsafe.run.settings import find_algo, preset_for
 
 ROOT = Path(__file__).parent.parent.parent
 sys.path.insert(0, str(ROOT / "docs"))
@@ -101,6 +101,9 @@ def test_a_row_of_your_own_is_loaded_by_its_address(tmp_path, monkeypatch):
     algos.load("mine:row")
     assert find_algo("mine:row").summary == "PPO that pays half"
     assert issubclass(find_algo("mine:row").config, OnPolicyConfig)
+    assert (
+        preset_for("walker2d_velocity", find_algo("mine:row")) == "fast"
+    )  # it has no other that suits
     sys.modules.pop("mine")
 
 
