@@ -31,6 +31,7 @@ SHIPPED = {
         ("hopper_velocity", x): "preset=published algo.num_envs=160 algo.horizon=125"
         for x in ("cpo", "cppo_pid")
     },
+    ("hopper_velocity", "focops"): FREQUENT,
     **{
         (f"{robot}_velocity", "td3_lag"): "preset=fast algo.lr_decay=true"
         for robot in ("halfcheetah", "ant")
@@ -38,10 +39,7 @@ SHIPPED = {
 }
 # What docs/choosing.md advises in place of it
 EARLY_PRICE = f"{FREQUENT} algo.lam_init=1 total_steps=2e6"
-ADVISED = {
-    **{("swimmer_velocity", x): EARLY_PRICE for x in ("ppo_lag", "trpo_lag")},
-    ("hopper_velocity", "focops"): FREQUENT,
-}
+ADVISED = {("swimmer_velocity", x): EARLY_PRICE for x in ("ppo_lag", "trpo_lag")}
 # of another task, limit or number of seeds
 OTHERS = ("env.rules=", "algo.cost_limit=", "num_seeds=")
 
