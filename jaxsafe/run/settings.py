@@ -186,7 +186,8 @@ def settings_from_config(config: dict[str, Any], extras: Extras = NO_EXTRAS) -> 
 
     Args:
         config: as config.yaml has it: {'env': {'name': ...}, 'algo': {'name': ...}, 'seed': 0, ...}.
-            An option that is missing has the default of the code, whatever the preset.
+            An option that is missing has the default of the code, whatever the preset. A missing
+            preset is fast, whatever the task.
         extras: environments and algorithms beside the registered ones.
     Raises:
         ConfigError: an unknown name, a wrong type, or a value out of bounds.
@@ -196,7 +197,7 @@ def settings_from_config(config: dict[str, Any], extras: Extras = NO_EXTRAS) -> 
     env_name, entry = find_env(env.pop("name", None), extras)
     algo_name = algo.pop("name", None)
     row = find_algo(algo_name, extras)
-    train = from_dict(TrainConfig, top)
+    train = from_dict(TrainConfig, {"preset": "fast", **top})
     train = dataclasses.replace(train, preset=preset_for(env_name, row, train.preset))
     if train.dataset is not None and train.total_updates is None:
         train = dataclasses.replace(train, total_updates=OFFLINE_UPDATES)

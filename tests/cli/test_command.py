@@ -552,6 +552,8 @@ def test_a_run_has_the_preset_that_suits_its_task_unless_it_names_one(task, algo
     assert arguments.compose([*chosen, "preset=fast"]).algo == algos.ALGOS[algo].config()
     assert (preset in session.about_preset(found)) == (preset != "fast")
     assert settings.settings_from_config(found.plain()).plain() == found.plain()
+    unnamed = {k: v for k, v in found.plain().items() if k != "preset"}
+    assert settings.settings_from_config(unnamed).train.preset == "fast"
 
 
 def test_tasks_of_a_sweep_must_have_one_preset_of_an_algorithm():
