@@ -172,9 +172,10 @@ def check_arguments(argv: list[str]) -> Request:
         if name in given and given[name].is_sweep_override():
             raise ConfigError(f"{name} takes one value, not a sweep")
     top = {name: given[name].value() for name in ONE_VALUE if name in given}
-    if swept_otherwise(typed):  # what a sweeper of its own will choose is not known
-        top.setdefault("preset", "fast")
-    known = every_default(typed, top)
+    general = {"preset": "fast"} if swept_otherwise(typed) else {}  # what it will choose is not known
+    if general and top.get("preset") == "auto":
+        raise ConfigError("preset=auto: a sweeper may choose any task; name one, such as preset=fast")
+    known = every_default(typed, general | top)
     check_presets(known)
     chosen = {kind: {each[kind]["name"]: each[kind] for each in known} for kind in DEFAULT}
     for override in typed.overrides:

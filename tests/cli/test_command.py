@@ -564,3 +564,14 @@ def test_tasks_of_a_sweep_must_have_one_preset_of_an_algorithm():
     assert hydra_jobs.check_arguments([*several, "algo=sac"]).base["preset"] == "fast"
     each = hydra_jobs.check_arguments(["-m", "env=walker2d_velocity", "algo=ppo,sac"])
     assert each.base["preset"] == "auto" and each.groups["algo"]["ppo"]["horizon"] == 160
+
+
+def test_a_sweeper_that_may_choose_any_task_has_the_general_defaults_or_those_of_the_run_to_continue(
+    tmp_path,
+):
+    texts, sweeper = ["env=walker2d_velocity", "algo=ppo"], ["-m", "hydra.sweeper.max_batch_size=1"]
+    assert hydra_jobs.check_arguments([*sweeper, *texts]).base["preset"] == "fast"
+    run_folder.write_config(tmp_path, arguments.compose(texts).plain())
+    assert hydra_jobs.check_arguments([*sweeper, f"resume={tmp_path}"]).base["preset"] == "frequent"
+    with pytest.raises(ConfigError, match="preset=auto: a sweeper may choose any task"):
+        hydra_jobs.check_arguments([*sweeper, *texts, "preset=auto"])
