@@ -81,7 +81,7 @@ class SACLagConfig(MultiplierConfig, SACConfig):
     takes the policy's mean action, and unit is 1.
     """
 
-    # Where the defaults hardly learn (docs/results/off_policy)
+    # Where the defaults hardly learn, or were not tried (docs/results/off_policy)
     SUITS: ClassVar = {
         "navigation": (
             "point_goal2", "car_goal2", "point_button1", "car_button1", "point_button2", "car_button2",
