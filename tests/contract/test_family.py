@@ -126,7 +126,7 @@ def problem(cfg):
 def test_the_penalty_is_felt_beyond_the_limit_alone(excess, price, omnisafe):
     sizes: dict[str, Any] = {"hidden": (8,), "minibatches": 1, "epochs": 1, "kappa": 3.0, "lr": 1e-3}
     ours = not omnisafe
-    cfg = p3o.P3OConfig(**sizes, per_step=ours, clip_cost=ours, centre_cost=ours)
+    cfg = p3o.P3OConfig(**sizes, per_step=ours, clip_cost=ours)
     of_cost = plain if omnisafe else pessimistic
     actor, batch = problem(cfg)
 
