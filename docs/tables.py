@@ -102,7 +102,7 @@ PRESETS = {  # all but `fast`, which has no settings of its own
     "omnisafe_velocity": "OmniSafe's settings of velocity tasks",
     "frequent": "longer rollouts or more gradient steps: Walker2d, Swimmer, Humanoid",
     "parallel": "on a GPU OmniSafe's replay ratio or, on policy, its settings with 160 environments",
-    "parallel_navigation": "the same for Goal: a slower policy and price, and targets of three steps",
+    "parallel_navigation": "that ratio for Goal: a slower policy and price, and targets of three steps",
     "navigation": "for Goal, Button, Push: OmniSafe's temperature of Goal, and targets of three steps",
     "velocity": "plans as long as OmniSafe's of velocity tasks, else nearly the defaults",
     "true_model": "plans in the simulator, not in learned models",
