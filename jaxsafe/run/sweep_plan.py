@@ -63,9 +63,13 @@ def plan(given: dict[str, Any], several: dict[str, list[Any]], extras: Extras = 
     floats = floats_among(several, given, extras)
     grid = combinations({name: several[name] for name in floats})
     side_by_side = {name: [setting[name] for setting in grid] for name in floats}
-    groups = {}
+    groups, known = {}, set()
     for chosen in combinations({k: v for k, v in several.items() if k not in floats}):
         settings = settings_from_options(merged(given, nested(side_by_side | chosen)), extras)
+        if (text := json.dumps(settings.plain(), sort_keys=True)) in known:
+            words = ", ".join(f"{k}={as_text(v)}" for k, v in chosen.items())
+            raise ConfigError(f"{words}: these settings occur twice")
+        known.add(text)
         settings.row.make(make_env(settings)).clocks(settings.algo)  # refuses sizes that do not fit
         groups[folder_name(len(groups), settings, chosen)] = settings
     swept = [f"{k}.name" if k in DEFAULT else k for k in several]

@@ -481,6 +481,8 @@ BAD = {
     "env=point_goal2 algo=p3o algo.cost_limits.hazards=5,10": "of p3o; did you mean 'cost_limit'?",
     "algo.cost_limit.hazards=5,10": "did you mean 'cost_limits'?",
     "algo=ppo_lag,cop": "did you mean 'cpo'?",
+    "env=point_goal1,Safexp-PointGoal1-v0": "env=Safexp-PointGoal1-v0: these settings occur twice",
+    "preset=auto,fast": "preset=fast: these settings occur twice",
     "env=point_goal1,car_gaol1": "did you mean 'car_goal1'?",
     "algo.minibatches=8,7": "minibatches=7",
     "resume=true": "the same command is given again",
