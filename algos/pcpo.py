@@ -32,6 +32,7 @@ class PCPOConfig(cpo.CPOConfig):
     H^-1 out of the first term (`natural=False`).
     """
 
+    SUITS: ClassVar = {"fast": ("hopper_velocity",)}  # CPO's preset there was not tried
     CONVENTIONS: ClassVar = (
         Convention(
             {"natural": False},

@@ -538,6 +538,7 @@ def test_a_resumed_run_does_not_start_from_the_other_policy_again(
         ("SafetyWalker2dVelocity-v1", "ppo_lag", "frequent"),
         ("hopper_velocity", "cppo_pid", "parallel"),
         ("hopper_velocity", "ppo_lag", "fast"),
+        ("hopper_velocity", "pcpo", "fast"),
         ("ant_velocity", "td3_lag", "decay"),
         ("point_button1", "sac_lag", "navigation"),
         ("point_goal1", "sac_lag", "fast"),
