@@ -177,6 +177,8 @@ def check_arguments(argv: list[str]) -> Request:
         raise ConfigError("preset=auto: a sweeper may choose any task; name one, such as preset=fast")
     known = every_default(typed, general | top)
     check_presets(known)
+    if not given.keys() & {*LENGTHS}:
+        check_lengths(known)
     chosen = {kind: {each[kind]["name"]: each[kind] for each in known} for kind in DEFAULT}
     for override in typed.overrides:
         check_override(override, known, typed.multirun)
@@ -202,6 +204,14 @@ def every_default(typed: Typed, top: dict[str, Any]) -> list[dict[str, Any]]:
         for env in names["env"]
         for algo in names["algo"]
     ]
+
+
+def check_lengths(known: list[dict[str, Any]]) -> None:
+    """Raise ConfigError where algorithms of a sweep have different lengths: Hydra composes one."""
+    steps = {each["algo"]["name"]: each["total_steps"] for each in known}
+    if len({*steps.values()}) > 1:
+        each = ", ".join(f"{count:,} of {algo}" for algo, count in steps.items())
+        raise ConfigError(f"total_steps are {each} by default; give one, such as total_steps=1e7")
 
 
 def swept_otherwise(typed: Typed) -> bool:

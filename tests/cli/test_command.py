@@ -563,8 +563,17 @@ def test_tasks_of_a_sweep_must_have_one_preset_of_an_algorithm():
         hydra_jobs.check_arguments([*several, "algo=ppo"])
     assert hydra_jobs.check_arguments([*several, "algo=ppo", "preset=fast"]).base["preset"] == "fast"
     assert hydra_jobs.check_arguments([*several, "algo=sac"]).base["preset"] == "fast"
-    each = hydra_jobs.check_arguments(["-m", "env=walker2d_velocity", "algo=ppo,sac"])
+    each = hydra_jobs.check_arguments(
+        ["-m", "env=walker2d_velocity", "algo=ppo,sac", "total_steps=1e6"]
+    )
     assert each.base["preset"] == "auto" and each.groups["algo"]["ppo"]["horizon"] == 160
+
+
+def test_algorithms_of_a_sweep_must_have_one_length():
+    with pytest.raises(ConfigError, match=r"10,000,000 of ppo, 5,000,000 of sac by default; give one"):
+        hydra_jobs.check_arguments(["-m", "algo=ppo,sac"])
+    for length in (["total_steps=1e6"], ["total_steps=1e6,2e6"]):
+        hydra_jobs.check_arguments(["-m", "algo=ppo,sac", *length])
 
 
 def test_a_sweeper_that_may_choose_any_task_has_the_general_defaults_or_those_of_the_run_to_continue(
