@@ -217,8 +217,8 @@ class SafetyGym:
         kept = world.replace(key=key, steps=world.steps + 1)
         zero = jnp.zeros(())
         return State(
-            physics=jax.tree.map(lambda old, new: jnp.where(bad, old, new), kept, moved),
-            obs=jax.tree.map(lambda old, new: jnp.where(bad, old, new), state.obs, obs),
+            physics=where(bad, kept, moved),
+            obs=where(bad, state.obs, obs),
             reward=jnp.where(bad, cfg.reward_exception, reward),
             cost=jnp.where(bad, zero, cost),
             costs=jnp.where(bad, zero, costs),
@@ -242,10 +242,11 @@ class SafetyGym:
 
     def _next_goal(self, world: World, key: jax.Array, wanted: jax.Array) -> tuple[World, jax.Array]:
         """A new goal or goal button where `wanted`, and the distances to it; whether one was found."""
-        button = jax.random.randint(key, (), 0, max(self.config.buttons_num, 1))
-        place, found = jnp.zeros(2), jnp.bool_(True)
+        place, button, found = jnp.zeros(2), world.goal_button, jnp.bool_(True)
         if self.arena.goal_kind == "goal":
             place, found = layouts.sample_goal(self.place, key, self.arena.layout_now(world), wanted)
+        else:
+            button = jax.random.randint(key, (), 0, self.config.buttons_num)
         return self._with_goal(world, place, button, wanted & found), found
 
     def _with_goal(self, world: World, place: jax.Array, button: jax.Array, wanted: jax.Array) -> World:
@@ -257,4 +258,9 @@ class SafetyGym:
             new = world.replace(layout=world.layout.at[self.place.names.index("goal")].set(place))
         dist_goal, dist_box, box_goal = self.arena.distances(new)
         new = new.replace(last_dist_goal=dist_goal, last_dist_box=dist_box, last_box_goal=box_goal)
-        return jax.tree.map(lambda a, b: jnp.where(wanted, a, b), new, world)
+        return where(wanted, new, world)
+
+
+def where(chosen: jax.Array, new: PyTree, old: PyTree) -> PyTree:
+    """`new` where `chosen`, else `old`; what is the same in both, as a key is, stays out of it."""
+    return jax.tree.map(lambda a, b: a if a is b else jnp.where(chosen, a, b), new, old)

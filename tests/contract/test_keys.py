@@ -1,12 +1,14 @@
-"""No algorithm draws twice from one random key, as far as JAX sees when it traces."""
+"""No algorithm or environment draws twice from one random key, as far as JAX sees when it traces."""
 
 from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import pytest
 from toys import START, Corridor
 
+from jaxsafe import envs
 from jaxsafe.algos import ALGOS, cup
 from jaxsafe.learn.offline import OfflineConfig, data_set_like
 
@@ -49,6 +51,26 @@ def test_an_algorithm_uses_each_key_once(name):
     trace(act, ts, key)
     if row.config.__module__.rpartition(".")[2] not in PLANNING:
         trace(update_twice, ts, shared)
+
+
+AT_RANDOM = {"engine": "c", "action_noise": 0.1, "frameskip_binom_p": 0.5}
+IN_PARTS = ((-1.5, -1.5, 0.0, 1.5), (0.0, -1.5, 1.5, 1.5))
+
+
+@pytest.mark.parametrize(
+    "name, options",
+    [
+        ("point_goal1", AT_RANDOM | {"goal_placements": IN_PARTS, "hazards_placements": IN_PARTS}),
+        ("point_button1", AT_RANDOM),
+        ("hopper_velocity", {"engine": "c"}),
+        ("car_racing1", {}),
+    ],
+)
+def test_an_environment_uses_each_key_once(name, options):
+    env = envs.make(name, **options)
+    trace(env.reset, jax.random.key(0))
+    state = jax.eval_shape(env.reset, jax.random.key(0))
+    trace(env.step, state, jnp.zeros(env.action_size))
 
 
 def test_each_step_of_cup_has_a_key_of_its_own(monkeypatch):
