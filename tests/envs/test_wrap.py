@@ -197,9 +197,24 @@ def test_a_wrapper_that_cannot_be_is_one_line(hall, wrap, says):
     assert says in str(error.value) and "\n" not in str(error.value)
 
 
-def test_bounds_for_other_actions_and_options_called_wrap_or_name_are_refused():
-    with pytest.raises(ConfigError, match="3 bounds for actions with 2 components"):
-        ActionScale(Corridor(), (0.0, 0.0, 0.0), 1.0)
+@pytest.mark.parametrize(
+    "wrapper, values, says",
+    [
+        (ActionScale, ((0.0, 0.0, 0.0), 1.0), "3 bounds for actions with 2 components"),
+        (ActionScale, (0.0, (1.0, 1.0, 1.0)), "3 bounds for actions with 2 components"),
+        (ActionScale, (0.0, float("inf")), "low=0.0 and high=inf: expected low < high"),
+        (ActionScale, ((0.0, 1.0), 1.0), "expected low < high"),
+        (ActionRepeat, (0,), "repeat=0: expected 1 to 20"),
+        (FrameStack, (0,), "frames=0: expected at least 1"),
+        (TimeLimit, (0,), "steps=0: expected at least 1"),
+    ],
+)
+def test_a_wrapper_made_in_python_is_refused_like_an_option(wrapper, values, says):
+    with pytest.raises(ConfigError, match=says):
+        wrapper(Corridor(), *values)
+
+
+def test_options_called_wrap_or_name_are_refused():
     for name, odd in (("wrap", lambda wrap=3: Corridor()), ("name", lambda name="a": Corridor())):
         envs.register("odd", odd)
         with pytest.raises(ConfigError, match=f"'{name}' is what every environment has: rename"):
