@@ -10,6 +10,8 @@ from tasks import ROBOT_AT_ORIGIN, task
 
 from jaxsafe import envs
 from jaxsafe.config import ConfigError
+from jaxsafe.envs.engines import Readings
+from jaxsafe.envs.safety_gym import observe
 from jaxsafe.envs.wrap import ActionRepeat, FrameStack
 
 
@@ -33,6 +35,28 @@ def test_the_coordinates_by_hand():
     expected = [1.0, -1.0, 1.0, 0.0, 0.0, 0.5, 0.0, -1.0, 0.0, 0.0]  # goal, hazards, heading, position
     np.testing.assert_allclose(state.obs[0, 7:], expected, atol=1e-5)
     assert t.env.observation_spec["hazards"] == (2, 2) and state.obs.shape == (1, 17)
+
+
+def test_of_each_sensor_the_coordinates_that_a_planar_robot_moves_in_are_kept():
+    """Two of the velocity, the acceleration ahead, the turn about the vertical, and the compass."""
+    env = envs.make("point_goal0", engine="c", observation="coordinates")
+    arena = env.arena
+    world = arena.at_rest(jnp.zeros((2, 2)), jnp.zeros(2), jax.random.key(0))
+    sensors = jnp.zeros(env.scene.model.nsensordata)
+    for i, name in enumerate(("velocimeter", "accelerometer", "gyro", "magnetometer")):
+        sensors = sensors.at[arena.sensors[name][0]].set(3.0 * i + jnp.arange(3))
+    readings = Readings(sensors, jnp.zeros(0), {}, jnp.zeros(()))
+    seen = observe.observe(arena, world, readings, jnp.zeros(2))
+    assert seen[:7].tolist() == [0, 1, 3, 8, 9, 10, 11]
+
+
+def test_the_cost_that_follows_is_a_depth_where_costs_are_no_indicators():
+    """Of hazards of 0.2 m, 0.05 m and 0.1 m from the robot, at 3 for a metre."""
+    options = {"hazards_num": 3, "hazards_cost": 3.0, "constrain_indicator": False}
+    env = envs.make("point_goal1", engine="c", observation="coordinates", **options)
+    assert env.obs_size == 19
+    obs = jnp.zeros(19).at[9:15].set(jnp.array([0.05, 0.0, 0.0, -0.1, 1.0, 1.0]))
+    assert env.observed_cost(obs) == pytest.approx(3 * (0.15 + 0.1))
 
 
 def test_the_cost_follows_from_the_coordinates_and_of_a_repeated_step_from_the_last_of_it():
