@@ -9,7 +9,8 @@ import pytest
 from tasks import ROBOT_AT_ORIGIN, change, put, task, with_qpos
 
 from jaxsafe.envs import make
-from jaxsafe.envs.safety_gym import costs, sensing
+from jaxsafe.envs.engines import Readings
+from jaxsafe.envs.safety_gym import costs, rewards, sensing
 
 BARE = {"hazards_num": 0, "gremlins_num": 0, "vases_num": 0, "pillars_num": 0}
 UPRIGHT = (jnp.array([0.0, 0.0, 0.1]), jnp.eye(3))
@@ -192,8 +193,8 @@ def test_a_vase_costs_while_it_slides_untouched():
     np.testing.assert_array_equal(after.cost, [0, 1, 1, 1])
 
 
-def test_a_vase_costs_its_speed_along_the_floor_and_how_far_it_is_from_its_place():
-    """One slides, one turns on the spot, one was moved, and one was moved a little."""
+def test_a_vase_costs_its_speed_in_space_and_how_far_it_is_from_its_place():
+    """One flies, one turns on the spot, one was moved, and one was moved a little."""
     options: dict[str, Any] = {"constrain_indicator": False, "vases_displace_cost": 3.0}
     t = task("point_goal2", **ROBOT_AT_ORIGIN, hazards_num=0, vases_num=1, **options)
     vase, rows = (s("vases").start for s in (t.env.scene.qpos_slice, t.env.scene.qvel_slice))
@@ -202,7 +203,7 @@ def test_a_vase_costs_its_speed_along_the_floor_and_how_far_it_is_from_its_place
     away = jnp.array([[0.0, 0.0], [0.0, 0.0], [0.03, 0.04], [5e-4, 0.0]])
     state = with_qpos(state, slice(vase, vase + 2), place + away)
     qvel = jnp.zeros_like(state.physics.bodies.qvel)
-    qvel = qvel.at[0, rows : rows + 2].set(jnp.array([3.0, 4.0])).at[1, rows + 5].set(5.0)
+    qvel = qvel.at[0, rows : rows + 3].set(jnp.array([2.0, 3.0, 6.0])).at[1, rows + 5].set(5.0)
     unread: Any = ()
 
     def paid(world: Any) -> jax.Array:
@@ -210,7 +211,91 @@ def test_a_vase_costs_its_speed_along_the_floor_and_how_far_it_is_from_its_place
         return jnp.array([cost(t.env.arena, world, unread) for cost in both])
 
     found = jax.vmap(paid)(change(state, {"qvel": qvel}).physics)
-    np.testing.assert_allclose(found, [[5, 0], [0, 0], [0, 0.15], [0, 0]], rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(found, [[7, 0], [0, 0], [0, 0.15], [0, 0]], rtol=1e-4, atol=1e-6)
+
+
+def still(env, **world):
+    """A world at rest with everything at the origin, and some of its fields."""
+    count = len(env.place.names)
+    return env.arena.at_rest(jnp.zeros((count, 2)), jnp.zeros(count), jax.random.key(0)).replace(
+        **world
+    )
+
+
+def reading(contacts=(), **fields):
+    return Readings(jnp.zeros(0), jnp.array(contacts, float), fields, jnp.zeros(()))
+
+
+def test_each_point_of_contact_costs_and_the_button_to_press_is_free():
+    kinds = ("vases", "pillars", "gremlins", "buttons")  # in the order of `watched`
+    options: dict[str, Any] = {f"{kind}_num": 2 for kind in kinds}
+    options |= {f"constrain_{kind}": True for kind in kinds}
+    options |= {"placements_extents": (-3.0, -3.0, 3.0, 3.0), "constrain_indicator": False}
+    env = make("point_button0", engine="c", **options, pillars_cost=0.5)
+    assert list(env.scene.watched) == ["vases", "pillars", "gremlins", "buttons"]
+    parts, total = costs.costs(env.arena, still(env), reading([1, 3, 2, 4, 0, 5, 7, 2]))
+    names = ("vases_contact", "pillars", "buttons", "gremlins", "vases_velocity")
+    assert env.cost_names == names
+    assert parts.tolist() == [1 + 3, 0.5 * (2 + 4), 2, 5, 0] and total == 14
+
+
+def test_vases_that_are_not_constrained_cost_nothing_by_their_place_either():
+    env = make("point_goal1", engine="c", vases_displace_cost=1.0)
+    assert env.cost_names == ("hazards",)
+
+
+@pytest.mark.parametrize(
+    "clip, expected", [(10.0, [10, -10, 3]), (None, [20, -20, 3]), (0.0, [20, -20, 3])]
+)
+def test_a_clip_of_null_or_0_is_none(clip, expected):
+    env = make("point_goal0", engine="c", reward_clip=clip)
+    after, none = still(env, last_dist_goal=jnp.float32(20)), reading()
+    found = [
+        rewards.reward(env.arena, still(env, last_dist_goal=jnp.float32(before)), after, none)
+        for before in (40, 0, 23)
+    ]
+    np.testing.assert_allclose(found, expected)
+
+
+@pytest.mark.parametrize(
+    "quat, paid",
+    [
+        ((0.6, 0, 0, 0.8), 10),  # upright, with any heading: 30, clipped
+        ((0.8, 0.6, 0, 0), 30 * 0.28),  # tilted about x, by the angle whose cosine is 0.28
+        ((0.8, 0, 0.6, 0), 30 * 0.28),
+        ((0.0, 1.0, 0, 0), -10),  # upside down
+    ],
+)
+def test_uprightness_pays_within_the_clip(quat, paid):
+    env = make("point_goal0", engine="c", reward_orientation=True, reward_orientation_scale=30.0)
+    body, world = env.scene.model.body("robot").id, still(env)
+    xquat = jnp.zeros((env.scene.model.nbody, 4)).at[body].set(jnp.array(quat))
+    found = rewards.reward(env.arena, world, world, reading(xquat=xquat))
+    np.testing.assert_allclose(found, paid, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "name, height", [("point_goal0", 0.15 + 0.01), ("point_push0", 0.15 + 0.01), ("point_button0", 0.1)]
+)
+def test_what_is_sought_is_as_high_as_its_middle(name, height):
+    env = make(name, engine="c", goal_size=0.3, buttons_size=0.1)
+    assert env.arena.goal_position(still(env))[2] == pytest.approx(height)
+
+
+def test_nearing_the_box_pays_by_how_far_it_was_before():
+    """Farther than 2 times 0.2 m, and nothing from there on."""
+    env = make("point_push0", engine="c", box_null_dist=2.0)
+    for old, new, paid in ((0.5, 0.3, 0.2), (0.39, 0.45, 0.0), (0.3, 0.2, 0.0)):
+        before, after = (still(env, last_dist_box=jnp.float32(x)) for x in (old, new))
+        found = rewards.reward(env.arena, before, after, reading())
+        np.testing.assert_allclose(found, paid, atol=1e-6)
+
+
+def test_the_first_step_of_run_is_paid_from_where_the_robot_stood():
+    t = task("point_run")
+    state = t.begin()
+    assert (np.abs(state.physics.start[:, 0]) > 0.01).any()
+    np.testing.assert_allclose(t.idle(state).reward, 0, atol=1e-6)
 
 
 def test_the_vase_of_level_one_is_free():
