@@ -301,14 +301,40 @@ def test_a_new_goal_is_clear_of_where_things_are_now():
 
 
 def test_a_goal_without_room_ends_the_episode_or_stays():
-    crowd = {"goal_locations": ((0.6, 0.0),), **ROBOT_AT_ORIGIN, "robot_keepout": 0.2}
+    """Goals are within 0.1 m of (0.6, 0), and the robot in their midst needs 0.505 m."""
+    area = ((0.195, -0.405, 1.005, 0.405),)
+    crowd = {"goal_placements": area, **ROBOT_AT_ORIGIN, "robot_keepout": 0.2}
     for ends in (True, False):
         t = task("point_goal0", **crowd, terminate_resample_failure=ends)
-        state = with_qpos(t.begin(), slice(0, 2), [0.55, 0.0])
+        state = with_qpos(t.begin(), slice(0, 2), [0.6, 0.0])
         after = t.idle(state)
         np.testing.assert_array_equal(after.info["goal_met"], 1)
         np.testing.assert_array_equal(after.terminated, ends)
-        np.testing.assert_allclose(after.physics.layout[:, 1], [[0.6, 0.0]] * 4, atol=1e-6)
+        np.testing.assert_array_equal(after.physics.layout[:, 1], state.physics.layout[:, 1])
+
+
+def test_a_goal_may_be_drawn_where_the_last_one_was():
+    options = {"task": "goal", "goal_locations": ((0.5, 0.0),), "robot_locations": ((-1.0, 0.0),)}
+    place = layouts.placement(config_from_plain(defaults(**options)))
+    xy = jnp.array([[-1.0, 0.0], [0.5, 0.0]])
+    found = layouts.sample_goal(place, jax.random.key(0), xy, jnp.bool_(True))
+    assert found[1] and np.abs(found[0] - xy[1]).max() < 1e-6
+
+
+def test_a_new_goal_keeps_clear_of_where_the_box_is_now_and_of_where_gremlins_circle():
+    options = {"gremlins_num": 1, "vases_num": 1, "placements_extents": (-3.0, -3.0, 3.0, 3.0)}
+    env = envs.make("car_push1", engine="c", **options)
+    names = env.place.names
+    xy = jnp.stack([jnp.arange(len(names)) * 0.1, jnp.zeros(len(names))], 1)
+    world = env.arena.at_rest(xy, jnp.zeros(len(names)), jax.random.key(0))
+    qpos = world.bodies.qpos.at[0].set(1.5)
+    for kind, x in {"box": 2.5, "vases": -1.5, "gremlins": -2.5}.items():
+        qpos = qpos.at[env.scene.qpos_slice(kind).start].set(x)
+    now = env.arena.layout_now(world.replace(bodies=world.bodies.replace(qpos=qpos)))
+    moved = {"robot": 1.5, "box": 2.5, "vase0": -1.5}
+    expected = [moved.get(name, 0.1 * i) for i, name in enumerate(names)]
+    np.testing.assert_allclose(now[:, 0], expected, rtol=1e-6)
+    np.testing.assert_array_equal(now[:, 1], 0)
 
 
 def test_one_layout_repeats_if_it_is_not_randomized():
