@@ -59,16 +59,17 @@ def test_the_pendulum_moves_as_in_gymnasium():
         before = wrapped
 
 
-def test_a_pendulum_turns_by_8_rad_a_second_at_most():
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_pendulum_turns_by_8_rad_a_second_at_most(side):
     theirs: Any = gymnasium.make("Pendulum-v1").unwrapped
     theirs.reset()
-    theirs.state = np.array([0.5, 7.9])
-    theirs.step(np.array([2.0]))
+    theirs.state = side * np.array([0.5, 7.9])
+    theirs.step(side * np.array([2.0]))
     env = envs.make("pendulum_upright")
     start = env.reset(jax.random.key(0))
-    fast = env.step(start.replace(physics=jnp.array([0.5, 7.9])), jnp.ones(1))
+    fast = env.step(start.replace(physics=side * jnp.array([0.5, 7.9])), side * jnp.ones(1))
     np.testing.assert_allclose(fast.obs, theirs.state, rtol=1e-6)
-    assert fast.obs[1] == 8.0  # 7.9 and 0.05 (15 sin(0.5) + 6) are more
+    assert fast.obs[1] == side * 8.0  # 7.9 and 0.05 (15 sin(0.5) + 6) are more
 
 
 @pytest.mark.parametrize(
@@ -81,6 +82,23 @@ def test_a_step_is_unsafe_where_the_barrier_is_above_1_and_ends_the_episode(name
     assert (above == (cost == 1)).all() and (above == ended).all()
     assert above.any() and not above[0]
     assert env.barrier(env.reset(jax.random.key(1)).obs) < 0.1
+
+
+@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize(
+    "name, near",
+    [
+        ("pendulum_upright", (1.49, 1.0)),
+        ("pendulum_swing", (0.0, 1.49, 0.0, 1.0)),
+        ("pendulum_swing", (0.89, 0.0, 1.0, 0.0)),
+    ],
+)
+def test_the_safe_set_ends_on_either_side_of_angles_and_rail(name, near, side):
+    env = envs.make(name)
+    state = env.reset(jax.random.key(0)).replace(physics=side * jnp.array(near))
+    after = env.step(state, jnp.zeros(1))
+    assert env.barrier(state.physics) < 1 < env.barrier(after.obs)
+    assert after.terminated and after.cost == 1
 
 
 def test_a_pendulum_that_swings_past_the_bottom_is_unsafe():
