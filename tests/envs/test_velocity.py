@@ -323,6 +323,8 @@ def test_velocities_cost_what_they_cost_in_safety_gymnasium():
 
 
 def test_a_threshold_of_one_s_own_counts():
+    still = envs.make("hopper_velocity", engine="c", velocity_threshold=0.0)
+    assert still.threshold == 0
     env = envs.make("hopper_velocity", engine="c", velocity_threshold=0.5)
     assert env.threshold == 0.5 and float(env.cost(jnp.array([0.6, 0.0]))) == 1
     assert float(env.cost(jnp.array([0.5, 0.0]))) == 0  # at the threshold
@@ -359,6 +361,16 @@ def test_a_height_is_healthy_within_its_range():
         for z, healthy in ((low - 1e-3, 0), (low + 1e-3, 1), (high - 1e-3, 1), (high + 1e-3, 0)):
             qpos = physics.qpos.at[m.env.robot.height].set(z)
             assert m.env.healthy(qpos, physics.qvel) == healthy
+
+
+@pytest.mark.parametrize("robot, limit", [("hopper", 0.2), ("walker2d", 1.0)])
+def test_a_pitch_is_healthy_within_its_range(robot, limit):
+    env = made(robot).env
+    upright = jnp.asarray(env.model.qpos0, jnp.float32)
+    for pitch in (limit, -limit):
+        for share, healthy in ((0.99, True), (1.01, False)):
+            qpos = upright.at[2].set(share * pitch)
+            assert env.healthy(qpos, jnp.zeros(env.model.nv)) == healthy
 
 
 @pytest.mark.parametrize(
@@ -401,7 +413,15 @@ def test_a_task_without_an_end_tells_none():
     assert FrameStack(envs.make("point_goal1"), 2).observed_end is None
 
 
-@pytest.mark.parametrize("change", [{"pitch": 0.25}, {"speed": 101.0}, {}])
+def test_hopper_is_healthy_wherever_it_is_and_by_its_joints_and_speeds():
+    env = made("hopper").env
+    qpos, qvel = jnp.array([500.0, 1.25, 0.0, 0.0, 0.0, 0.0]), jnp.zeros(6)
+    assert env.healthy(qpos, qvel)
+    assert not env.healthy(qpos.at[3].set(-101.0), qvel)
+    assert not env.healthy(qpos, qvel.at[5].set(101.0))
+
+
+@pytest.mark.parametrize("change", [{"pitch": 0.25}, {"speed": 101.0}, {"speed": -101.0}, {}])
 def test_hopper_falls_by_its_pitch_and_by_any_speed_out_of_range(change):
     m = made("hopper")
     state = begin(m, 1)
@@ -413,7 +433,8 @@ def test_hopper_falls_by_its_pitch_and_by_any_speed_out_of_range(change):
     after = m.step(state.replace(physics=World(physics, state.physics.place)), jnp.zeros((1, 3)))
     assert after.terminated[0] == bool(change)
     if "speed" in change:  # what is observed is clipped
-        assert after.obs[0, 5] == 10 and after.physics.physics.qvel[0, 0] > 100
+        sign = np.sign(change["speed"])
+        assert after.obs[0, 5] == 10 * sign and sign * after.physics.physics.qvel[0, 0] > 100
 
 
 def test_an_action_beyond_the_limits_does_no_more_and_is_paid_for():
@@ -466,7 +487,8 @@ def test_a_reset_draws_as_gymnasium_s(robot):
     ):
         for column in columns:
             assert stats.kstest(column, law.cdf).pvalue > 1e-4
-        assert abs(np.corrcoef(columns) - np.eye(len(columns))).max() < 0.16  # 5 standard errors
+    columns = np.concatenate([*drawn.values()])
+    assert abs(np.corrcoef(columns) - np.eye(len(columns))).max() < 0.16  # 5 standard errors
     env = theirs(robot)
     env.set_state(np.asarray(physics.qpos[0], float), np.asarray(physics.qvel[0], float))
     np.testing.assert_allclose(state.obs[0], env._get_obs(), rtol=1e-4, atol=1e-5)
