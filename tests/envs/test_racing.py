@@ -120,6 +120,7 @@ def test_steering_gas_and_wheels_are_those_of_the_car():
     np.testing.assert_allclose(car.steer[:6], 0.06 * np.arange(1, 7), rtol=1e-5)  # 3 rad/s
     assert car.steer[-1] == pytest.approx(MAX_STEER)
     np.testing.assert_allclose(car.gas, 0.1 * np.arange(1, 9), rtol=1e-5)
+    assert not driven(1, rolling_at(0.0, gas=0.8), 0.0, 0.0, 0.0, ROAD).gas.any()  # falls at once
     spun = replace(rolling_at(10.0), spin=jnp.float32(2.0), heading=jnp.float32(np.pi / 2))
     np.testing.assert_allclose(  # front left, front right, rear left, rear right
         wheels(spun), [[-SIDE, AXLE], [SIDE, AXLE], [-SIDE, -AXLE], [SIDE, -AXLE]], atol=1e-6
@@ -247,14 +248,38 @@ def test_leaving_the_road_costs_once_and_only_without_obstacles():
         assert paid == costs
 
 
+def test_a_tile_that_is_only_passed_beside_the_road_is_not_paid():
+    step = compiled(0)[2]
+    after = step(put(stadium(0), 20.0, HALF_WIDTH + SIDE + 0.1), STILL)
+    assert after.reward == 0 and not after.physics.visited.any()
+    after = step(put(stadium(0), 20.0, HALF_WIDTH), STILL)  # with the right wheels on the road
+    assert after.reward > 0
+
+
+def test_actions_beyond_1_do_no_more():
+    step, state = compiled(0)[2], put(stadium(0), 20.0, 0.0, 30.0)
+    state = replace(state, physics=replace(state.physics, car=rolling_at(30.0, gas=0.95)))
+    for action in ([1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]):
+        one, more = (step(state, factor * jnp.array(action)).physics.car for factor in (1, 3))
+        for a, b in zip(*map(jax.tree.leaves, (one, more)), strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+def test_an_episode_begins_at_rest_in_the_middle_of_either_half_of_the_road():
+    world = begun().physics
+    _, left = jax.vmap(locate)(world.track, world.car.position[:, None])
+    np.testing.assert_allclose(abs(left), HALF_WIDTH / 2, rtol=1e-4)
+    assert 0.3 < (left > 0).mean() < 0.7 and not world.car.velocity.any()
+
+
 def test_each_axle_has_the_grip_of_its_own_wheels():
     step = compiled(0)[2]
     state, action = put(stadium(0), 20.0, 0.0), jnp.array([-1.0, 1.0, -1.0])
-    car = state.physics.car.replace(velocity=jnp.array([10.0, 0.0]))
-    grass = jnp.array([False, False, True, True])  # the rear wheels
+    car = state.physics.car.replace(velocity=jnp.array([10.0, 0.0]), steer=jnp.float32(MAX_STEER))
+    grass = jnp.array([True, False, True, True])  # the left front wheel and the rear wheels
     world = replace(state.physics, car=car, on_road=~grass)
     after = step(replace(state, physics=world), action)
-    grip = jnp.array([1.0, cars.OFF_ROAD])
+    grip = jnp.array([(cars.OFF_ROAD + 1) / 2, cars.OFF_ROAD])
     alone = cars.drive(car, jnp.float32(1), jnp.float32(1), jnp.float32(0), grip)
     for a, b in zip(*map(jax.tree.leaves, (after.physics.car, alone)), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
@@ -295,6 +320,10 @@ def test_the_observation_is_what_the_docstring_says():
     expected = [[10 * length, HALF_WIDTH / 2], [20 * length, -HALF_WIDTH / 2]]
     np.testing.assert_allclose(world(seen[:2, :2]), expected, atol=0.02)
     np.testing.assert_array_equal(seen[:, 2], [1.5, 1.5, -1.0])
+    for tile, first in ((11, 10), (12, 20)):  # the one on the tile behind the car is seen, none before
+        state = step(put(stadium(1), tile * length, 1.0), STILL)
+        x, _ = state.physics.car.position + cars.rotated(state.obs[35:37], state.physics.car.heading)
+        assert x == pytest.approx(first * length, abs=0.02)
 
 
 # ---- pictures ----------------------------------------------------------------------------------
