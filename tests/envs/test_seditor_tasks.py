@@ -65,6 +65,13 @@ def test_observations_have_the_sizes_of_the_fork_and_are_stacked_four_deep(name,
         ("point_button2", "hazards_keepout", 0.18),
         ("car_goal2", "goal_keepout", 0.3),
         ("car_goal1", "vases_velocity_cost", 0.0),
+        ("car_goal1", "robot_keepout", 0.15),
+        ("car_goal1", "vases_keepout", 0.1),
+        ("car_goal1", "placements_margin", 0.3),
+        ("point_push2", "pillars_keepout", 0.2),
+        ("point_button1", "gremlins_keepout", 0.3),
+        ("point_button1", "buttons_keepout", 0.1),
+        ("point_button1", "buttons_resampling_delay", 20),
     ],
 )
 def test_options_are_those_of_the_fork(name, option, value):
@@ -205,6 +212,7 @@ def test_a_success_with_a_physics_error_is_a_failure():
     after = judge(state, given, physics, readings)
     np.testing.assert_array_equal(after.truncated, [True, True, False, True])
     np.testing.assert_array_equal(after.terminated, ~after.truncated)
+    np.testing.assert_array_equal(after.info["goal_met"], [1, 1, 0, 1])
 
 
 def test_several_violations_cost_one_and_fast_vases_nothing():

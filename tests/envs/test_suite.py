@@ -9,6 +9,7 @@ from tasks import task
 
 from jaxsafe import envs
 from jaxsafe.config import ConfigError
+from jaxsafe.envs.safety_gym import suite
 
 SPHERE, CYLINDER = 2, 5  # mjtGeom
 LEGS = [f"{leg}" for leg in ("ankle_1", "ankle_2", "ankle_3", "ankle_4")]
@@ -133,6 +134,12 @@ def test_costs_and_objects_are_those_of_the_table(robot, name):
         ("point_gridwall", "hazards_num", 42),
         ("point_grid0", "continue_goal", False),
         ("point_grid4", "goal_locations", ((0.0, 10.0),)),
+        ("car_grid1", "goal_size", 0.5),
+        ("car_grid1", "hazards_size", 1.0),
+        ("car_grid1", "lidar_num_bins", 10),
+        ("car_grid1", "robot_placements", ((-1.0, -1.0, 1.0, 1.0),)),
+        ("point_circle0", "lidar_max_dist", 6.0),
+        ("point_circle0", "lidar_num_bins", 16),
     ],
 )
 def test_options_are_those_of_the_table(name, option, value):
@@ -140,9 +147,16 @@ def test_options_are_those_of_the_table(name, option, value):
     assert envs.env_defaults(name)[option] == value
 
 
+def test_the_walls_of_the_grid_are_two_sides_and_two_rows_around_its_posts():
+    posts = {(-0.5, 2.0), (0.5, 4.0), (-0.5, 6.0), (0.5, 8.0)}
+    sides = {(x, float(y)) for x in (-2.0, 2.0) for y in range(-1, 13)}
+    rows = {(float(x), y) for x in range(-2, 3) for y in (-2.0, 13.0)}
+    assert {*suite.WALL} == posts | sides | rows and len(suite.WALL) == 42
+
+
 def test_27_tasks_and_the_others_are_registered_for_each_robot():
-    suite = {f"{r}_{t}{i}" for r in SENSORS for t in ("goal", "button", "push") for i in "012"}
-    assert len(suite) == 27 and suite < set(envs.ENVS)
+    named = {f"{r}_{t}{i}" for r in SENSORS for t in ("goal", "button", "push") for i in "012"}
+    assert len(named) == 27 and named < set(envs.ENVS)
     extra = 3 * 2 + 3 * 5 + 6 + 2 + 4  # run and circle, grids, velocity tasks, racing, pendulums
     assert len(envs.ENVS) == 27 + extra + 2 * 4 + 12  # Safety-Gymnasium's circles and run, SEditor's
 
