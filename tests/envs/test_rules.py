@@ -10,6 +10,8 @@ from tasks import ROBOT_AT_ORIGIN, change, task, with_qpos
 
 from jaxsafe import envs
 from jaxsafe.config import ConfigError
+from jaxsafe.envs.engines import Readings
+from jaxsafe.envs.safety_gym import costs
 
 THEIRS: dict[str, Any] = {"rules": "safety_gymnasium"}
 TOUCHED: dict[str, Any] = {  # Point at the origin, which touches button 0
@@ -117,6 +119,12 @@ def test_their_ids_lead_to_the_rules():
         envs.make("SafetyDoggoGoal1-v0")
 
 
+def test_an_id_that_is_registered_anew_implies_no_rules():
+    envs.register("SafetyCarGoal1-v0", envs.ENVS["car_goal1"])
+    assert envs.env_defaults("SafetyCarGoal1-v0")["rules"] == "safety_gym"
+    assert envs.make("SafetyCarGoal1-v0", engine="c").config.rules == "safety_gym"
+
+
 # ---- Circle and Run ----------------------------------------------------------------------------
 
 
@@ -152,6 +160,15 @@ def test_their_circle_is_paid_at_the_bodys_origin_and_its_lines_cost():
     one = task("point_circle1")
     again = one.idle(change(with_qpos(one.begin(), slice(0, 3), places)))
     np.testing.assert_array_equal(again.cost, [1, 0, 0, 0])
+
+
+def test_a_corner_beyond_two_lines_costs_as_much_as_one():
+    env = envs.make("point_circle2", engine="c", constrain_indicator=False, bounds_cost=2.0)
+    none = Readings(jnp.zeros(0), jnp.zeros(0), {}, jnp.zeros(()))
+    for place, expected in (((1.2, -1.2), 2), ((0.0, -1.2), 2), ((-1.2, 0.0), 2), ((1.1, 1.1), 0)):
+        world = env.arena.at_rest(jnp.array([place]), jnp.zeros(1), jax.random.key(0))
+        parts, total = costs.costs(env.arena, world, none)
+        assert parts.tolist() == [expected] and total == expected
 
 
 def test_their_run_is_paid_for_nearing_a_point_a_kilometre_away():
