@@ -10,7 +10,7 @@ from tasks import ROBOT_AT_ORIGIN, change, put, task, with_qpos
 
 from jaxsafe.envs import make
 from jaxsafe.envs.engines import Readings
-from jaxsafe.envs.safety_gym import costs, rewards, sensing
+from jaxsafe.envs.safety_gym import costs, observe, rewards, sensing
 
 BARE = {"hazards_num": 0, "gremlins_num": 0, "vases_num": 0, "pillars_num": 0}
 UPRIGHT = (jnp.array([0.0, 0.0, 0.1]), jnp.eye(3))
@@ -314,6 +314,28 @@ def test_nothing_keeps_a_robot_inside():
         state = t.step(state, jnp.array([[1.0, 0.0]] * 4))
     assert (state.physics.bodies.qpos[:, 0] > 1.2).all()
     assert not state.terminated.any() and not state.info["exception"].any()
+
+
+def test_the_coordinates_of_point_are_those_of_its_start():
+    """It began at (1, 2) with its front along y, went 3 m along y, and moves so at 0.5 m/s."""
+    options = {"observe_qpos": True, "observe_qvel": True, "observe_sensors": False}
+    env = make("point_goal0", engine="c", **options, observe_goal_lidar=False)
+    world = still(env, start=jnp.array([1.0, 2.0, np.pi / 2]))
+    qpos, qvel = jnp.array([1.0, 5.0, np.pi / 2 + 0.1]), jnp.array([0.0, 0.5, 0.2])
+    world = world.replace(bodies=world.bodies.replace(qpos=qpos, qvel=qvel))
+    seen = observe.observe(env.arena, world, reading(), jnp.zeros(2))
+    np.testing.assert_allclose(seen, [3.0, 0.0, 0.1, 0.5, 0.0, 0.2], atol=1e-6)
+
+
+def test_a_goal_s_distance_is_seen_in_the_plane_and_the_free_joint_whole():
+    options = {"observe_goal_dist": True, "observe_freejoint": True, "observe_sensors": False}
+    env = make("car_goal0", engine="c", **options, observe_goal_lidar=False)
+    world = still(env)
+    world = world.replace(
+        layout=world.layout.at[env.place.names.index("goal")].set(jnp.array([3.0, 4.0]))
+    )
+    seen = observe.observe(env.arena, world, reading(), jnp.zeros(2))
+    np.testing.assert_allclose(seen, [0, 0, 0.1, 1, 0, 0, 0, np.exp(-5)], atol=1e-6)
 
 
 def test_remaining_grows():
