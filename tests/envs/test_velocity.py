@@ -555,6 +555,12 @@ def test_options_that_mean_nothing_for_a_robot_are_refused():
         envs.make("ant_velocity", engine="c", healthy_angle_range=(0.0, 1.0))
 
 
+@pytest.mark.parametrize("factor, room", [(1.0, (11, 38)), (2.0, (22, 76)), (0.01, (1, 1))])
+def test_the_room_for_contacts_is_a_multiple_of_the_estimate_and_never_none(factor, room):
+    env = envs.make("hopper_velocity", engine="c", contact_room=factor)
+    assert env.simulation.room == room
+
+
 def test_an_environment_of_one_s_own_is_made_of_a_config():
     cfg = envs.VelocityConfig(robot="swimmer", frame_skip=2, velocity_threshold=0.1)
     env = envs.make(cfg, engine="c", num_steps=10)
