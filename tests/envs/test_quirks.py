@@ -428,6 +428,24 @@ def test_a_ray_along_the_face_of_a_shape_does_not_meet_it():
         np.testing.assert_allclose(inside, 0.1, rtol=1e-5)  # the side, not the lid
 
 
+def test_a_ray_meets_the_caps_of_a_capsule():
+    """Of radius 0.1 m and half length 0.3 m: 0.4 m from the middle along the axis."""
+    size = np.array((0.1, 0.3, 0))
+    for z in (1.0, -1.0):
+        start, ahead = jnp.array([0.0, 0.0, -z]), jnp.array([0.0, 0.0, z])
+        np.testing.assert_allclose(sensing.hit_capsule(ahead, start, size, 0.0), 0.6, rtol=1e-5)
+
+
+def test_walls_stand_straight_and_pillars_are_turned():
+    env = make("point_goal0", engine="c", walls_num=1, pillars_num=1)
+    count = len(env.place.names)
+    world = env.arena.at_rest(jnp.zeros((count, 2)), jnp.ones(count), jax.random.key(0))
+    turned = [np.cos(0.5), 0, 0, np.sin(0.5)]
+    for kind, quat in (("walls", [1, 0, 0, 0]), ("pillars", turned)):
+        found = world.bodies.mocap_quat[env.scene.mocap_slice(kind)]
+        np.testing.assert_allclose(found, [quat], rtol=1e-6)
+
+
 def test_circle_pays_for_speed_along_the_circle():
     """0.1 (v x - u y) / r / (1 + |r - 1.5|), with x, y and r of the centre of mass."""
     t = task("point_circle", robot_rot=0.0)
