@@ -196,8 +196,7 @@ def collect(
         )
         rollout = dataclasses.replace(rollout, state=state, steps=steps, episode=episode, carry=carry)
         rollout = restart(env, rollout, done, reset_key)
-        kept = episode.kept_cost  # NaN would stay for good
-        kept_cost = jnp.where(stopped | ~jnp.isfinite(kept), 0.0, kept)
+        kept_cost = jnp.where(stopped, 0.0, episode.kept_cost)
         episode = dataclasses.replace(rollout.episode, kept_cost=kept_cost)
         return dataclasses.replace(rollout, episode=episode), record
 
