@@ -2,23 +2,37 @@
 
 import dataclasses
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from compiling import FAST
-from learners import TINY, begin, compiled, telling
+from learners import TINY, at, begin, compiled, telling
 from toys import START, Sometimes, Ticker
 
 from jaxsafe.algos.ppo import PPOConfig
 from jaxsafe.learn.acting import learned_of
 from jaxsafe.learn.estimates import Experience, Signals, estimate_batch, scaled
+from jaxsafe.learn.metrics import episode_metrics, world_metrics
 from jaxsafe.learn.normalise import normalise
-from jaxsafe.learn.returns import ValuedSteps, Window, gae
-from jaxsafe.learn.rollout import collect, memoryless
+from jaxsafe.learn.on_policy import on_policy, on_policy_pair
+from jaxsafe.learn.returns import ValuedSteps, Window, advantages
+from jaxsafe.learn.rollout import Bad, Episode, collect, memoryless
+from jaxsafe.learn.steps import PolicyStep
+from jaxsafe.learn.treatments import no_treatment
 from jaxsafe.nn.gaussian import kl
 from jaxsafe.nn.networks import action_dist, value
+
+
+class Ended(NamedTuple):
+    """Where episodes ended, with their sums and lengths."""
+
+    ended: jax.Array
+    episode: Episode
+    length: jax.Array
+
 
 FIVE_STEPS = {"stagger": False, "horizon": 5}
 
@@ -49,10 +63,11 @@ def test_what_the_learner_sees_is_normalised_by_all_batches_up_to_this_one():
         assert (a == reward[0]).all() == (not reward_too) and (b == cost[0]).all() == (not cost_too)
 
 
-def test_a_batch_has_the_advantages_of_its_good_steps_each_by_its_own_discount_and_decay():
+@pytest.mark.parametrize("estimator", ["gae", "plain"])
+def test_a_batch_has_the_advantages_of_its_good_steps_each_by_its_own_discount_and_decay(estimator):
     discounts: Any = {"discount": 0.9, "gae_lambda": 0.8, "cost_discount": 0.7, "cost_gae_lambda": 0.6}
     env = Sometimes(episode_length=5, lives=(2, 9))
-    ts = begin("ppo_lag", env, stagger=False, **discounts)
+    ts = begin("ppo_lag", env, stagger=False, estimator=estimator, **discounts)
     # so that the cleared observation of a bad step has a value
     ts = dataclasses.replace(ts, normaliser=dataclasses.replace(ts.normaliser, mean=jnp.ones(3)))
     still = memoryless(lambda obs, key: (jnp.zeros((len(obs), 1)), jnp.zeros(len(obs))))
@@ -61,9 +76,9 @@ def test_a_batch_has_the_advantages_of_its_good_steps_each_by_its_own_discount_a
         _, traj = collect(env, still, ts.rollout, jax.random.key(0), 12)
         reward, cost = jnp.where(traj.bad.any, 0.0, jax.random.normal(jax.random.key(1), (2, 12, 8)))
         seen = Experience(traj, Signals(reward, cost, ()), ())
-        return traj, reward, cost, estimate_batch(learned_of(ts), seen, (), None)[0]
+        return traj, reward, cost, *estimate_batch(learned_of(ts), seen, (), None)
 
-    traj, reward, cost, batch = jax.jit(made, compiler_options=FAST)()
+    traj, reward, cost, batch, metrics = jax.jit(made, compiler_options=FAST)()
     bad, good, cfg, params = traj.bad.any, ~traj.bad.any, ts.config, ts.params
     assert all(0 < x.sum() < x.size / 2 for x in (bad, traj.terminated, traj.truncated & good))
     obs, after = (normalise(ts.normaliser, x) for x in (traj.obs, traj.next_obs))
@@ -71,16 +86,21 @@ def test_a_batch_has_the_advantages_of_its_good_steps_each_by_its_own_discount_a
     def expected(critic, paid, discount, decay):
         v, later = (value(params[critic], x, cfg) for x in (obs, after))
         paid, later = jnp.where(bad, v, paid), jnp.where(bad, 0.0, later)  # an error of 0
-        found = gae(ValuedSteps(paid, v, later, traj.terminated, traj.done), discount, decay)
-        return (good * (found - found.mean()) * good.size / good.sum()).ravel(), found, v
+        steps = ValuedSteps(paid, v, later, traj.terminated, traj.done)
+        found, error = advantages(estimator, steps, jnp.ones_like(v), discount, decay)
+        scale = found.std() if critic == "critic_r" else 1.0
+        advantage = good * (found - found.mean()) / scale * good.size / good.sum()
+        return advantage.ravel(), error, v, 1 - error.var() / (error + v).var()
 
-    (r, error, v), (c, error_c, v_c) = (
+    (r, error, v, explained), (c, error_c, v_c, explained_c) = (
         expected("critic_r", reward, cfg.discount, cfg.gae_lambda),
         expected("critic_c", cost, cfg.cost_discount, cfg.cost_gae_lambda),
     )
     close = partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-5)
-    close(batch.adv_r, r / error.std())
+    close(batch.adv_r, r)
     close(batch.adv_c, c)
+    close(metrics["train/explained_variance_r"], explained)
+    close(metrics["train/explained_variance_c"], explained_c)
     close(batch.ret_r, (error + v).ravel())
     close(batch.ret_c, (error_c + v_c).ravel())
     close(batch.ret_c.reshape(bad.shape)[bad], v_c[bad])
@@ -163,3 +183,76 @@ def test_metrics_are_of_the_episodes_that_ended_and_of_none_there_is_no_mean():
     _, m = compiled("ppo", env).update(endless)
     assert m["train/episodes"] == 0 and jnp.isnan(m["train/return"]) and jnp.isnan(m["train/ticks"])
     assert m["train/cost_estimate"] == 2 * 9
+
+
+def told_by_its_objective(of):
+    """A step that never moves the policy, and tells what it maximises: `of` what it is given."""
+
+    def update(actor, opt_state, objective, batch, context):
+        gain, _ = of(objective)(actor, batch)
+        return actor, opt_state, {"train/objective": gain, "train/nonfinite": jnp.zeros(())}
+
+    return PolicyStep(lambda actor, cfg: (), update)
+
+
+def mean_advantage(dist, batch, advantage, cfg):
+    return advantage.mean(), {}
+
+
+BONUS: dict[str, Any] = {"entropy_coef": 0.5, "entropy_decay": True, "total_iterations": 10.0}
+
+
+def test_an_iteration_first_moves_the_price_and_then_pays_by_it():
+    treatment = no_treatment._replace(
+        init=lambda cfg: jnp.float32(99.0),
+        update=lambda dual, episode_cost, cfg, iteration: jnp.float32(episode_cost + iteration),
+        advantage=lambda dual, adv_r, adv_c: jnp.broadcast_to(dual, adv_r.shape),
+    )
+    step = told_by_its_objective(lambda objective: objective)
+    algo = on_policy(Ticker(episode_length=5), treatment, mean_advantage, step)
+    ts = algo.init(jax.random.key(0), PPOConfig(**TINY, **BONUS), START)
+    after, m = jax.jit(algo.update, compiler_options=FAST)(ts, at(3))
+    assert after.dual == 13  # J_c is 10
+    np.testing.assert_allclose(m["train/objective"], 13 + 0.5 * 0.7 * m["train/entropy"], rtol=1e-5)
+
+
+@pytest.mark.parametrize(("part", "share"), [("reward", 0.7), ("cost", 0.0)])
+def test_the_bonus_for_entropy_belongs_to_the_reward_of_a_pair(part, share):
+    step = told_by_its_objective(lambda pair: getattr(pair, part))
+    algo = on_policy_pair(Ticker(episode_length=5), mean_advantage, step)
+    ts = algo.init(jax.random.key(0), PPOConfig(**TINY, **BONUS), START)
+    _, m = jax.jit(algo.update, compiler_options=FAST)(ts, at(3))
+    bonus = 0.5 * share * m["train/entropy"]  # of advantages the mean is 0
+    np.testing.assert_allclose(m["train/objective"], bonus, rtol=1e-5, atol=1e-5)
+
+
+def test_critics_make_the_passes_that_the_policy_made_and_their_skipped_steps_are_counted(monkeypatch):
+    """In place of a critic's error stands how many of its passes take effect."""
+
+    def passes_alone(critic, data, passes, key, cfg, axis_name):
+        return critic, jnp.float32(passes), jnp.int32(3)
+
+    monkeypatch.setattr("jaxsafe.learn.on_policy.fit_critic", passes_alone)
+    algo = telling(Ticker(), lambda batch, context: {"train/passes": jnp.int32(2)})
+    cfg = PPOConfig(**TINY, epochs=5, critic_epochs=4, critics_stop=True)
+    _, m = algo.update(algo.init(jax.random.key(0), cfg, START), START)
+    assert (m["train/value_loss_r"], m["train/value_loss_c"], m["train/nonfinite"]) == (2, 2, 6)
+
+
+def test_worlds_and_episodes_are_counted_once_each_and_on_all_devices():
+    no = jnp.zeros((2, 3, 4), bool)  # two devices with 3 steps in each of 4 worlds
+    obs, cost = no.at[0, :2, 1].set(True), no.at[0, 2, 1].set(True).at[1, 0, :2].set(True)
+    ended = no.at[0, 1, :3].set(True).at[1, 2, 0].set(True)
+    sums = jnp.where(ended, jnp.arange(4.0), jnp.nan)
+    episode = Episode(sums, sums + 1, jnp.stack([sums + 2, sums + 3], -1), {"ticks": sums + 4}, sums)
+
+    def on_one(bad, ended, episode, length):
+        ends = Ended(ended, episode, length)
+        return world_metrics(bad, "devices") | episode_metrics(Ticker(), ends, "devices")
+
+    m = jax.vmap(on_one, axis_name="devices")(Bad(obs, no, cost), ended, episode, sums + 5)
+    expected = {"bad_worlds": 3, "bad_obs": 1, "bad_reward": 0, "bad_cost": 3, "episodes": 4}
+    names = ("return", "cost", "cost_a", "cost_b", "ticks", "episode_length")
+    expected |= {name: 3 / 4 + i for i, name in enumerate(names)}  # of worlds 0, 1, 2 and 0
+    for name, x in expected.items():
+        np.testing.assert_array_equal(m[f"train/{name}"], [x, x])

@@ -33,6 +33,8 @@ def test_an_update_keeps_the_structure(name):
     assert kinds(before) == kinds(after)
     assert all(x.dtype == jnp.float32 and x.shape == () for x in metrics.values())
     assert {"train/return", "train/cost", "train/cost_estimate", "train/nonfinite"} <= metrics.keys()
+    for metric, option in (("clip_fraction", "clip"), ("inside", "near_kl"), ("passes", "epochs")):
+        assert (f"train/{metric}" in metrics) == (option in options_of(name))
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -126,6 +126,13 @@ def test_an_entropy_bonus_raises_the_entropy_and_a_malus_lowers_it(name):
     assert low < none - 1e-3 < none + 1e-3 < high  # by steps of 3e-4, or within 0.02 nats
 
 
+def test_a_step_of_a_trust_region_stays_within_it_however_large_it_is():
+    sizes = jnp.array([1e-3, 0.1, 5.0])
+    _, m = compiled("trpo_pid").together(members("trpo_pid", [0, 0, 0], target_kl=sizes))
+    assert (m["train/accepted"] == 1).all() and (m["train/kl"] > sizes / 10).all()
+    assert (m["train/kl"] <= sizes).all() and m["train/line_search"][2] > 0
+
+
 ESTIMATORS = {"cpo": "plain", "focops": "vtrace", "ppo_saute": "gae_rtg"}
 
 

@@ -21,6 +21,7 @@ from jaxsafe.config import ConfigError
 from jaxsafe.learn.constraints import metrics_by_constraint
 from jaxsafe.learn.halfspaces import furthest_point, nearest_point
 from jaxsafe.learn.normalise import normalise
+from jaxsafe.learn.returns import Window
 from jaxsafe.learn.treatments import lagrangian, pid
 from jaxsafe.nn.networks import value
 from jaxsafe.run import loop
@@ -328,9 +329,9 @@ def test_off_policy_too_the_policy_comes_near_the_best_within_both_limits(name):
 TINY = {"num_envs": 8, "horizon": 25, "minibatches": 2, "hidden": (8,)}
 
 
-def begin(name):
+def begin(name, **options):
     algo = ALGOS[name].make(Ticker())
-    cfg = ALGOS[name].config(**TINY, cost_limits={"b": 1.0, "a": 20.0})
+    cfg = ALGOS[name].config(**TINY, cost_limits={"b": 1.0, "a": 20.0}, **options)
     return algo, lambda: algo.init(jax.random.key(0), cfg, START)
 
 
@@ -353,8 +354,13 @@ def test_an_update_has_a_critic_and_its_metrics_for_each_constraint(name):
     "name", [name if name in ("cpo", "ppo_lag") else SLOW(name) for name in SEVERAL]
 )
 def test_each_constraint_is_charged_its_own_cost(name):
-    algo, init = begin(name)
-    after, metrics = jax.jit(lambda: algo.update(init(), START), compiler_options=FAST)()
+    algo, init = begin(name, cost_window=2)
+
+    def update():
+        past = Window(jnp.full((2, 2), 99.0), jnp.int32(2))  # which no metric of an iteration sees
+        return algo.update(dataclasses.replace(init(), past_costs=past), START)
+
+    after, metrics = jax.jit(update, compiler_options=FAST)()
     assert all(jnp.isfinite(x).all() for x in jax.tree.leaves((after.params, metrics)))
     for mean, cost in ((2.5, "a"), (7.5, "b")):  # 0.5 and 1.5 a step, 5 steps
         for metric in ("cost", "cost_estimate"):
