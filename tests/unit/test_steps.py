@@ -154,20 +154,34 @@ def test_on_a_gpu_small_networks_are_one_array_to_adam_and_take_the_same_step(jo
     assert (isinstance(mu, jax.Array) and mu.shape == (17,)) == joined
 
 
+@pytest.mark.parametrize(("length", "kept"), [(5.0, 0.5), (0.3, 0.3)])
+def test_a_gradient_of_all_parameters_is_cut_to_its_longest_norm(length, kept):
+    grads = {"a": jnp.array([0.6]), "b": jnp.array([0.0, -0.8])}  # of norm 1
+    optimiser = adam(1e-2, PPOConfig(max_grad_norm=0.5))
+    long = jax.tree.map(lambda x: length * x, grads)
+    _, state = optimiser.update(long, optimiser.init(grads))
+    found = momentum(Trainable({"net": grads}, {"net": state}), "net")
+    for mu, x in zip(*map(jax.tree.leaves, (found, grads)), strict=True):
+        np.testing.assert_allclose(mu, 0.1 * kept * x, rtol=1e-5)
+
+
 fit_jitted = jax.jit(fit_critic, static_argnums=5, compiler_options=FAST)
 
 
-def test_each_pass_of_a_critic_has_minibatches_of_its_own(monkeypatch):
-    """In place of a pass, a number that its key draws is its error."""
+def test_each_pass_of_a_critic_has_minibatches_of_its_own_and_the_last_that_counts_is_told(monkeypatch):
+    """In place of each pass its errors are drawn by its key, and both its steps are skipped."""
 
     def one_draw(step, critic, data, key, minibatches):
-        return critic, (jax.random.uniform(key, (1,)), jnp.zeros(1, int))
+        return critic, (jax.random.uniform(key, (2,)), jnp.ones(2, int))
 
     monkeypatch.setattr("jaxsafe.learn.steps.one_pass", one_draw)
     cfg, critic = PPOConfig(**SMALL, critic_epochs=3), Trainable(jnp.zeros(1), ())
     data, key = (jnp.zeros((8, 3)), jnp.zeros(8)), jax.random.key(0)
-    errors = {fit_critic(critic, data, passes, key, cfg, None)[1].item() for passes in (1, 2, 3)}
-    assert len(errors) == 3
+    draws = [jax.random.uniform(key, (2,)).mean() for key in jax.random.split(key, 3)]
+    assert len({*map(float, draws)}) == 3
+    for passes in (1, 2, 3):
+        _, error, skipped = fit_critic(critic, data, passes, key, cfg, None)
+        assert error == draws[passes - 1] and skipped == 2 * passes
 
 
 def test_a_critic_learns_its_targets():

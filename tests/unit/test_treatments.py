@@ -115,6 +115,11 @@ def test_the_controller_by_hand():
     dual = pid.update(dual, jnp.float32(5.0), cfg, 0)
     # I = 1.9 - 0.2, P = -3.75 - 10, smoothed cost 8.125: that it fell from 17.5 takes nothing off
     np.testing.assert_allclose(dual.lam, 0.1 * -13.75 + 1.7, rtol=1e-5)
+    told = pid.metrics(dual)
+    np.testing.assert_allclose([told["train/lam"], told["train/integral"]], [0.325, 1.7], rtol=1e-5)
+    np.testing.assert_allclose(
+        pid.advantage(dual, jnp.ones(1), 2 * jnp.ones(1)), [0.35 / 1.325], rtol=1e-4
+    )
     for _ in range(8):
         dual = pid.update(dual, jnp.float32(0.0), cfg, 0)
     assert dual.integral == 0 and dual.lam == 0  # neither winds up below
