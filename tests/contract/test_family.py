@@ -7,9 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import FAST
 from jax.flatten_util import ravel_pytree
+from learners import TINY
 from scipy.optimize import minimize
-from toys import context
+from toys import START, Ticker, context
 
 from jaxsafe.algos import cpo, cup, focops, p3o, pcpo
 from jaxsafe.learn.estimates import Batch
@@ -105,9 +107,10 @@ def test_the_projection_is_scipys(seed, c):
 def test_omnisafes_pcpo_steps_along_the_plain_gradient():
     h_g, h_b = jnp.array([1.0, 2.0]), jnp.array([0.5, 0.0])
     p = cpo.Problem(jnp.array([2.0, 8.0]), h_g, h_b, *map(jnp.float32, (18.0, 1.0, 0.25, 0.3, 0.04)))
-    step = pcpo.projected_step(p, pcpo.PCPOConfig(natural=False)).step
+    found = pcpo.projected_step(p, pcpo.PCPOConfig(natural=False))
     scale = (2 * 0.04 / 18) ** 0.5
-    np.testing.assert_allclose(step, scale * p.g - (scale * 1.0 + 0.3) / 0.25 * h_b, rtol=1e-6)
+    assert not found.earns  # what is projected may earn less than the present policy
+    np.testing.assert_allclose(found.step, scale * p.g - (scale * 1.0 + 0.3) / 0.25 * h_b, rtol=1e-6)
 
 
 def problem(cfg):
@@ -153,13 +156,8 @@ def test_the_penalty_is_felt_beyond_the_limit_alone(excess, price, omnisafe):
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7)
 
 
-@pytest.mark.parametrize("noise", [-1.0, 1.0])
-@pytest.mark.parametrize("violation", [-0.2, 0.2])
-@pytest.mark.parametrize("centred", [False, True])
-def test_noise_of_a_minibatch_is_a_violation_unless_it_is_centred(centred, violation, noise):
-    """The mean of A_c over a minibatch depends on the states that it happens to hold."""
-    cfg = p3o.P3OConfig(hidden=(8,), kappa=3.0, centre_cost=centred)
-    penalty = 3.0 * max(0.0, violation + (0.0 if centred else noise))
+def penalty_of(cfg, noise, violation, axis_name=None):
+    """What a policy pays that has not moved, for a minibatch whose A_c has the mean `noise`."""
     actor, batch = problem(cfg)
     batch = dataclasses.replace(batch, adv_c=batch.adv_c + noise)
 
@@ -169,9 +167,29 @@ def test_noise_of_a_minibatch_is_a_violation_unless_it_is_centred(centred, viola
     def of_cost(actor, batch):
         return p3o.surrogate_c(action_dist(actor, batch.obs, cfg), batch, batch.adv_c, cfg)
 
-    told = context(cfg, violation=violation)
-    _, metrics = p3o.penalised(Pair(of_reward, of_cost), told)(actor, batch)
-    np.testing.assert_allclose(metrics["train/penalty"], penalty, atol=1e-5)
+    told = context(cfg, violation=violation, axis_name=axis_name)
+    return p3o.penalised(Pair(of_reward, of_cost), told)(actor, batch)[1]["train/penalty"]
+
+
+@pytest.mark.parametrize("noise", [-1.0, 1.0])
+@pytest.mark.parametrize("violation", [-0.2, 0.2])
+@pytest.mark.parametrize("centred", [False, True])
+def test_noise_of_a_minibatch_is_a_violation_unless_it_is_centred(centred, violation, noise):
+    """The mean of A_c over a minibatch depends on the states that it happens to hold."""
+    cfg = p3o.P3OConfig(hidden=(8,), kappa=3.0, centre_cost=centred)
+    penalty = 3.0 * max(0.0, violation + (0.0 if centred else noise))
+    np.testing.assert_allclose(penalty_of(cfg, noise, violation), penalty, atol=1e-5)
+
+
+@pytest.mark.parametrize("violation", [-0.2, 0.2])
+def test_the_penalty_is_on_the_mean_of_all_devices(violation):
+    cfg = p3o.P3OConfig(hidden=(8,), kappa=3.0)
+
+    def on_one(noise):
+        return penalty_of(cfg, noise, violation, "devices")
+
+    paid = jax.vmap(on_one, axis_name="devices")(jnp.array([-1.0, 1.0]))
+    np.testing.assert_allclose(paid.mean(), 3.0 * max(0.0, violation), atol=1e-5)
 
 
 def test_cups_projection_is_a_step_down_the_papers_loss():
@@ -189,3 +207,33 @@ def test_cups_projection_is_a_step_down_the_papers_loss():
     ours = jax.grad(lambda x: -cup.projection(unravel(x), batch, lam, cfg)[0])(away)
     np.testing.assert_allclose(ours, jax.grad(paper)(away), rtol=1e-4, atol=1e-5)
     assert jnp.abs(ours).max() > 0
+
+
+def test_cups_steps_are_up_the_papers_objectives(monkeypatch):
+    """In place of each step all parameters rise by 0.1; it tells what it maximises there, and what it
+    should."""
+    collected = []
+
+    def rise(actor, opt_state, objective, batch, context):
+        cfg, actor = context.cfg, jax.tree.map(lambda x: x + 0.1, actor)
+        collected.append(batch)
+        dist, acted = action_dist(actor, batch.obs, cfg), collected[0]
+        if len(collected) == 1:
+            expected = clipped(dist, acted, acted.adv_r, cfg)[0]
+        else:
+            scale = (1 - cfg.cost_discount * cfg.cost_gae_lambda) / (1 - cfg.cost_discount)
+            w = jnp.exp(log_prob(dist, acted.action) - acted.log_prob)  # with the policy that acted
+            before = action_dist(jax.tree.map(lambda x: x - 0.1, actor), batch.obs, cfg)
+            expected = -jnp.mean(1.1 * scale * w * acted.adv_c + kl(dist, before))
+        told = {"train/kl": objective(actor, batch)[0], "train/passes": expected}
+        return actor, opt_state, told | {"train/nonfinite": jnp.ones(())}
+
+    monkeypatch.setattr(cup, "adam_epochs", cup.adam_epochs._replace(update=rise))
+    algo, cfg = cup.make(Ticker(episode_length=5)), cup.CUPConfig(**TINY, lam_init=1.0, cost_limit=9.0)
+    ts = algo.init(jax.random.key(0), cfg, START)
+    after, m = jax.jit(algo.update, compiler_options=FAST)(ts, START)
+    np.testing.assert_allclose(after.dual.lam, 1.1, rtol=1e-6)  # J_c is 10: Adam's step of 0.1
+    assert jnp.abs(m["train/passes"]) > 1e-4 and jnp.abs(m["train/passes_projection"]) > 1e-4
+    np.testing.assert_allclose(m["train/kl_reward"], m["train/passes"], rtol=1e-3)
+    np.testing.assert_allclose(m["train/kl_projection"], m["train/passes_projection"], rtol=1e-3)
+    assert m["train/nonfinite"] == 2

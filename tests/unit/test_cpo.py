@@ -1,3 +1,4 @@
+import dataclasses
 from functools import cache, partial
 
 import jax
@@ -15,11 +16,13 @@ from jaxsafe.algos.cpo import (
     RECOVER,
     RETURN,
     CPOConfig,
+    Direction,
     Margin,
     Problem,
     cpo_step,
     multipliers,
     solution,
+    step_by,
 )
 from jaxsafe.learn.estimates import Batch
 from jaxsafe.learn.steps import Pair, mean_kl
@@ -318,3 +321,58 @@ def test_a_step_keeps_its_promises_and_two_devices_take_it_as_one(violation, cas
     for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(parts), strict=True):
         np.testing.assert_allclose(b[0], b[1], rtol=1e-6)
         np.testing.assert_allclose(a, b[0], rtol=1e-3, atol=1e-4)
+
+
+def test_a_residual_is_that_of_its_own_gradient():
+    cfg, (actor, batch) = CPOConfig(hidden=(8,), cg_iterations=2), problem()
+    for field, zero, other in (("adv_r", "r", "c"), ("adv_c", "c", "r")):
+        without = dataclasses.replace(batch, **{field: jnp.zeros(256)})
+        _, _, m = one_step(cfg, actor, jnp.float32(0.0), START, without)
+        assert m[f"train/cg_residual_{zero}"] == 0 and m[f"train/cg_residual_{other}"] > 1e-3
+
+
+def tried(direction, earns, violation):
+    """The metrics of a step along `direction(problem)`, with one cost or, for two violations, two."""
+    cfg, (actor, batch) = CPOConfig(hidden=(8,), margin_lr=0.0), problem()
+    violation = jnp.array(violation)
+
+    def of(adv):
+        return lambda actor, batch: plain(action_dist(actor, batch.obs, cfg), batch, adv, cfg)
+
+    def both(actor, batch):
+        costs = batch.adv_c, batch.action[:, 1] - batch.action[:, 1].mean()
+        return jnp.stack([of(adv)(actor, batch)[0] for adv in costs]), {}
+
+    def step():
+        step = step_by(lambda p, cfg: Direction(direction(p), jnp.bool_(earns), {}))
+        pair = Pair(of(batch.adv_r), both if violation.ndim else of(batch.adv_c))
+        told = context(cfg, violation=violation)
+        return step.update(actor, Margin(jnp.zeros_like(violation)), pair, batch, told)[2]
+
+    return jax.jit(step, compiler_options=FAST)()
+
+
+def short(x):
+    return 0.01 * x / jnp.linalg.norm(x)
+
+
+@pytest.mark.parametrize(
+    "direction, earns, violation, accepted",
+    [
+        (lambda p: short(p.h_b), False, 0.0, 0),  # cost rises from the limit
+        (lambda p: short(-p.h_b), False, 0.0, 1),
+        (lambda p: short(p.h_b[1] - p.h_b[0]), False, [0.0, 0.0], 0),  # the second of two costs rises
+        (lambda p: short(-p.h_b[1] - p.h_b[0]), False, [0.0, 0.0], 1),
+        (lambda p: short(-p.h_g), True, -9.0, 0),  # reward falls, far below the limit
+        (lambda p: short(-p.h_g), False, -9.0, 1),
+    ],
+)
+def test_a_step_that_breaks_a_promise_is_not_taken(direction, earns, violation, accepted):
+    metrics = tried(direction, earns, violation)
+    assert metrics["train/accepted"] == accepted and (metrics["train/kl"] > 0) == accepted
+
+
+def test_a_step_beyond_the_trust_region_is_shortened():
+    metrics = tried(lambda p: 10 * jnp.sqrt(2 * p.delta / p.q) * p.h_g, True, -9.0)
+    assert metrics["train/accepted"] == 1 and metrics["train/line_search"] > 5
+    assert 0.002 < metrics["train/kl"] <= CPOConfig().target_kl
