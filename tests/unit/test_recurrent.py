@@ -1,12 +1,15 @@
-"""The gradient of long sequences."""
+"""A gated recurrent unit, and the gradient of long sequences."""
+
+from typing import Any
 
 import chex
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
-from jaxsafe.nn.recurrent import GRU, gradient_at_once, scanned
+from jaxsafe.nn.recurrent import GRU, Recurrent, gradient_at_once, scanned
 
 STEPS, ROWS, SIZE, WIDTH = 7, 3, 4, 2
 
@@ -45,3 +48,24 @@ def test_the_gradient_of_all_steps_at_once_is_that_of_a_scan(of):
     chex.assert_trees_all_close(value, expected, rtol=1e-6)
     chex.assert_trees_all_close(slope, slope_of_scan, rtol=1e-4, atol=1e-4)
     assert all(jnp.abs(x).max() > 0.1 for x in jax.tree.leaves(slope))
+
+
+def test_a_unit_and_what_is_around_it_by_hand():
+    net = Recurrent(nn.Dense(WIDTH), jnp.square, SIZE, (nn.Dense(1), nn.Dense(2)))
+    draw = jax.random.split(jax.random.key(0), 3)
+    h, x = jax.random.normal(draw[0], (ROWS, SIZE)), jax.random.normal(draw[1], (ROWS, 5))
+    params = net.init(draw[2], h, x)
+    layers = jax.tree.map(np.float64, params["params"])
+
+    def linear(layer, x):
+        return x @ layer["kernel"] + layer.get("bias", 0.0)
+
+    unit, seen = layers["GRU_0"], linear(layers["encoder"], np.float64(x)) ** 2
+    gates = 1 / (1 + np.exp(-linear(unit["gates"], np.concatenate([seen, h], -1))))
+    z, r = gates[:, :SIZE], gates[:, SIZE:]
+    candidate = np.tanh(linear(unit["see"], seen) + r * linear(unit["recall"], np.float64(h)))
+    after = (1 - z) * candidate + z * h
+    found: Any = net.apply(params, h, x)
+    np.testing.assert_allclose(found[0], after, rtol=1e-4, atol=1e-5)
+    heads = np.concatenate([linear(layers[f"heads_{i}"], after) for i in range(2)], -1)
+    np.testing.assert_allclose(found[1], heads, rtol=1e-4, atol=1e-5)
