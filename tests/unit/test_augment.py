@@ -132,6 +132,16 @@ def test_omnisafes_value_at_a_time_limit_is_of_a_full_budget():
     np.testing.assert_array_equal(augment.saute.last_obs(traj, ours), traj.next_obs)
 
 
+def test_critics_learn_the_value_of_a_full_budget_at_a_time_limit():
+    env = Ticker(episode_length=5)
+
+    def learned(full):
+        ts = start("ppo_saute", env, full_at_end=full, cost_limit=90.0)
+        return jax.tree.leaves(build("ppo_saute", env)[1](ts)[0].params["critic_r"])
+
+    assert any((x != y).any() for x, y in zip(learned(False), learned(True), strict=True))
+
+
 def test_the_unsafe_reward_is_the_learners_alone():
     env = Ticker(episode_length=5)
     after = {}
