@@ -75,8 +75,9 @@ def test_a_step_that_is_not_finite_does_not_count_and_its_world_begins_anew(whic
     assert (traj.reward[2, 0], traj.cost[2, 0], traj.reward[2, 1]) == (0, 0, 1)
 
 
-def test_a_reset_that_is_not_finite_is_followed_by_another():
-    env = Ticker(episode_length=5)
+@pytest.mark.parametrize("env", [Ticker(episode_length=5), Corridor()])
+def test_a_reset_that_is_not_finite_is_followed_by_another(env):
+    """Whether or not the step makes its observation of it, which a corridor does not."""
     rollout = init_rollout(env, jax.random.key(0), 2, False)
     state = dataclasses.replace(rollout.state, obs=rollout.state.obs.at[0].set(jnp.nan))
     rollout = dataclasses.replace(rollout, state=state)
