@@ -227,16 +227,18 @@ def test_the_bonus_for_entropy_belongs_to_the_reward_of_a_pair(part, share):
 
 
 def test_critics_make_the_passes_that_the_policy_made_and_their_skipped_steps_are_counted(monkeypatch):
-    """In place of a critic's error stands how many of its passes take effect."""
+    """In place of a critic's error stands its mean target times the passes that take effect."""
 
     def passes_alone(critic, data, passes, key, cfg, axis_name):
-        return critic, jnp.float32(passes), jnp.int32(3)
+        return critic, passes * data[1].mean(), jnp.int32(3)
 
     monkeypatch.setattr("jaxsafe.learn.on_policy.fit_critic", passes_alone)
     algo = telling(Ticker(), lambda batch, context: {"train/passes": jnp.int32(2)})
-    cfg = PPOConfig(**TINY, epochs=5, critic_epochs=4, critics_stop=True)
+    sizes: dict[str, Any] = {**TINY, "epochs": 5, "critic_epochs": 4}
+    cfg = PPOConfig(**sizes, critics_stop=True, discount=0.0, cost_discount=0.0)  # targets 1 and 2
     _, m = algo.update(algo.init(jax.random.key(0), cfg, START), START)
-    assert (m["train/value_loss_r"], m["train/value_loss_c"], m["train/nonfinite"]) == (2, 2, 6)
+    found = [m[f"train/{name}"] for name in ("value_loss_r", "value_loss_c", "nonfinite")]
+    np.testing.assert_allclose(found, [2, 4, 6], rtol=1e-5)
 
 
 def test_worlds_and_episodes_are_counted_once_each_and_on_all_devices():
