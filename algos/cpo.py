@@ -65,7 +65,7 @@ class CPOConfig(LimitsConfig, trpo.TRPOConfig):
     in fewer than 1% of iterations and are not reproduced.
     """
 
-    SUITS: ClassVar = {"parallel": ("hopper_velocity",)}
+    SUITS: ClassVar = {"parallel": ("hopper_velocity",)}  # docs/results/velocity_settings
     CONVENTIONS: ClassVar = (
         Convention(
             {"per_step": False, "violation_gain": 1.0, "margin_lr": 0.0},

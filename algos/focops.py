@@ -30,7 +30,7 @@ class FOCOPSConfig(LagrangianConfig, pg.PGConfig):
     in the paper. OmniSafe multiplies the mean of the minibatch by it (`per_state=False`).
     """
 
-    SUITS: ClassVar = {"frequent": ("hopper_velocity",)}
+    SUITS: ClassVar = {"frequent": ("hopper_velocity",)}  # docs/results/velocity
     CONVENTIONS: ClassVar = (
         Convention(
             {"per_state": False},

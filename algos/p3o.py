@@ -46,8 +46,9 @@ class P3OConfig(ppo.PPOConfig):
     per_step: bool = True
     # Whether the cost's surrogate is max(w A_c, clip(w) A_c). OmniSafe's is w A_c.
     clip_cost: bool = True
-    # Whether the mean of A_c over each minibatch is subtracted. That mean is noise, whose positive part
-    # the penalty keeps as a margin: without it costs end over the limit.
+    # Whether the mean of A_c over each minibatch is subtracted. Neither the paper nor OmniSafe does it.
+    # That mean is noise, whose positive part the penalty keeps as a margin. Without it costs end over
+    # the limit.
     centre_cost: bool = False
 
 

@@ -99,7 +99,7 @@ class CPPOPIDConfig(PIDConfig, PPOConfig):
     `lam_init`, in the algorithm at 0.
     """
 
-    SUITS: ClassVar = {"parallel": ("hopper_velocity",)}
+    SUITS: ClassVar = {"parallel": ("hopper_velocity",)}  # docs/results/velocity_settings
 
 
 @config
