@@ -18,7 +18,7 @@ from jaxsafe.learn.augment import (
     schedule,
     simmer,
 )
-from jaxsafe.learn.on_policy import on_policy, presets
+from jaxsafe.learn.on_policy import EARLY_PRICE, on_policy, presets
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.steps import adam_epochs
 from jaxsafe.learn.surrogates import clipped
@@ -99,7 +99,8 @@ class CPPOPIDConfig(PIDConfig, PPOConfig):
     `lam_init`, in the algorithm at 0.
     """
 
-    SUITS: ClassVar = {"parallel": ("hopper_velocity",)}  # docs/results/velocity_settings
+    # docs/results/velocity_settings
+    SUITS: ClassVar = {"parallel": ("hopper_velocity", "humanoid_velocity")}
 
 
 @config
@@ -213,7 +214,7 @@ ROWS = {
         PPOLagConfig,
         partial(make, treatment=lagrangian),
         "PPO with an adaptive price on cost",
-        presets(PUBLISHED | {"dual_lr": 0.035}),
+        presets(PUBLISHED | {"dual_lr": 0.035}) | EARLY_PRICE,
         omnisafe="PPOLag",
         lever=pg.LEVER,
     ),

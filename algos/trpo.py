@@ -1,7 +1,7 @@
 """TRPO, and TRPO with each treatment of the constraint and each augmentation of the task."""
 
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 from jaxsafe.algos import npg, ppo
 from jaxsafe.config import config
@@ -18,7 +18,7 @@ from jaxsafe.learn.augment import (
     schedule,
     simmer,
 )
-from jaxsafe.learn.on_policy import OnPolicyConfig, on_policy, presets
+from jaxsafe.learn.on_policy import EARLY_PRICE, OnPolicyConfig, on_policy, presets
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.surrogates import plain
 from jaxsafe.learn.treatments import (
@@ -58,6 +58,8 @@ class TRPOLagConfig(LagrangianConfig, TRPOConfig):
     Learning".
     Differs from it as PPO-Lagrangian does.
     """
+
+    SUITS: ClassVar = {"early_price": ("swimmer_velocity",)}  # docs/results/velocity_settings
 
 
 @config
@@ -149,7 +151,7 @@ ROWS = {
         TRPOLagConfig,
         partial(make, treatment=lagrangian),
         "TRPO with an adaptive price on cost",
-        presets(PUBLISHED | {"dual_lr": 0.035}),
+        presets(PUBLISHED | {"dual_lr": 0.035}) | EARLY_PRICE,
         omnisafe="TRPOLag",
     ),
     "trpo_pid": Row(

@@ -21,25 +21,25 @@ GOALS = ("point_goal1", "car_goal1")
 ROBOTS = ("halfcheetah", "hopper", "ant")
 ON_POLICY = [f"{robot}_velocity" for robot in (*ROBOTS, "walker2d", "swimmer", "humanoid")]
 FREQUENT = "preset=frequent"
+PARALLEL = "preset=published algo.num_envs=160 algo.horizon=125"
+EARLY_PRICE = f"{FREQUENT} algo.lam_init=1"
 # How runs of the studies say what is shipped for a task, after 1e7 steps: `preset=auto` gives the same.
 # A run with no options stands for the other tasks.
 SHIPPED = {
     **{
         (f"{robot}_velocity", x): FREQUENT for robot in ("walker2d", "swimmer", "humanoid") for x in SIX
     },
-    **{
-        ("hopper_velocity", x): "preset=published algo.num_envs=160 algo.horizon=125"
-        for x in ("cpo", "cppo_pid")
-    },
+    **{("hopper_velocity", x): PARALLEL for x in ("cpo", "cppo_pid")},
     ("hopper_velocity", "focops"): FREQUENT,
+    ("swimmer_velocity", "trpo_lag"): EARLY_PRICE,
+    ("humanoid_velocity", "cppo_pid"): PARALLEL,
     **{
         (f"{robot}_velocity", "td3_lag"): "preset=fast algo.lr_decay=true"
         for robot in ("halfcheetah", "ant")
     },
 }
 # What docs/choosing.md advises in place of it
-EARLY_PRICE = f"{FREQUENT} algo.lam_init=1 total_steps=2e6"
-ADVISED = {("swimmer_velocity", x): EARLY_PRICE for x in ("ppo_lag", "trpo_lag")}
+ADVISED = {("swimmer_velocity", "ppo_lag"): f"{EARLY_PRICE} total_steps=2e6"}
 # of another task, limit or number of seeds
 OTHERS = ("env.rules=", "algo.cost_limit=", "num_seeds=")
 

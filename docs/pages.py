@@ -483,14 +483,14 @@ def suited(row: Row) -> dict[str, list[str]]:
 
 @functools.cache
 def trained() -> list[SettingRun]:
-    """The runs of the tables of results, by task and then by whose settings they have."""
+    """The runs of the tables of results that are done, by task and then by whose settings they have."""
 
     def place(run: SettingRun) -> tuple[str, str]:
         preset, compat = run.config["preset"], run.config["compat"]
         return run.env, compat if compat != "none" else preset if preset != "fast" else ""
 
     folders = [HERE / "results" / name for name in STUDIES]
-    return sorted(read(folders), key=place)
+    return sorted((run for run in read(folders) if run.ended), key=place)
 
 
 @functools.cache

@@ -172,8 +172,9 @@ OMNISAFE: dict[str, Any] = {
 # four times as long, and four times as many gradient steps; of the critics eight times as many.
 FREQUENT: dict[str, Any] = {"num_envs": 128, "horizon": 160, "minibatches": 32, "critic_epochs": 20}
 
-
-# OmniSafe's settings with rollouts side by side, for Hopper (docs/results/velocity_settings)
+# For Swimmer, where a price that comes late holds TRPO-Lagrangian on a plateau (the same page)
+EARLY_PRICE: dict[str, dict[str, Any]] = {"early_price": FREQUENT | {"lam_init": 1.0}}
+# OmniSafe's settings with rollouts side by side, for Hopper and Humanoid (the same page)
 PARALLEL: dict[str, Any] = {"num_envs": 160, "horizon": 125}
 
 
