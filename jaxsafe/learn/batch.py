@@ -37,14 +37,15 @@ def masked_mean(x: jax.Array, mask: jax.Array, axis_name: str | None) -> jax.Arr
     return jnp.where(count > 0, total / jnp.maximum(count, 1), jnp.nan)
 
 
-def centre(x: jax.Array, axis_name: str | None) -> jax.Array:
-    return x - batch_mean(x, axis_name)
+def centre(x: jax.Array, axis_name: str | None, weight: jax.Array | float = 1.0) -> jax.Array:
+    """`x` less its mean over all devices, in which an entry counts `weight`, 1 on average."""
+    return x - batch_mean(x * weight, axis_name)
 
 
-def standardise(x: jax.Array, axis_name: str | None) -> jax.Array:
-    """Zero mean and unit population variance over the batch of all devices."""
-    x = centre(x, axis_name)
-    return x / (jnp.sqrt(batch_mean(x**2, axis_name)) + 1e-8)
+def standardise(x: jax.Array, axis_name: str | None, weight: jax.Array | float = 1.0) -> jax.Array:
+    """Zero mean and unit population variance over the batch of all devices; `weight` as in `centre`."""
+    x = centre(x, axis_name, weight)
+    return x / (jnp.sqrt(batch_mean(x**2 * weight, axis_name)) + 1e-8)
 
 
 def select(condition: jax.Array, new: PyTree, old: PyTree) -> PyTree:

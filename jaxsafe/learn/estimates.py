@@ -157,8 +157,8 @@ def estimate_batch(
         action=lay_out(traj.action),
         log_prob=lay_out(traj.log_prob),
         old=jax.tree.map(lay_out, found.dist),
-        adv_r=lay_out(standardise(of_reward.advantage, axis_name) * weight),
-        adv_c=lay_out(each(lambda x: centre(x, axis_name) * weight, names)(of_cost.advantage)),
+        adv_r=lay_out(standardise(of_reward.advantage, axis_name, weight) * weight),
+        adv_c=lay_out(each(lambda x: centre(x, axis_name, weight) * weight, names)(of_cost.advantage)),
         ret_r=lay_out(of_reward.target),
         ret_c=lay_out(of_cost.target),
     )

@@ -88,8 +88,8 @@ def test_a_batch_has_the_advantages_of_its_good_steps_each_by_its_own_discount_a
         paid, later = jnp.where(bad, v, paid), jnp.where(bad, 0.0, later)  # an error of 0
         steps = ValuedSteps(paid, v, later, traj.terminated, traj.done)
         found, error = advantages(estimator, steps, jnp.ones_like(v), discount, decay)
-        scale = found.std() if critic == "critic_r" else 1.0
-        advantage = good * (found - found.mean()) / scale * good.size / good.sum()
+        scale = found.std(where=good) if critic == "critic_r" else 1.0
+        advantage = good * (found - found.mean(where=good)) / scale * good.size / good.sum()
         return advantage.ravel(), error, v, 1 - error.var() / (error + v).var()
 
     (r, error, v, explained), (c, error_c, v_c, explained_c) = (
