@@ -53,6 +53,7 @@ class Typed(NamedTuple):
     overrides: list[Override]
     multirun: bool
     printed: bool  # --cfg: the config is printed, and no job is called
+    files: bool  # --config-dir or --config-path: Hydra reads files of the user's
 
     @property
     def by_name(self) -> dict[str, Override]:
@@ -155,7 +156,8 @@ def read_arguments(argv: list[str]) -> Typed:
     check_grid(overrides)
     for override in overrides:
         import_named_code(override)
-    return Typed(flags, overrides, args.multirun, bool(args.cfg))
+    files = bool(args.config_dir or args.config_path)
+    return Typed(flags, overrides, args.multirun, bool(args.cfg), files)
 
 
 def check_arguments(argv: list[str]) -> Request:
@@ -215,8 +217,18 @@ def check_lengths(known: list[dict[str, Any]]) -> None:
 
 
 def swept_otherwise(typed: Typed) -> bool:
-    """Whether a sweeper is chosen or set that may pick environments and algorithms itself."""
-    return any(o.key_or_group.startswith(("hydra.sweeper", "hydra/sweeper")) for o in typed.overrides)
+    """Whether a sweeper may pick environments and algorithms itself: its options name env or algo, or
+    files of the user's may."""
+    set_in = [
+        o for o in typed.overrides if o.key_or_group.startswith(("hydra.sweeper", "hydra/sweeper"))
+    ]
+    names = {name for o in set_in for name in (*o.key_or_group.split("."), *names_within(o.value()))}
+    return bool(set_in) and (typed.files or not names.isdisjoint(DEFAULT))
+
+
+def names_within(value: Any) -> set[str]:
+    """The names in dicts in dicts."""
+    return {*value}.union(*map(names_within, value.values())) if isinstance(value, dict) else set()
 
 
 def several(known: list[dict[str, Any]]) -> bool:

@@ -579,12 +579,38 @@ def test_algorithms_of_a_sweep_must_have_one_length():
         hydra_jobs.check_arguments(["-m", "algo=ppo,sac", *length])
 
 
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["hydra.sweeper.params={env: 'walker2d_velocity,ant_velocity'}"],
+        ["hydra.sweeper.params={algo: 'ppo,sac'}"],
+        ["+hydra.sweeper.params.env='walker2d_velocity,ant_velocity'"],
+        ["+hydra.sweeper.ax_config={params: {env: {type: choice, values: [ant_velocity]}}}"],
+        ["--config-dir=conf", "hydra/sweeper=mine"],
+    ],
+)
 def test_a_sweeper_that_may_choose_any_task_has_the_general_defaults_or_those_of_the_run_to_continue(
-    tmp_path,
+    tmp_path, options
 ):
-    texts, sweeper = ["env=walker2d_velocity", "algo=ppo"], ["-m", "hydra.sweeper.max_batch_size=1"]
+    texts, sweeper = ["env=walker2d_velocity", "algo=ppo"], ["-m", *options]
     assert hydra_jobs.check_arguments([*sweeper, *texts]).base["preset"] == "fast"
     run_folder.write_config(tmp_path, arguments.compose(texts).plain())
     assert hydra_jobs.check_arguments([*sweeper, f"resume={tmp_path}"]).base["preset"] == "frequent"
     with pytest.raises(ConfigError, match="preset=auto: a sweeper may choose any task"):
         hydra_jobs.check_arguments([*sweeper, *texts, "preset=auto"])
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["-m", "hydra.sweeper.max_batch_size=1"],
+        ["-m", "hydra.sweeper.params={algo.clip: '0.1,0.2', seed: '1,2'}"],
+        ["-m", "hydra/sweeper=basic"],
+        ["hydra.verbose=true"],
+    ],
+)
+def test_options_of_hydra_that_choose_no_task_leave_it_its_preset(options):
+    texts = [*options, "env=walker2d_velocity", "algo=ppo"]
+    request = hydra_jobs.check_arguments(texts)
+    assert request.base["preset"] == "frequent" and request.groups["algo"]["ppo"]["horizon"] == 160
+    hydra_jobs.check_arguments([*texts, "preset=auto"])  # is not refused
