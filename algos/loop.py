@@ -118,7 +118,7 @@ class SafeLOOPConfig(LOOPConfig):
 def planner(env: Env, cost: PlanCost = no_cost, weigh: Weigh = by_return) -> Planner:
     actor = sac.soft_actor(env.action_size)
 
-    def ret(imagined: Imagined, learned: Learned, key: jax.Array) -> jax.Array:
+    def plan_return(imagined: Imagined, learned: Learned, key: jax.Array) -> jax.Array:
         cfg, params = learned.config, learned.params
         steps = len(imagined.reward)
         weights = (cfg.discount ** jnp.arange(steps)).reshape(-1, 1, 1, 1)
@@ -142,7 +142,7 @@ def planner(env: Env, cost: PlanCost = no_cost, weigh: Weigh = by_return) -> Pla
         actions = jax.lax.scan(step, start, jax.random.split(key, cfg.plan_steps))[1]
         return (jnp.moveaxis(actions.reshape(cfg.plan_steps, -1, env.action_size), 0, 1),)
 
-    return Planner(ret, cost, weigh, propose)
+    return Planner(plan_return, cost, weigh, propose)
 
 
 def make(env: Env, axis_name: str | None = None, **scores: Any) -> Algorithm:

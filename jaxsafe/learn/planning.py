@@ -71,14 +71,14 @@ Weigh = Callable[[jax.Array, jax.Array, Any], jax.Array]  # (return [S], cost [S
 class Planner(NamedTuple):
     """What one method adds to the planning.
 
-    ret(imagined, learned, key) -> float [S], the return of each plan.
+    plan_return(imagined, learned, key) -> float [S], the return of each plan.
     cost(imagined, learned) -> float [S], the cost of each plan, summed over its steps. The policy
         scales it to a whole episode, whose cost `weigh` compares with the limit.
     weigh(ret, cost, cfg) -> weights, float [S], whose sum is 1.
     propose(model, learned, seen, key) -> further plans to try: arrays [.., H, A], or () for none.
     """
 
-    ret: Callable[[Imagined, Learned, jax.Array], jax.Array]
+    plan_return: Callable[[Imagined, Learned, jax.Array], jax.Array]
     cost: PlanCost
     weigh: Weigh
     propose: Callable[[Model, Learned, PyTree, jax.Array], tuple[jax.Array, ...]] = lambda *_: ()
@@ -298,7 +298,7 @@ def planning_policy(env: Env, planner: Planner) -> Policy:
         def score(plans: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
             imagine_key, ret_key = jax.random.split(key)
             imagined = imagine(model, learned, seen, plans, imagine_key)
-            ret = planner.ret(imagined, learned, ret_key)
+            ret = planner.plan_return(imagined, learned, ret_key)
             return ret, per_episode * planner.cost(imagined, learned)
 
         proposals = planner.propose(model, learned, seen, propose_key)

@@ -331,7 +331,7 @@ def test_the_plan_is_worth_the_smaller_value_of_what_the_actor_does_at_its_end()
         obs = jnp.broadcast_to(s[:, None], (1, 1, len(s), 1))
         reward = jnp.array([3.0, 4.0]).reshape(2, 1, 1, 1) * jnp.ones((2, 1, 1, len(s)))
         imagined = Imagined(reward, reward, reward, obs, jnp.full((1, 1, len(s)), alive))
-        return planner.ret(imagined, learned, jax.random.key(0))
+        return planner.plan_return(imagined, learned, jax.random.key(0))
 
     s = jnp.array([-1.0, 0.1, 1.0])
     smaller = np.tanh(-5 * s) - np.abs(s) / 2
