@@ -62,11 +62,12 @@ class NextGoal(NamedTuple):
 
 class Replay(SafetyGym):
     """The environment as it was recorded: the next goal is given instead of drawn, and the welds of
-    gremlins are those of MuJoCo 3.17."""
+    gremlins are those of MuJoCo 3.17. Its costs are amounts, of which a recording has those, too."""
 
     def __init__(self, recording: Recording, engine: str = "auto", awake: int | None = None):
         self._given = jnp.zeros(2), jnp.int32(0)  # traced already when the shapes are found
-        config = config_from_plain(recording.meta["config"] | {"awake": awake})
+        amounts = {"constrain_indicator": False}
+        config = config_from_plain(recording.meta["config"] | amounts | {"awake": awake})
         super().__init__(config, engine, recording.name)
 
     def _build_scene(self, cfg: SafetyGymConfig, mjx: bool = False) -> scenes.Scene:
@@ -308,17 +309,14 @@ def compare_states(
         got = np.where(grazing[:, columns], want, result.obs[:, columns])
         errors[part["name"]] = largest(got, want)
         tolerances[part["name"]] = obs_tolerance(part["name"], pose, velocity)
-    raw = "" if env.config.constrain_indicator else "raw_"
     mismatches: dict[str, Any] = {
         "goal_met": result.info["goal_met"].astype(bool) != recording["step.goal_met"]
     }
-    for i, name in enumerate(env.cost_names):
-        errors[f"cost_{name}"] = np.abs(result.costs[:, i] - recording[f"step.{raw}cost_{name}"])
-        tolerances[f"cost_{name}"] = np.inf
-        mismatches[f"cost_{name}"] = (result.costs[:, i] > 0) != (recording[f"step.cost_{name}"] > 0)
-    errors["cost"] = np.abs(result.cost - recording[f"step.{raw}cost"])
-    tolerances["cost"] = np.inf
-    mismatches["cost"] = (result.cost > 0) != (recording["step.cost"] > 0)
+    costs = {f"cost_{k}": cost for k, cost in zip(env.cost_names, result.costs.T, strict=True)}
+    tolerances |= {k: amount_tolerance(env, k, pose, velocity) for k in costs}
+    for name, cost in {**costs, "cost": result.cost}.items():
+        mismatches[name] = differs = (cost > 0) != (recording[f"step.{name}"] > 0)
+        errors[name] = np.where(differs, 0.0, np.abs(cost - recording[f"step.raw_{name}"]))
     if env.config.task == "button":
         mismatches["buttons_timer"] = world.buttons_timer != recording["state.buttons_timer"][after]
     done = result.terminated | (world.steps >= env.config.num_steps)
@@ -327,6 +325,7 @@ def compare_states(
     for key in ("version_cost", "f32_cost", "version_goal", "f32_goal"):
         undecided |= recording.get(f"spread.{key}_mismatch", False).astype(bool)
     tolerances = {k: np.maximum(v, SPREADS * spread_of(recording, k)) for k, v in tolerances.items()}
+    tolerances["cost"] = sum((tolerances[k] for k in costs), np.zeros(len(after)))
     return Comparison(recording.name, env.engine, errors, mismatches, strict, undecided, tolerances)
 
 
@@ -334,6 +333,8 @@ def spread_of(recording: Recording, name: str) -> np.ndarray:
     """How far MuJoCo versions and float32 rounding move this component of each step."""
     names = {"robot pose": "robot_qpos", "robot velocity": "robot_qvel", "reward": "reward"}
     names |= {"object pose": "obj_qpos", "object velocity": "obj_qvel"}
+    names |= {"cost_vases_displace": "obj_qpos", "cost_vases_velocity": "obj_qvel"}
+    names |= {"cost_hazards": "robot_qpos"}  # what else touches shows in the observed forces
     key = names.get(name, "obs")
     versions, rounding = (recording.get(f"spread.{kind}_{key}", 0.0) for kind in ("version", "f32"))
     return np.nan_to_num(np.maximum(versions, rounding))  # nan where the goal changed: no spread known
@@ -346,3 +347,17 @@ def obs_tolerance(name: str, pose: float, velocity: float) -> float:
     if name == "accelerometer" or name.startswith("touch"):
         return 10 * velocity
     return 10 * pose
+
+
+def amount_tolerance(env: SafetyGym, name: str, pose: float, velocity: float) -> float:
+    """Of a cost's amount. Where MuJoCo itself moves the objects, they move and touch as recorded."""
+    cfg = env.config
+    if name == "cost_hazards":
+        return 3 * pose * cfg.hazards_cost
+    if env.engine != "c":
+        return np.inf
+    if name == "cost_vases_displace":
+        return 3 * pose * cfg.vases_displace_cost
+    if name == "cost_vases_velocity":
+        return velocity * cfg.vases_velocity_cost
+    return 1e-6  # a number of contact points, times the cost of one

@@ -46,6 +46,13 @@ def test_the_recordings_hold_every_robot_task_and_event():
     [
         ("point_goal2", "reward_distance", 2.0, "reward"),
         ("point_goal2", "hazards_size", 0.15, "cost_hazards"),
+        ("point_goal2", "hazards_cost", 1.01, "cost_hazards"),
+        ("point_goal2", "vases_contact_cost", 2.0, "cost_vases_contact"),
+        ("point_goal2", "vases_velocity_cost", 1.01, "cost_vases_velocity"),
+        ("car_natural_all", "gremlins_contact_cost", 9.0, "cost_gremlins"),
+        ("doggo_button2", "buttons_cost", 2.0, "cost_buttons"),
+        ("car_natural_all", "pillars_cost", 9.0, "cost_pillars"),
+        ("car_natural_all", "vases_displace_cost", 1.01, "cost_vases_displace"),
         ("point_goal2", "vases_size", 0.12, "cost_vases_velocity"),
         ("point_goal2", "lidar_max_dist", 3.1, "lidar"),
         ("point_button1", "gremlins_travel", 0.25, "gremlins_lidar"),
