@@ -109,7 +109,11 @@ class SafetyGym:
     @property
     def observed_cost(self) -> Callable[[jax.Array], jax.Array] | None:
         """obs [..., obs_size] -> the cost [...] of a step after which it is observed. None where the
-        observation does not tell."""
+        observation does not tell.
+
+        The cost is by distances on the floor; the observation, as OmniSafe's, has positions in the
+        frame of the robot. So at a hazard's rim the two differ where the robot is tilted.
+        """
         cfg = self.config
         told = cfg.observation == "coordinates" and cfg.observation_flatten
         if not told or self.cost_names not in ((), ("hazards",)):
