@@ -23,7 +23,7 @@ import numpy as np
 
 from jaxsafe.envs.vision import surface
 from jaxsafe.envs.vision.poses import Pose, fixed, kinematics, placed, turned
-from jaxsafe.envs.vision.rays import SHAPES, Vector
+from jaxsafe.envs.vision.rays import SHAPES, Vector, inverse, root
 
 # (qpos [nq], mocap_pos [nmocap, 3], mocap_quat [nmocap, 4]) -> uint8 [height, width, 3]
 Eye = Callable[[jax.Array, jax.Array, jax.Array], jax.Array]
@@ -204,11 +204,11 @@ def painted(
         return t, colour
     seen = jnp.where(jnp.isfinite(t), t, 0.0)
     x, y = (origin[i] + seen * direction[i] for i in (0, 1))
-    slope = jnp.where(seen > 0, direction[2], 1.0)
+    flat = inverse(jnp.where(seen > 0, direction[2], 1.0))
     moves = [  # squared: how far x, y move from a pixel to the next, to the right and upwards
-        sum((axes[i, k] - axes[2, k] / slope * direction[i]) ** 2 for i in (0, 1)) for k in (0, 1)
+        sum((axes[i, k] - axes[2, k] * flat * direction[i]) ** 2 for i in (0, 1)) for k in (0, 1)
     ]
-    width = drawing.pixel * seen * jnp.sqrt(jnp.maximum(*moves))
+    width = drawing.pixel * seen * root(jnp.maximum(*moves))
     return t, each(jnp.multiply, colour, surface.checkered(thing.checker, x, y, width))
 
 

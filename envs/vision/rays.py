@@ -28,9 +28,18 @@ def dot(a: Vector, b: Vector) -> jax.Array:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def nonzero(x: jax.Array) -> jax.Array:
-    """`x`, to divide by."""
-    return jnp.where(jnp.abs(x) < TINY, TINY, x)
+# Both by way of 1 / sqrt(x), for which processors have a fast instruction.
+
+
+def root(x: jax.Array) -> jax.Array:
+    """sqrt(x), of what is positive."""
+    x = jnp.maximum(x, TINY)
+    return x * jax.lax.rsqrt(x)
+
+
+def inverse(x: jax.Array) -> jax.Array:
+    """1 / x, and 0 of what is nearly 0."""
+    return x * jax.lax.rsqrt(jnp.maximum(x**2, TINY**2)) ** 2
 
 
 def hit(there: jax.Array, distance: jax.Array, normal: Vector) -> Hit:
@@ -39,7 +48,7 @@ def hit(there: jax.Array, distance: jax.Array, normal: Vector) -> Hit:
 
 def plane(size: Size, origin: Vector, direction: Vector) -> Hit:
     """The upper side of z = 0, within +-size[0] and +-size[1]; a size of 0 has no end."""
-    t = -origin[2] / nonzero(direction[2])
+    t = -origin[2] * inverse(direction[2])
     there = direction[2] < 0
     for axis in (0, 1):
         if size[axis]:
@@ -53,7 +62,7 @@ def sphere(size: Size, origin: Vector, direction: Vector) -> Hit:
     radius = size[0]
     a, b, c = dot(direction, direction), dot(origin, direction), dot(origin, origin) - radius**2
     square = b**2 - a * c
-    t = (-b - jnp.sqrt(jnp.maximum(square, TINY))) / a
+    t = -(b + root(square)) * inverse(a)
     x, y, z = ((o + t * d) / radius for o, d in zip(origin, direction, strict=True))
     return hit(square > 0, t, (x, y, z))
 
@@ -70,8 +79,8 @@ def tube(radius: float, origin: Vector, direction: Vector) -> Tube:
     (x, y, _), (dx, dy, _) = origin, direction
     a, b, c = jnp.maximum(dx**2 + dy**2, TINY), x * dx + y * dy, x**2 + y**2 - radius**2
     square = b**2 - a * c
-    root = jnp.sqrt(jnp.maximum(square, TINY))
-    return Tube(square > 0, (-b - root) / a, (-b + root) / a)
+    half, scale = root(square), inverse(a)
+    return Tube(square > 0, -(b + half) * scale, (half - b) * scale)
 
 
 def capsule(size: Size, origin: Vector, direction: Vector) -> Hit:
@@ -92,8 +101,8 @@ def cylinder(size: Size, origin: Vector, direction: Vector) -> Hit:
     """The part of a tube around z between -h and h."""
     radius, half = size[0], size[1]
     round_ = tube(radius, origin, direction)
-    inverse = 1 / nonzero(direction[2])
-    middle, reach = -origin[2] * inverse, half * jnp.abs(inverse)
+    steep = inverse(direction[2])
+    middle, reach = -origin[2] * steep, half * jnp.abs(steep)
     top = middle - reach > round_.enter
     t = jnp.maximum(middle - reach, round_.enter)
     x, y = ((origin[i] + t * direction[i]) / radius for i in (0, 1))
@@ -107,8 +116,8 @@ def box(size: Size, origin: Vector, direction: Vector) -> Hit:
     """What three pairs of planes have in common."""
     enters, leaves = [], []
     for half, o, d in zip(size, origin, direction, strict=True):
-        inverse = 1 / nonzero(d)
-        middle, reach = -o * inverse, half * jnp.abs(inverse)
+        steep = inverse(d)
+        middle, reach = -o * steep, half * jnp.abs(steep)
         enters.append(middle - reach)
         leaves.append(middle + reach)
     x, y, z = enters

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from jaxsafe.envs.vision.rays import TINY, Vector, dot
+from jaxsafe.envs.vision.rays import Vector, dot, inverse, root
 
 Colour = tuple[jax.Array, jax.Array, jax.Array]  # red, green, blue, from 0 to 1
 
@@ -104,7 +104,7 @@ def checkered(checker: Checker, x: jax.Array, y: jax.Array, width: jax.Array) ->
         over = jnp.maximum(width / side, 1e-3)
         # the integral of a wave that is 1 on [0, 1), -1 on [1, 2), and so on
         ahead, behind = (1 - jnp.abs(jnp.mod(at / side + s * over / 2, 2.0) - 1) for s in (1, -1))
-        signs = signs * (ahead - behind) / over
+        signs = signs * (ahead - behind) * inverse(over)
     even, odd = checker.even, checker.odd
     share = (1 + signs) / 2
 
@@ -144,9 +144,8 @@ def sky_colour(sky: Sky | None, direction: Vector) -> Colour:
     if sky is None:
         black = jnp.zeros_like(z)
         return black, black, black
-    flat = jnp.sqrt(jnp.maximum(x**2 + y**2, TINY))
-    e = jnp.arctan2(z, flat) / (jnp.pi / 2)
-    share = (1 + jnp.sqrt(2.0) * e / jnp.sqrt(1 + e**2)) / 2
+    e = jnp.arctan2(z, root(x**2 + y**2)) / (jnp.pi / 2)
+    share = (1 + jnp.sqrt(2.0) * e * jax.lax.rsqrt(1 + e**2)) / 2
 
     def channel(k: int) -> jax.Array:
         return float(sky.down[k]) + float(sky.up[k] - sky.down[k]) * share
