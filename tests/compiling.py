@@ -37,3 +37,10 @@ def keep_programs() -> None:
     use_compilation_cache()
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+
+
+def forget_lines() -> None:
+    """Programs are lowered without the lines of code that made them, which no test reads: here, and in
+    the processes that tests start."""
+    os.environ["JAX_TRACEBACK_IN_LOCATIONS_LIMIT"] = "0"
+    jax.config.update("jax_traceback_in_locations_limit", 0)

@@ -6,12 +6,13 @@ from pathlib import Path
 
 import jax
 import pytest
-from compiling import compile_quickly, keep_programs
+from compiling import compile_quickly, forget_lines, keep_programs
 
 from jaxsafe import algos, envs
 from jaxsafe.envs.view import backend
 
 keep_programs()
+forget_lines()
 
 # In the background the tests are told to ignore these. The programs that they start would inherit
 # that, but not a handler.
