@@ -83,7 +83,8 @@ class SafetyGym:
         self._picture = sight.make_sight(self.arena) if cfg.observe_vision else None
 
         def shown(key: jax.Array) -> dict[str, jax.Array]:
-            world, ctrl = self.begin(key)
+            count, ctrl = len(self.place.names), jnp.zeros(self.action_size)
+            world = self.arena.at_rest(jnp.zeros((count, 2)), jnp.zeros(count), key)
             _, readings = self._engine.forward(world.bodies, ctrl)
             return observe.components(self.arena, world, readings, ctrl)
 
