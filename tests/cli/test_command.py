@@ -226,9 +226,8 @@ def test_evaluate_prints_the_table(real, tmp_path):
 def test_killed_and_resumed_it_ends_bit_for_bit_as_if_uninterrupted(
     finished, tmp_path, monkeypatch, capsys
 ):
-    args = (*SMALL, f"total_steps={END}", "run_dir=run", "checkpoint_iterations=1")
-    run = tmp_path / "run"
-    process = start("train", *args, cwd=tmp_path)
+    args, run = (*SMALL, f"total_steps={END}", "run_dir=run"), tmp_path / "run"
+    process = start("train", *args, "checkpoint_iterations=1", cwd=tmp_path)
     wait_for(lambda: len(checkpoint.checkpoints(run / "checkpoints")) == 2, process)
     process.kill()
     process.communicate()

@@ -102,8 +102,8 @@ def test_the_normaliser_that_acts_is_that_of_the_data(whole):
 
 def test_killed_and_resumed_it_ends_bit_for_bit_as_if_uninterrupted(whole, data, tmp_path, capsys):
     run, moved = tmp_path / "run", tmp_path / "moved.npz"
-    args = (*BC, "total_updates=400", "num_seeds=2", f"run_dir={run}", "checkpoint_iterations=1")
-    process = start("train", *args, f"dataset={data}", cwd=tmp_path)
+    args = (*BC, "total_updates=400", "num_seeds=2", f"run_dir={run}")
+    process = start("train", *args, f"dataset={data}", "checkpoint_iterations=1", cwd=tmp_path)
     wait_for(lambda: len(checkpoint.checkpoints(run / "checkpoints")) == 2, process)
     process.kill()
     process.communicate()

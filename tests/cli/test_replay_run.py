@@ -35,8 +35,8 @@ def test_killed_and_resumed_with_its_replay_it_ends_bit_for_bit_as_if_uninterrup
     whole, tmp_path, capsys
 ):
     run = tmp_path / "run"
-    args = (*SAC, f"total_steps={END}", f"run_dir={run}", "checkpoint_iterations=1")
-    process = start("train", *args, cwd=tmp_path)
+    args = (*SAC, f"total_steps={END}", f"run_dir={run}")
+    process = start("train", *args, "checkpoint_iterations=1", cwd=tmp_path)
     wait_for(lambda: len(checkpoint.checkpoints(run / "checkpoints")) == 2, process)
     process.kill()
     process.communicate()
