@@ -164,10 +164,10 @@ def test_a_vector_is_made_again_from_its_spec_and_takes_a_shorter_time_limit():
     def made(id: Any, **options: Any) -> gymnasium.vector.VectorEnv:
         return gymnasium.make_vec(id, num_envs=2, **options)
 
-    vector = made("jaxsafe/point_goal1", num_steps=3)
+    vector = made("jaxsafe/pendulum_upright", num_steps=3)
     np.testing.assert_array_equal(*(env.reset(seed=1)[0] for env in (vector, made(vector.spec))))
     for limit, steps in ((2, 2), (9, 3)):
-        vector = made("jaxsafe/point_goal1", num_steps=3, max_episode_steps=limit)
+        vector = made("jaxsafe/pendulum_upright", num_steps=3, max_episode_steps=limit)
         assert vector.spec is not None and vector.spec.max_episode_steps == steps
         vector.reset(seed=1)
         ends = [vector.step(vector.action_space.sample())[3].all() for _ in range(steps)]
