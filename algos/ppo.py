@@ -49,6 +49,8 @@ class PPOConfig(pg.PGConfig):
     shared. A cost critic is trained, too, but only its metrics are used.
     """
 
+    SUITS: ClassVar = {"parallel": ("humanoid_velocity",)}  # docs/results/velocity_settings
+
     # eps: ratios count as if they were at most this far from 1, as in the paper.
     clip: Annotated[float, Bounds(1e-6, 100)] = 0.2
 
@@ -69,6 +71,8 @@ class PPOLagConfig(LagrangianConfig, PPOConfig):
     lam. Here, as in OmniSafe, both terms are clipped, and Adam moves lam itself. J_c is estimated from
     the last batch. OmniSafe takes the mean of the last 100 episodes.
     """
+
+    SUITS: ClassVar = {"early_price": ("swimmer_velocity",)}  # docs/results/velocity_settings
 
 
 @config
@@ -99,8 +103,7 @@ class CPPOPIDConfig(PIDConfig, PPOConfig):
     `lam_init`, in the algorithm at 0.
     """
 
-    # docs/results/velocity_settings
-    SUITS: ClassVar = {"parallel": ("hopper_velocity", "humanoid_velocity")}
+    SUITS: ClassVar = {"parallel": ("hopper_velocity",)}  # docs/results/velocity_settings
 
 
 @config

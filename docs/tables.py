@@ -102,6 +102,7 @@ PRESETS = {  # all but `fast`, which has no settings of its own
     "omnisafe_velocity": "OmniSafe's settings of velocity tasks",
     "frequent": "longer rollouts or more gradient steps: Walker2d, Swimmer, Humanoid",
     "early_price": "`frequent`, and a price on cost of 1 at the start: Swimmer",
+    "entropy": "a bonus for entropy that fades: Car Push",
     "parallel": "on a GPU OmniSafe's replay ratio or, on policy, its settings with 160 environments",
     "parallel_navigation": "that ratio for Goal: a slower policy and price, and targets of three steps",
     "navigation": "for Goal, Button, Push: OmniSafe's temperature of Goal, and targets of three steps",

@@ -140,14 +140,6 @@ def test_equations_of_algorithms_are_typeset():
     )
 
 
-def test_choosing_gives_the_advice_that_the_cells_count_by():
-    text = (DOCS / "choosing.md").read_text()
-    words = {x for advice in cells.ADVISED.values() for x in advice.split() if "total_steps" not in x}
-    assert len(words) == 2
-    for word in words:
-        assert word in text
-
-
 def test_the_cells_of_what_is_shipped_are_of_what_a_run_has_that_names_no_preset():
     found = cells.asked()
     long = [cell for cell in found if cell.steps in ("", "1e7")]
