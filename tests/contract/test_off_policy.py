@@ -162,6 +162,7 @@ def test_the_first_actions_are_uniform_and_a_resumed_run_acts_by_its_policy_whil
     again, metrics = update(copy(ts), at(40, since=40))
     random, chosen = np.asarray(fresh.replay.action)[:, :6], np.asarray(again.replay.action)[:, 6:12]
     assert abs(np.mean(random > 0.5) - 0.25) < 0.15 and abs(np.mean(random < -0.5) - 0.25) < 0.15
+    assert len(np.unique(random)) == random.size  # no two environments draw together
     assert (chosen < -0.99).all()
     assert not any(differ(fixed, again.params)) and jnp.isnan(metrics["train/critic_loss"])
     later, metrics = update(copy(again), at(41, since=40))
@@ -186,14 +187,14 @@ def test_seeds_and_floats_side_by_side_are_the_lone_ones(name):
 @pytest.mark.parametrize("members", [1, 4])
 @pytest.mark.parametrize("name", [*QUICK, *OTHERS])
 def test_the_compiled_update_writes_into_the_ring_in_place(name, members):
-    """No scatter, and no second ring."""
+    """No scatter, no second ring, and no call of the host."""
     ts, compiled = (start(name), build(name)[1]) if members == 1 else together(name)
     text: Any = compiled.as_text()
     shapes = {f"[{','.join(map(str, x.shape))}]" for x in jax.tree.leaves(ts.replay)}
     made = [line for line in text.splitlines() if any(s in line.partition("(")[0] for s in shapes)]
     assert any(" dynamic-update-slice(" in line for line in made)
     assert not any(" copy(" in line for line in made)
-    assert " scatter(" not in text
+    assert " scatter(" not in text and "callback" not in text
     memory: Any = compiled.memory_analysis()
     size = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(ts.replay))
     assert memory.alias_size_in_bytes > size
