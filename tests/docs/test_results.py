@@ -103,3 +103,22 @@ def test_a_planner_within_a_limit_earns_and_costs_next_to_nothing_and_a_blind_on
     )
     assert mean(rows, "final return", **planned) >= 24 and mean(rows, "final cost", **planned) <= 3
     assert 40 < mean(rows, "final cost", **blind) < 70
+
+
+def seditor(task: str, name: str, edit: str = "") -> float:
+    """The mean of a figure over SEditor's seeds with the defaults, or with another `edit`."""
+    run = f"env=seditor_point_{task} algo=seditor{edit}"
+    found = [row for row in rows_of("seditor") if row["run"] == run]
+    assert len(found) == 3
+    return mean(found, name)
+
+
+@pytest.mark.parametrize("task", ["goal1", "goal2", "button1", "button2"])
+def test_seditor_succeeds_within_a_violation_in_1000_steps_on_goal_and_button(task):
+    """In the last tenth of training. The estimate is of 999 steps, from the cost of each."""
+    assert seditor(task, "goals") >= 0.9 and seditor(task, "cost estimate") <= 1
+
+
+def test_seditor_succeeds_in_three_of_ten_episodes_of_push_more_than_one_policy_does():
+    alone = seditor("push1", "goals", " algo.edit=none")
+    assert seditor("push1", "goals") >= alone + 0.3
