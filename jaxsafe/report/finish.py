@@ -2,11 +2,13 @@
 
 import functools
 import json
+from collections.abc import Mapping
 
 from jaxsafe.config import one_line
 from jaxsafe.learn.constraints import limits_by_name, limits_in_words
 from jaxsafe.report import evaluation, plots
 from jaxsafe.report.film import film
+from jaxsafe.report.stats import Estimate
 from jaxsafe.report.tables import cell
 from jaxsafe.run import files, run_folder
 from jaxsafe.run.divergence import seeds_in_words
@@ -51,6 +53,8 @@ def finish(session: Session, report: Reporter, stop: Interrupts) -> None:
                 f"{100 * share:.0f}% of {s.episodes} episodes over it"
                 + (f"; diverged in training: {seeds_in_words(s.diverged)}" if s.diverged else "")
             )
+            if compared := beside(s.rows):
+                report.line(f"beside it{s.name and ', ' + s.name}: {compared}")
         if risks:
             plots.calibration(risks, folder / "calibration.png", title)
 
@@ -77,3 +81,14 @@ def finish(session: Session, report: Reporter, stop: Interrupts) -> None:
             report.line(f"no {name}: {one_line(error)}")
         if stop.requested:
             raise KeyboardInterrupt
+
+
+def beside(rows: Mapping[str, Estimate]) -> str:
+    """DSRL's scores of a run on a data set, and the data's own episodes; '' of any other run."""
+
+    def told(head: str) -> str:
+        said = [f"{k.removeprefix(head)} {cell(e)}" for k, e in rows.items() if k.startswith(head)]
+        return ", ".join(said)
+
+    kinds = {"DSRL's scores": told("DSRL "), "episodes of the data": told("data ")}
+    return "; ".join(f"{kind}: {said}" for kind, said in kinds.items() if said)

@@ -161,10 +161,16 @@ def test_a_sweep_falls_back_on_the_evaluation_of_a_named_cost_too(whole):
         assert read.or_evaluated(watched).values[name] is run.values[f"final {name}"]
 
 
-def test_evaluation_during_training_stands_in_for_its_episodes(data, tmp_path):
+def test_evaluation_during_training_stands_in_for_its_episodes(data, tmp_path, capsys):
+    """The last evaluation is said beside the data's own episodes, of 20 steps."""
     run = tmp_path / "run"
     args = (*BC, f"dataset={data}", "total_updates=100", "eval_every=30", f"run_dir={run}")
     assert typed("train", *args) == 0
+    last, episodes = capsys.readouterr().out.splitlines()[-2], make_data().episodes
+    ret, cost = (f"{x.mean():.4g}" for x in (episodes.ret, episodes.cost))
+    safe = f"{episodes.ret[episodes.cost <= 25].max():.4g}"
+    assert "DSRL's scores: cost " in last
+    assert last.endswith(f"of the data: return {ret}, cost {cost}, best safe return {safe}")
     table = run_folder.read_metrics(run)
     assert table["updates"][np.isfinite(table["eval/cost"])].tolist() == [30, 60, 90, 100]
     np.testing.assert_array_equal(table["eval/return"], table["eval/return_sampled"])  # deterministic
