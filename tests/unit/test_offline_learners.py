@@ -427,6 +427,15 @@ def test_gradients_of_coptidice_where_all_are_paired():
     assert_gradient(after, "actor", imitate, nets.params["actor"])
 
 
+def test_tau_of_coptidice_stays_above_0():
+    """Weights of a batch of one have a KL of 0, below what is allowed, so tau falls by 1 a step."""
+    cfg = coptidice.COptiDICEConfig(**LINEAR, cost_divergence=0.1, tau_init=0.5, tau_lr=1.0)
+    learner = coptidice.learner(Corridor())
+    nets, batch, at, _ = prepared(learner, cfg, n=1)
+    after, metrics = stepped(learner, nets, batch, at._replace(first_obs=batch.obs), cfg)
+    assert metrics["train/tau"] == 0.5 and after.params["tau"] == pytest.approx(1e-6)
+
+
 STILL: dict[str, Any] = {"critic_lr": 0.0}
 LINEAR_VAE: dict[str, Any] = {"vae_hidden": ()}
 # COptiDICE's W is a softmax over the batch. With a tau as large as this it is 1.
