@@ -133,7 +133,7 @@ def test_a_gradient_of_vae_bc(decoder, squash):
 @pytest.mark.parametrize("target", ["chosen", "max"])
 def test_gradients_of_bcq_lag(target):
     cfg = bcq.BCQLagConfig(
-        **LINEAR, vae_hidden=(), candidates=3, cost_discount=0.8, cost_target=target, perturbation=0.2
+        **LINEAR, vae_hidden=(), candidates=3, cost_discount=0.8, cost_target=target, perturbation=0.9
     )
     learner = bcq.learner(Corridor(), lagrangian)
     nets, batch, at, b = prepared(learner, cfg)
@@ -150,7 +150,7 @@ def test_gradients_of_bcq_lag(target):
     def xi(actor, obs, z):
         likely = np.tanh(linear(new["vae"]["decoder"], np.concatenate([obs, z], -1)))
         out = linear(actor, np.concatenate([obs, likely], -1))
-        return np.clip(likely + 0.2 * np.tanh(out), -1, 1)
+        return np.clip(likely + 0.9 * np.tanh(out), -1, 1)
 
     y, y_c, chosen = [], [], []
     latents = np.clip(noise(next_key, (5, 3, 4)), -0.5, 0.5)
@@ -175,6 +175,8 @@ def test_gradients_of_bcq_lag(target):
     assert_gradient(after, "critic_c", error(y_c), nets.params["critic_c"])
     np.testing.assert_allclose(metrics["train/cost_estimate"], 0.2 * 20 * np.mean(chosen), rtol=1e-4)
     z = np.clip(noise(key, (5, 4)), -0.5, 0.5)
+    at_edge = np.abs(xi(new["actor"], b["obs"], z)) == 1
+    assert at_edge.any() and not at_edge.all()
 
     def climb(actor):
         a = xi(actor, b["obs"], z)
