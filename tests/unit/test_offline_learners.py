@@ -130,6 +130,20 @@ def test_a_gradient_of_vae_bc(decoder, squash):
     np.testing.assert_allclose(whole, loss(double(nets.params["vae"])), rtol=1e-5)
 
 
+def test_vae_bc_acts_with_a_latent_of_0_or_with_one_that_is_drawn():
+    """By a linear decoder, far out: actions are clipped as environments clip them."""
+    cfg = bc.VAEBCConfig(**LINEAR, vae_hidden=(), decoder="linear", latent_clip=0.3)
+    learner = bc.autoencoder(Corridor())
+    nets, batch, _, b = prepared(learner, cfg)
+    learned, decoder = Learned(cfg, nets.params, (), ()), double(nets.params["vae"]["decoder"])
+    key = jax.random.key(2)
+    for z, at in ((np.zeros((5, 4)), None), (np.clip(noise(key, (5, 4)), -0.3, 0.3), key)):
+        decoded = linear(decoder, np.concatenate([3 * b["obs"], z], -1))
+        assert 0 < (np.abs(decoded) > 1).sum() < decoded.size
+        acts = learner.act(learned, 3 * batch.obs, at)
+        np.testing.assert_allclose(acts, np.clip(decoded, -1, 1), atol=1e-5)
+
+
 @pytest.mark.parametrize("target", ["chosen", "max"])
 def test_gradients_of_bcq_lag(target):
     cfg = bcq.BCQLagConfig(
