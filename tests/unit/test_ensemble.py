@@ -408,3 +408,18 @@ def test_a_particle_follows_its_own_model_from_where_it_is():
     ahead = np.arange(3)[:, None, None] + np.stack([action] * 2)  # [M, P, S]
     np.testing.assert_allclose(imagined.obs[..., 0], 1 + 4 * ahead, atol=1e-4)
     np.testing.assert_allclose(imagined.reward, [1 + h * ahead for h in range(4)], atol=1e-4)
+
+
+def test_no_predicted_observation_is_farther_than_100():
+    """Every model is sure that a step goes 60 back: from 1 to -59, and no farther than -100."""
+    cfg = dataclasses.replace(Config(), model_hidden=(), particles=2)
+    model = init_model(jax.random.key(0), LINE, cfg).params
+    (layer,) = jax.tree.map(jnp.zeros_like, model.ensemble.layers)
+    layer = layer.replace(bias=layer.bias.at[:, 1].set(-60.0))
+    low = jnp.full_like(model.ensemble.low, -30.0)
+    ensemble = model.ensemble.replace(layers=(layer,), low=low, high=low + 1e-3)
+    learned = Learned(cfg, {"model": model.replace(ensemble=ensemble)}, (), ())
+    for steps, x in ((1, -59.0), (2, -100.0), (3, -100.0)):
+        plans = jnp.zeros((1, steps, 1))
+        imagined = imagine(learned_model(LINE), learned, jnp.ones(1), plans, jax.random.key(1))
+        np.testing.assert_allclose(imagined.obs, x, atol=1e-4)
