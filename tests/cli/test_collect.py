@@ -194,7 +194,30 @@ def test_each_policy_meets_the_task_as_it_was_trained_in():
     run: Any = SimpleNamespace(algo=algo, env=env, learned=learned)
     played = collect.episodes(run, 2 * env.episode_length, seed=1, sampled=False)
     for expected in ([1, 0.5, 0, -0.5, -1], [0.5, 0.25, 0, -0.25, -0.5]):  # a step costs 2
-        np.testing.assert_allclose(next(played)[1].action[:, 0], expected)
+        steps = next(played)[1]
+        np.testing.assert_allclose(steps.action[:, 0], expected)
+        assert np.shape(steps.obs) == (6, 3)  # the task's own, without what is left
+
+
+def test_an_episode_ends_where_it_terminates_or_runs_out_of_time_and_the_rest_is_left_out():
+    """Lives of 2 to 6 steps, and time for 5. A step that is taken after the end would be counted."""
+    env = Ticker(lives=(2, 6))
+    algo = SimpleNamespace(
+        policy=Policy(lambda learned: (), lambda learned, carry, obs, key: (obs[:1], carry, {})),
+        task=lambda learned: env,
+    )
+    run: Any = SimpleNamespace(algo=algo, env=env, learned=np.zeros(1))
+    played = collect.episodes(run, 50 * env.episode_length, seed=1, sampled=False)
+    ends = set()
+    for _ in range(50):
+        made = collect.arrays(next(played)[1])
+        steps, life = len(made["reward"]), int(made["obs"][0, 2])
+        assert steps == min(life, 5)
+        assert made["next_obs"][:, 1].tolist() == [*range(1, steps + 1)]
+        for name, at_end in (("terminated", life <= 5), ("truncated", life > 5)):
+            assert made[name].tolist() == [False] * (steps - 1) + [at_end]
+        ends.add(life)
+    assert ends == {2, 3, 4, 5, 6}
 
 
 def test_a_run_that_terminates_gives_shorter_episodes():
