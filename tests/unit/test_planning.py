@@ -15,6 +15,7 @@ from scipy.special import softmax
 from jaxsafe.algos import ALGOS, loop, pets
 from jaxsafe.learn.acting import Learned
 from jaxsafe.learn.models import Model, Prediction, init_fitted
+from jaxsafe.learn.normalise import Normaliser
 from jaxsafe.learn.planning import (
     Imagined,
     by_return,
@@ -254,6 +255,36 @@ def test_the_worst_case_counts_for_the_rows_that_say_so(name, least, most):
     assert least <= ahead <= most + 1e-3
 
 
+def test_cap_pets_pays_for_its_models_uncertainty_at_the_price_kappa():
+    """Two steps, which pay what they go ahead. sigma of the reward is exp(2 a - 2) or a little less,
+    and a limit of 0.27 on the sum over both allows a of about 0 at a price of 1."""
+    env: Any = dataclasses.replace(SHORE, episode_length=2)
+    row = ALGOS["cap_pets"]
+    cfg = row.config(
+        models=3, model_hidden=(), plan_steps=2, plans=200, elites=16, cem_iterations=8, plan_var=1.0,
+        cost_limit=0.27,
+    )  # fmt: skip
+    model = init_fitted(jax.random.key(0), env, cfg).params
+    outputs = {"mean of the reward": 0, "log variance of the reward": 3}
+    weight, bias = jnp.zeros((3, 2, 6)), jnp.zeros((3, 6))
+    weight = weight.at[:, 1, outputs["mean of the reward"]].set(1.0)
+    weight = weight.at[:, 1, outputs["log variance of the reward"]].set(4.0)
+    bias = bias.at[:, outputs["log variance of the reward"]].set(-4.0)
+    low = model.ensemble.low.at[:, 1:].set(-30.0)  # of cost and observation it is sure
+    high = model.ensemble.high.at[:, 1:].set(-30.0 + 1e-3)
+    layers = (model.ensemble.layers[0].replace(weight=weight, bias=bias),)
+    model = model.replace(ensemble=model.ensemble.replace(layers=layers, low=low, high=high))
+    policy = row.make(env).policy
+
+    def ahead(kappa):
+        learned = learned_by(cfg, dual=kappa, model=model)
+        action, carry, _ = policy.act(learned, policy.init(learned), jnp.zeros(1), jax.random.key(0))
+        return action[0] + carry.mean[0, 0]
+
+    free, priced = jax.jit(jax.vmap(ahead), compiler_options=FAST)(jnp.array([0.0, 1.0]))
+    assert free > 1.5 and -0.3 < priced < 0.1
+
+
 # ---- the border of the feasible ------------------------------------------------------------------
 
 RET = jnp.array([5.0, 4.0, 3.0, 2.0, 1.0])
@@ -338,6 +369,27 @@ def test_the_plan_is_worth_the_smaller_value_of_what_the_actor_does_at_its_end()
     np.testing.assert_allclose(ret(s), 3 + 0.5 * 4 + 0.25 * smaller, rtol=1e-5)
     np.testing.assert_allclose(ret(s, alive=False), 3 + 0.5 * 4)  # after an end nothing is left
     assert jnp.argmax(ret(s)) == 0
+
+
+def test_actor_and_critics_see_normalised_observations_in_plans():
+    """Of mean 1 and standard deviation 2: 5 is 2 for them."""
+    cfg = loop.LOOPConfig(hidden=(), layer_norm=False, plan_steps=1, discount=0.5)
+    normaliser = Normaliser(jnp.ones(()), jnp.ones(1), 4 * jnp.ones(1))
+    actor = linear([0.25, 0.0])
+    actor["params"]["Dense_0"]["bias"] = jnp.array([0.0, -20.0])
+    params = {"model": (), "critic_r": STEEP["critic_r"], "actor": actor}
+    learned = Learned(cfg, params, (), normaliser)
+    planner, zero = loop.planner(SHORE), jnp.zeros((1, 1, 1, 1))
+    imagined = Imagined(zero, zero, zero, jnp.full((1, 1, 1, 1), 5.0), jnp.ones((1, 1, 1), bool))
+    found = planner.plan_return(imagined, learned, jax.random.key(0))
+    np.testing.assert_allclose(found, 0.5 * (np.tanh(0.25 * 2) - 2 / 2), rtol=1e-5)
+
+    def predict(fitted, latent, action, key, cfg):
+        return Prediction(latent, zero[0], zero[0], zero[0], zero[0] > 0)
+
+    model = Model(lambda cfg: (1, 1), predict, lambda latent: latent)
+    (plans,) = planner.propose(model, learned, jnp.full(1, 5.0), jax.random.key(0))
+    np.testing.assert_allclose(plans, np.tanh(0.25 * 2), atol=1e-4)
 
 
 def test_the_first_action_leads_to_where_the_actor_does_most():
