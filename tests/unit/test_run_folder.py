@@ -219,6 +219,18 @@ def test_only_the_limit_in_force_gives_scores():
     assert {"normalised return", "data return", "data cost"} <= of(None) < of(25.0)
 
 
+def test_the_datas_own_rows_are_of_its_whole_episodes_alone():
+    """The best of them earns 9 and is cut off, the next costs 26."""
+    ret, cost = np.array([1.0, 3.0, 8.0, 9.0]), np.array([0.0, 25.0, 26.0, 1.0])
+    whole = np.array([True, True, True, False])
+    data = SimpleNamespace(episodes=(np.zeros(4), np.zeros(4), ret, cost, whole))
+    rows = {name: e.mean for name, e in evaluation.of_data(data, 25.0).items()}
+    assert rows == {"data return": 4.0, "data cost": 17.0, "data best safe return": 3.0}
+    assert "data best safe return" not in evaluation.of_data(data, -1.0)
+    none = SimpleNamespace(episodes=(np.zeros(4), np.zeros(4), ret, cost, whole & False))
+    assert evaluation.of_data(none, 25.0) == {}
+
+
 def test_progress_reads_the_newest_manifest(tmp_path):
     assert run_folder.newest_progress(tmp_path) is None
     for done in (Progress(3, 30, 6), Progress(4, 40, 8)):
