@@ -32,6 +32,7 @@ from jaxsafe.learn.planning import PlanConfig, imagine
 from jaxsafe.learn.replay import Span
 from jaxsafe.learn.rollout import init_rollout
 from jaxsafe.learn.steps import Trainable
+from jaxsafe.nn.ensemble import draw as draw_of_ensemble
 from jaxsafe.nn.ensemble import ensemble_loss, init_ensemble, outputs_of, unscaled
 
 ROWS, ENVS = 640, 8
@@ -145,6 +146,25 @@ def test_the_loss_by_hand():
     errors = (0.25 + 0.25) / 2 * np.exp(-log_var) + log_var
     expected = errors + 0.01 * 10.5 + 0.3 / 2 * 4.0  # one layer: the last, whose share is 1
     np.testing.assert_allclose(ensemble_loss(ensemble, unscaled(1), x, y, 0.3), expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("hidden, shares", [(1, (0.25, 1)), (4, (0.25, 0.5, 0.75, 0.75, 1))])
+def test_layers_have_their_shares_of_the_weight_decay(hidden, shares):
+    """The paper's network has four hidden layers."""
+    ensemble = init_ensemble(jax.random.key(0), 2, 3, (5,) * hidden, 2)
+    x, y = jax.random.normal(jax.random.key(1), (2, 2, 4, 3))
+    loss = [ensemble_loss(ensemble, unscaled(3), x, y[..., :2], decay) for decay in (0.0, 10.0)]
+    squares = [(layer.weight**2).sum() for layer in ensemble.layers]
+    expected = 10 / 2 * np.dot(shares, squares)
+    np.testing.assert_allclose(loss[1] - loss[0], expected, rtol=1e-4)
+
+
+def test_the_spread_is_the_length_of_the_vector_of_deviations():
+    ensemble = init_ensemble(jax.random.key(0), 2, 3, (5,), 4)
+    x = jax.random.normal(jax.random.key(1), (2, 6, 3))
+    _, spread = draw_of_ensemble(ensemble, unscaled(3), x, jax.random.key(2))
+    std = np.exp(outputs_of(ensemble, unscaled(3), x).log_std)
+    np.testing.assert_allclose(spread, np.sqrt((std**2).sum(-1)), rtol=1e-5)
 
 
 def test_the_bounds_of_the_variance_follow_the_likelihood_too():
@@ -408,6 +428,28 @@ def test_a_particle_follows_its_own_model_from_where_it_is():
     ahead = np.arange(3)[:, None, None] + np.stack([action] * 2)  # [M, P, S]
     np.testing.assert_allclose(imagined.obs[..., 0], 1 + 4 * ahead, atol=1e-4)
     np.testing.assert_allclose(imagined.reward, [1 + h * ahead for h in range(4)], atol=1e-4)
+
+
+def test_a_cost_that_is_not_learned_is_that_of_where_a_step_leads():
+    """Every model is sure that a step goes 1 ahead. Beyond 1.5 it costs 7."""
+
+    @dataclass(frozen=True)
+    class Costly(Line):
+        def observed_cost(self, obs):
+            return 7.0 * (obs[..., 0] > 1.5)
+
+    env: Any = Costly()
+    cfg = dataclasses.replace(Config(), model_hidden=(), particles=2)
+    model = init_model(jax.random.key(0), env, cfg).params
+    (layer,) = jax.tree.map(jnp.zeros_like, model.ensemble.layers)
+    layer = layer.replace(bias=layer.bias.at[:, 1].set(1.0))
+    low = jnp.full_like(model.ensemble.low, -30.0)
+    ensemble = model.ensemble.replace(layers=(layer,), low=low, high=low + 1e-3)
+    learned = Learned(cfg, {"model": model.replace(ensemble=ensemble)}, (), ())
+    plans = jnp.zeros((1, 3, 1))
+    imagined = imagine(learned_model(env), learned, jnp.zeros(1), plans, jax.random.key(1))
+    np.testing.assert_array_equal(imagined.cost[:, 0, 0, 0], [0, 7, 7])
+    assert (imagined.cost == imagined.cost[:, :1, :1]).all()
 
 
 def test_no_predicted_observation_is_farther_than_100():
