@@ -220,6 +220,29 @@ def test_an_episode_ends_where_it_terminates_or_runs_out_of_time_and_the_rest_is
     assert ends == {2, 3, 4, 5, 6}
 
 
+def test_an_episode_with_a_number_that_is_not_finite_is_left_out(run):
+    """Every second one, of the second policy. A run that plays no other one is refused."""
+    opened = open_run(run, (TOY,))
+
+    def holed(policies: slice) -> Any:
+        def act(learned, carry, obs, key):
+            action, carry, extras = opened.algo.policy.act(learned["own"], carry, obs, key)
+            return action + learned["hole"], carry, extras
+
+        hole = np.zeros(2, np.float32)
+        hole[policies] = np.nan
+        algo = opened.algo._replace(
+            policy=Policy(lambda learned: (), act), task=lambda learned: opened.env
+        )
+        return opened._replace(algo=algo, learned={"own": opened.learned, "hole": hole})
+
+    made = collect.collect([collect.Ingredient(holed(slice(1, 2)), 1.0)], 60)
+    assert made.policy.tolist() == [0] * 60 and np.isfinite(made.data.action).all()
+    assert made.recipe["runs"][0]["episodes"] == 3
+    with pytest.raises(ConfigError, match="plays episodes with numbers that are not finite"):
+        collect.collect([collect.Ingredient(holed(slice(0, 2)), 1.0)], 60)
+
+
 def test_a_run_that_terminates_gives_shorter_episodes():
     alive = np.array([True, True, False])
     terminated = np.array([False, True, True])
