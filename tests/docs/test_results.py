@@ -3,7 +3,7 @@
 import itertools
 import re
 import statistics
-from collections import Counter
+from collections import Counter, defaultdict
 from pathlib import Path
 
 import pytest
@@ -122,3 +122,34 @@ def test_seditor_succeeds_within_a_violation_in_1000_steps_on_goal_and_button(ta
 def test_seditor_succeeds_in_three_of_ten_episodes_of_push_more_than_one_policy_does():
     alone = seditor("push1", "goals", " algo.edit=none")
     assert seditor("push1", "goals") >= alone + 0.3
+
+
+# what OmniSafe's best algorithm on policy earns at a cost of at most 27.5
+BARS = {
+    "point_goal1": 19.2, "car_goal1": 27.0, "point_goal2": 4.6, "car_goal2": 2.3,
+    "point_button1": 4.6, "car_button1": 0.0, "point_button2": 5.4, "car_button2": -0.99,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("env", sorted(BARS))
+def test_a_policy_of_ours_within_the_limit_earns_what_omnisafes_best_on_policy_does(env):
+    runs = defaultdict(list)
+    for study in ("goal", "button", "causes", "off_policy"):
+        for row in rows_of(study):
+            if row["env"] == env and row["final return"] and "terminated" not in row["algo"]:
+                runs[study, row["run"]].append(row)
+    found = [
+        mean(rows, "final return")
+        for rows in runs.values()
+        if len(rows) >= 5 and mean(rows, "final cost") <= 25
+    ]
+    assert max(found) >= BARS[env]
+
+
+@pytest.mark.parametrize("study", ["goal", "button"])
+def test_ten_algorithms_are_of_one_commit_and_evaluated_with_both_kinds_of_action(study):
+    ten = ["ppo", "ppo_lag", "trpo_lag", "cpo", "pcpo", "cup", "focops", "p3o", "trpo_pid", "rcpo"]
+    rows = [row for row in rows_of(study) if row["algo"] in ten]
+    assert Counter(row["algo"] for row in rows) == dict.fromkeys(ten, 4 * 5)  # tasks and seeds
+    assert {row["commit"][:7] for row in rows} == {"24de6da"}
+    assert all(row["final return"] and row["final sampled return"] for row in rows)
