@@ -254,7 +254,7 @@ def test_what_a_dream_tells_of_its_actions_is_a_function_of_the_actor_alone():
 def test_a_critic_is_told_of_each_state_the_return_that_follows_it(monkeypatch, limit_ends):
     """A critic that says the state's first number has nothing to learn, in dreams and of rows, where
     the returns and rewards are those that make it right. An episode ends in one of the rows, or runs
-    out of time there, where that is an end."""
+    out of time there, where that is an end. What stands in the next row is of another episode."""
 
     def error(scene, trained, name, features, returns):
         return (features[..., 0] - returns) ** 2
@@ -265,9 +265,10 @@ def test_a_critic_is_told_of_each_state_the_return_that_follows_it(monkeypatch, 
     ends = no.at[2, 0].set(True)
     discount = 0.5
     earned = value[:-1] - discount * value[1:] * ~ends[1:]
-    reward = jnp.concatenate([jnp.full((1, 2), 9.0), earned])
+    reward = jnp.concatenate([jnp.full((1, 2), 9.0), earned]).at[3, 0].set(9.0)
+    first = no.at[3, 0].set(True)
     zeros, terminated, truncated = jnp.zeros((4, 2, 1)), ends & (not limit_ends), ends & limit_ends
-    rows = Record(zeros, zeros, reward, reward, zeros, no, terminated, truncated)
+    rows = Record(zeros, zeros, reward, reward, zeros, first, terminated, truncated)
     latents = rssm.Latent(value[..., None], zeros)
     cfg = dreamer.DreamerConfig(replay_value=1.0, limit_ends=limit_ends)
     batch = SequenceBatch(rows, jnp.array([0.75, 0.25]))
@@ -283,6 +284,68 @@ def test_a_critic_is_told_of_each_state_the_return_that_follows_it(monkeypatch, 
 
     np.testing.assert_allclose(losses(features[:-1, :, 0]), 0, atol=1e-10)
     assert min(losses(features[1:, :, 0])) > 0.1
+
+
+def test_a_critic_is_held_back_by_what_its_slow_copy_says(monkeypatch):
+    """-log p(R) - log p(V'), where V' is that of the copy and no function of the critic."""
+    keys = jax.random.split(jax.random.key(0), 2)
+    critic, returns = jax.random.normal(keys[0], (5, two_hot.BINS)), jax.random.normal(keys[1], (5,))
+    monkeypatch.setattr(Scene, "logits", lambda self, critic, features: critic)
+    monkeypatch.setattr(Scene, "value", lambda self, critic, features: critic.mean(-1))
+    copy = jnp.arange(5.0)
+    params: Any = {
+        "critic_r": 9 * critic,
+        "targets": {"critic_r": jnp.tile(copy[:, None], two_hot.BINS)},
+    }
+    unused: Any = None
+    scene = Scene(Corridor(), unused, params, unused, unused, (), dreamer.DreamerConfig(), None)
+    found = scene._loss({"critic_r": critic}, "critic_r", unused, returns)
+    log_p = jax.nn.log_softmax(critic)
+    expected = -((two_hot.two_hot(returns) + two_hot.two_hot(copy)) * log_p).sum(-1)
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+
+
+def test_each_network_learns_of_its_own_loss_alone(monkeypatch):
+    """By backprop, where what actors and critics learn is a function of latents and of one another.
+    Without the actor's loss model and critic learn the same, and without the critic's model and actor
+    do. The slow copy takes on a share of the critic."""
+    cfg = dreamer.DreamerConfig(
+        size="tiny", actor_grad="backprop", imagine_steps=2, replay_value=0.5, tau=0.25
+    )
+    rows, env = recorded(Ticker(episode_length=5, lives=(3, 9)), 8), Ticker()
+    monkeypatch.setattr(dreaming, "laprop", lambda lr, cfg: optax.sgd(1.0))
+    learner = dreaming_learner(env, dreamer.blind)
+    at = GradientStep(jnp.int32(0), jnp.float32(1), jax.random.key(1))
+
+    def stepped(nets):
+        batch = SequenceBatch(rows, jnp.full(3, 1 / 3))
+        return learner.step(nets, batch, at, cfg, None)[0].params
+
+    init = jax.jit(lambda key: learner.init(key, 3, 1, cfg), compiler_options=FAST)
+    nets = init(jax.random.key(0))
+    params = jax.tree.map(
+        lambda x: x + 0.1 * jnp.sin(jnp.arange(x.size)).reshape(x.shape), nets.params
+    )  # heads and critics are 0 at first
+    nets, names = nets._replace(params=params), ("model", "actor", "critic_r")
+
+    def moves():
+        after = jax.jit(lambda nets: stepped(nets), compiler_options=FAST)(nets)
+        moved = {x: ravel_pytree(after[x])[0] - ravel_pytree(params[x])[0] for x in names}
+        return moved, after
+
+    whole, after = moves()
+    assert all(jnp.linalg.norm(x) > 1e-3 for x in whole.values())
+    slow, before = after["targets"]["critic_r"], params["targets"]["critic_r"]
+    share = jax.tree.map(lambda x, y: 0.75 * x + 0.25 * y, before, after["critic_r"])
+    np.testing.assert_allclose(ravel_pytree(slow)[0], ravel_pytree(share)[0], rtol=1e-4, atol=1e-5)
+    for name, loss in (("actor", "actor_loss"), ("critic_r", "critic_loss_with_rows")):
+        with monkeypatch.context() as without:
+            without.setattr(Scene, loss, lambda *args: jnp.zeros(()))
+            rest, _ = moves()
+        assert not rest.pop(name).any()
+        for other, found in rest.items():
+            apart = jnp.linalg.norm(found - whole[other]) / jnp.linalg.norm(whole[other])
+            assert apart < 1e-4, (name, other)
 
 
 def test_actors_and_critics_learn_from_a_dream_as_much_as_it_weighs(monkeypatch):
