@@ -396,7 +396,40 @@ def test_labels_say_which_costs_are_violations():
         ambs.check(labelled(labels=("wal",)), env)
 
 
+def test_a_run_counts_the_steps_that_its_labels_call_violations(monkeypatch):
+    """For `train/violations`, the sum of which is how many there were while it learned."""
+    monkeypatch.setattr(ambs, "off_policy", lambda env, learner, **_: learner)
+    env = Corridor(cost_names=("wall", "floor"))
+    steps: Any = SimpleNamespace(cost=jnp.array([0.0, 2.0]), costs=jnp.array([[0.0, 0.0], [2.0, 0.0]]))
+    made: Any = ambs.make(env)
+    for labels, expected in (
+        ((), [False, True]),
+        (("wall",), [False, True]),
+        (("floor",), [False] * 2),
+    ):
+        found = made.counted(env, steps, dataclasses.replace(CFG, labels=labels))
+        assert found.keys() == {"violations"} and found["violations"].tolist() == expected
+
+
 # ---- the penalties -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("penalty, coef", [("penl", 1.0), ("plpg", 0.8), ("copt", 1.0)])
+def test_the_presets_of_the_penalties_have_the_numbers_of_the_paper_and_its_code(penalty, coef):
+    row = ALGOS["ambs"]
+    cfg = row.config(**row.published[penalty])
+    assert (cfg.penalty, cfg.penalty_coef, cfg.kappa) == (penalty, coef, 10.0)
+    shield = (cfg.shield_rollouts, cfg.shield_steps, cfg.shield_horizon, cfg.violation_cost)
+    assert shield == (512, 15, 30, 10.0)
+    assert (cfg.delta, cfg.eps, cfg.confidence) == (0.1, 0.09, 0.01)
+    assert (cfg.rule, cfg.verdict, cfg.verify_action) == ("hoeffding", "summed", False)
+    assert ambs.overruled_from(cfg) == 6
+    learning = (cfg.cost_discount, cfg.td_lambda, cfg.replay_value, cfg.imagine_steps, cfg.tau)
+    assert learning == (0.997, 0.95, 0.0, 15, 0.02)
+    assert (cfg.actor_grad, cfg.limit_ends, cfg.overshoot) == ("backprop", True, 0)
+    pixels = row.config(**row.published["pixels"])
+    same = dataclasses.replace(cfg, encoder="cnn", size="medium")
+    assert (pixels == same) == (penalty == "plpg")
 
 
 def advantages(key: jax.Array, shape: tuple[int, ...] = (4, 3)) -> ambs.Advantages:
@@ -709,6 +742,7 @@ def test_in_the_simulator_the_policy_knows_what_it_did_and_where_it_got(monkeypa
             return Latent(action, embedded)
 
     def goes_on(env, learned, name, latent, key):
+        assert name == "actor"  # and not the safe policy
         return jnp.where(latent.stoch < turns_at, latent.deter, -latent.deter)
 
     monkeypatch.setattr(dreaming, "world_of", lambda *_: Glass())
