@@ -616,6 +616,23 @@ def tiny() -> tuple[rssm.WorldModel, Any]:
     return world, init(jax.random.key(0), jnp.zeros(3), jnp.zeros(1))
 
 
+@pytest.mark.parametrize("method", ["observe", "imagine"])
+def test_what_was_done_beyond_the_bounds_is_remembered_as_the_bound(method):
+    """Both with and without an observation, so that dreams go on as the world does."""
+    world, params = tiny()
+    embedded: Any = world.apply(params, jnp.zeros(3), method="embed")
+    start: Any = jax.tree.map(lambda x: x + 0.5, world.apply(params, method="start"))
+    seen = (embedded,) if method == "observe" else ()
+
+    def after(action):
+        args = start, jnp.array([action]), *seen, jax.random.key(1)
+        found: Any = world.apply(params, *args, method=method)
+        return np.asarray(found.deter)
+
+    np.testing.assert_array_equal(after(3.0), after(1.0))
+    assert np.abs(after(3.0) - after(-1.0)).max() > 1e-3
+
+
 def test_a_sequence_that_begins_anew_is_two_sequences():
     rows = recorded(Ticker(episode_length=5), 12)
     begins = int(jnp.argmax(rows.first[1:, 0])) + 1
