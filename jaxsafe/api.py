@@ -432,5 +432,5 @@ def render(
     out = Path(path or run.folder / "video.mp4").expanduser()
     film.check_video(out)
     index, seed = convert(index, Index, "index"), convert(seed, Seed, "seed")
-    film.film([run._opened.one(index)], out, seed)
+    film.film([run._opened.one(index)], out, film.key_of(seed))
     return out

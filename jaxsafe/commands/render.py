@@ -6,7 +6,7 @@ from pathlib import Path
 from jaxsafe.commands import viewing
 from jaxsafe.commands.guard import guarded
 from jaxsafe.config import ConfigError
-from jaxsafe.report.film import check_video, film, labels
+from jaxsafe.report.film import check_video, film, key_of, labels
 from jaxsafe.run.policies import CODE, check_same_task
 
 
@@ -38,6 +38,6 @@ def command() -> int:
     names = labels(folders, [policy.settings.algo_name for policy in policies]) if several else None
     task = policies[0].settings.env_name
     print(f"filming {len(policies)} x 1 episode of {task} ...", file=sys.stderr)
-    film(policies, out, args.seed, names)
+    film(policies, out, key_of(args.seed), names)
     print(out)
     return 0

@@ -28,6 +28,7 @@ class Scores(NamedTuple):
     rows: dict[str, Estimate]
     seeds: dict[str, list[float]]  # the mean over the episodes of each
     calibration: dict[str, list[float]]  # of a shield's risk, empty without one: see `calibrated`
+    typical: int  # which of the first seed's episodes has the median return
     diverged: tuple[int, ...] = ()  # the seeds that did in training
 
     def __str__(self) -> str:
@@ -63,8 +64,11 @@ def evaluate(
             rows |= of_data(data, limits.get(""))
         by_seed = {name: values.mean(1).tolist() for name, values in found.items()}
         size = of_setting.ret.size
+        typical = int(np.argsort(of_setting.ret[0])[num // 2])
         diverged = tuple(x.seed for x in lost if x.setting == member.setting)
-        by_setting.append(Scores(member.setting, limits, size, rows, by_seed, of_risk, diverged))
+        by_setting.append(
+            Scores(member.setting, limits, size, rows, by_seed, of_risk, typical, diverged)
+        )
     return by_setting
 
 

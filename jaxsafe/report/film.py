@@ -28,13 +28,21 @@ def check_video(path: Path) -> None:
         raise ConfigError(f"{path} cannot be written")
 
 
-def film(policies: list[RunPolicy], path: Path, seed: int, labels: list[str] | None = None) -> None:
+def key_of(seed: int) -> jax.Array:
+    """The key of the episode that a film of this seed shows."""
+    return jax.random.fold_in(jax.random.key(seed), 0x66696C6D)
+
+
+def film(
+    policies: list[RunPolicy], path: Path, key: jax.Array, labels: list[str] | None = None
+) -> None:
     """Write one episode of each deterministic policy as a video, side by side in labelled panels.
 
+    Args:
+        key: of the episode, as evaluation has it.
     Raises:
         NoVideo: this machine has neither EGL nor OSMesa nor a display.
     """
-    key = jax.random.fold_in(jax.random.key(seed), 0x66696C6D)
     try:
         films = [
             render.render_episode(a.env, a.player, key, label=label)

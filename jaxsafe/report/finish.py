@@ -7,12 +7,12 @@ from collections.abc import Mapping
 from jaxsafe.config import one_line
 from jaxsafe.learn.constraints import limits_by_name, limits_in_words
 from jaxsafe.report import evaluation, plots
-from jaxsafe.report.film import film
+from jaxsafe.report.film import film, key_of
 from jaxsafe.report.stats import Estimate
 from jaxsafe.report.tables import cell
 from jaxsafe.run import files, run_folder
 from jaxsafe.run.divergence import seeds_in_words
-from jaxsafe.run.evaluate import TRAINING
+from jaxsafe.run.evaluate import TRAINING, keys_of_episodes
 from jaxsafe.run.interrupts import Interrupts
 from jaxsafe.run.policies import RunPolicies, member_policies
 from jaxsafe.run.progress import Reporter
@@ -37,8 +37,12 @@ def finish(session: Session, report: Reporter, stop: Interrupts) -> None:
         metrics, limits = run_folder.read_metrics(folder), limits_by_name(settings.algo)
         plots.curves(metrics, folder / "curves.png", title, limit, limits)
 
+    filmed = key_of(train.seed)
+
     def scores() -> None:
+        nonlocal filmed
         found = evaluation.evaluate(run(), train.eval_episodes, TRAINING, session.program.data)
+        filmed = keys_of_episodes(TRAINING, train.eval_episodes, train.seeds)[0, found[0].typical]
         risks = {s.name: s.calibration for s in found if s.calibration}
         tables = {s.name: evaluation.as_json(s.rows) | {"seeds": s.seeds} for s in found}
         for name, risk in risks.items():
@@ -59,7 +63,7 @@ def finish(session: Session, report: Reporter, stop: Interrupts) -> None:
             plots.calibration(risks, folder / "calibration.png", title)
 
     def video() -> None:
-        film([run().one(0)], folder / "video.mp4", train.seed)
+        film([run().one(0)], folder / "video.mp4", filmed)
 
     members = len(settings.configs) * train.num_seeds
     wanted = {

@@ -23,10 +23,12 @@ from jaxsafe.learn.on_policy import on_policy
 from jaxsafe.learn.steps import adam_epochs
 from jaxsafe.learn.surrogates import clipped
 from jaxsafe.learn.treatments import penalty
+from jaxsafe.report import film, finish
 from jaxsafe.report.evaluation import evaluate
 from jaxsafe.report.read import read
 from jaxsafe.run import checkpoint, programs, progress, run_folder
 from jaxsafe.run.arguments import compose
+from jaxsafe.run.evaluate import episode
 from jaxsafe.run.plain import to_plain
 from jaxsafe.run.settings import Settings, nested, settings_from_options
 from jaxsafe.run.sweep_plan import Sweep, plan
@@ -252,6 +254,25 @@ def test_evaluation_is_that_of_the_script(run):
     for bad in wrong:
         with pytest.raises(jaxsafe.ConfigError, match=r"expected|has 1"):
             jaxsafe.evaluate(run, **bad)
+
+
+@pytest.mark.parametrize("episodes", [5, 0])
+def test_a_run_films_its_episode_of_the_median_return_or_that_of_its_seed(
+    episodes, tmp_path, monkeypatch
+):
+    filmed: list[Any] = []
+    monkeypatch.setattr(finish, "film", lambda policies, path, key: filmed.append((policies, key)))
+    made = jaxsafe.train(
+        Corridor(), "ppo", run_dir=tmp_path / "run", num_envs=4, total_steps=48, horizon=6,
+        eval_episodes=episodes, video=True,
+    )  # fmt: skip
+    (((policy,), key),) = filmed
+    if episodes:
+        (ret,) = run_episodes(made._opened.algo, made._opened.learned, episodes, seed=0).ret
+        assert len({*ret.tolist()}) == episodes
+        assert np.argmin(abs(ret - episode(policy.player, key).ret)) == np.argsort(ret)[2]
+    else:
+        assert (key == film.key_of(0)).all()
 
 
 def test_sampled_actions_are_evaluated_in_the_same_episodes(run):

@@ -167,10 +167,10 @@ def test_a_run_is_as_long_as_its_algorithm_asks_unless_told():
 
 
 def test_every_chosen_name_has_its_options_and_no_other():
-    texts = ["-m", "env=car_push1,Safexp-PointGoal1-v0", "algo=cpo,trpo"]
+    texts = ["-m", "env=car_push1,Safexp-PointGoal1-v0", "algo=pcpo,trpo"]
     groups = hydra_jobs.check_arguments(texts).groups
     chosen = {group: {name for name, options in g.items() if options} for group, g in groups.items()}
-    assert chosen == {"env": {"car_push1", "point_goal1"}, "algo": {"cpo", "trpo"}}
+    assert chosen == {"env": {"car_push1", "point_goal1"}, "algo": {"pcpo", "trpo"}}
 
 
 def test_the_conventions_of_omnisafe_are_defaults_of_either_preset():

@@ -453,7 +453,7 @@ def test_a_film_takes_the_place_of_a_link(place, monkeypatch):
     monkeypatch.setattr(film.render, "render_episode", lambda *args, **options: picture)
     actor: Any = type("Actor", (), {"env": None, "player": None})()
     before = snapshot(place.outside)
-    film.film([actor], place.run / "video.gif", seed=0)
+    film.film([actor], place.run / "video.gif", film.key_of(0))
     assert snapshot(place.outside) == before
     assert not (place.run / "video.gif").is_symlink() and (place.run / "video.gif").stat().st_size > 0
 
