@@ -99,6 +99,7 @@ The on-policy algorithms share these options:
 | `algo.entropy_coef`, `algo.entropy_decay` | a bonus for exploring, and whether it falls to 0 |
 | `algo.activation`, `algo.init` | `tanh`, `relu`; `orthogonal`, `torch` |
 | `algo.std` | `free`: a parameter; `state`: the network computes it |
+| `algo.min_std` | a floor of the standard deviation of actions, to which what is learned is added |
 | `algo.trunk` | `separate`: a network each; `shared`: common hidden layers; `gru`: with a memory |
 
 With `shared` and `gru` policy and critics have one loss. Both are for the algorithms whose steps are

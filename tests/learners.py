@@ -34,6 +34,7 @@ OPTIONS: dict[str, Any] = {
     "total_iterations": 3.0,
     "activation": "relu",
     "std": "state",
+    "min_std": 0.2,
     "cost_window": 3,
 }
 

@@ -7,6 +7,7 @@ folded with the device's index where devices must differ.
 """
 
 import dataclasses
+import math
 import operator
 from collections.abc import Callable
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
@@ -118,6 +119,9 @@ class OnPolicyConfig(EncoderConfig):
     init_log_std: Annotated[float, Bounds(-20, 10)] = -0.5
     # free: the standard deviation is a parameter, as in OmniSafe. state: the network computes it.
     std: Literal["free", "state"] = "free"
+    # Floor of the actions' standard deviation, to which what is learned is added. It must be less than
+    # exp(init_log_std), where the deviation starts. 0 is no floor, as in OmniSafe.
+    min_std: Annotated[float, Bounds(0, 10)] = 0.0
     # Whether observations are scaled by their running mean and variance, as in OmniSafe.
     obs_normalize: bool = True
     # Whether the learner sees rewards divided by the root of their running mean square, and at most 5
@@ -483,6 +487,7 @@ def check_sizes(cfg: Any) -> None:
     """Refuse sizes out of their bounds, and those that do not fit each other."""
     check_values(cfg)
     check_steps(cfg.num_envs, cfg.horizon)
+    check_floor(cfg.min_std, cfg.init_log_std)
     if cfg.trunk == "gru" and cfg.encoder == "cnn":
         raise ConfigError("trunk=gru: expected separate or shared with encoder=cnn")
     # a network with a memory learns from whole sequences, one of each environment
@@ -494,4 +499,17 @@ def check_sizes(cfg: Any) -> None:
         raise ConfigError(
             f"minibatches={cfg.minibatches}: expected a divisor of {rows} = {size}; "
             f"the nearest is {divisor}"
+        )
+
+
+def check_floor(min_std: Any, init_log_std: Any) -> None:
+    """Refuse a floor of the standard deviation that is not below where the deviation starts.
+
+    JAX's traced values are not checked.
+    """
+    known = isinstance(min_std, float | int) and isinstance(init_log_std, float | int)
+    if known and min_std >= (start := math.exp(init_log_std)):
+        raise ConfigError(
+            f"min_std={min_std:g}: expected less than {start:.3g}, the standard deviation at the "
+            "start, exp(init_log_std)"
         )

@@ -109,6 +109,12 @@ def coarse_mlp(cfg: Any, out: int, layer_norm: bool = False) -> MLP:
     )
 
 
+def initial_log_std(action_size: int, cfg: Any) -> jax.Array:
+    """log(exp(init_log_std) - min_std) [A], so that the deviation starts at exp(init_log_std)."""
+    learned = cfg.init_log_std + jnp.log1p(-cfg.min_std * jnp.exp(-cfg.init_log_std))
+    return jnp.full(action_size, learned, jnp.float32)
+
+
 def policy_outputs(action_size: int, cfg: Any) -> int:
     return 2 * action_size if cfg.std == "state" else action_size
 
@@ -122,7 +128,7 @@ def init_params(key: jax.Array, obs: PyTree, action_size: int, cfg: Any) -> dict
     keys = jax.random.split(key, 3)
     actor = {
         "mean": mlp(cfg, policy_outputs(action_size, cfg), gain=0.01).init(keys[0], obs),
-        "log_std": jnp.full(action_size, cfg.init_log_std, jnp.float32),
+        "log_std": initial_log_std(action_size, cfg),
     }
     critic_r, critic_c = (mlp(cfg, 1).init(key, obs) for key in keys[1:])
     return {"actor": actor, "critic_r": critic_r, "critic_c": critic_c}
@@ -168,7 +174,7 @@ def init_recurrent(
     return {
         "actor": {
             "mean": net.init(key, jnp.zeros(cfg.hidden[-1]), obs),
-            "log_std": jnp.full(action_size, cfg.init_log_std, jnp.float32),
+            "log_std": initial_log_std(action_size, cfg),
         }
     }
 
@@ -215,11 +221,27 @@ def recurrent_step(
 
 
 def distribution(actor: PyTree, out: jax.Array, cfg: Any) -> Gaussian:
-    """The Gaussian of a policy's outputs."""
+    """The Gaussian of a policy's outputs, of standard deviation
+
+        min_std + exp(log_std)
+
+    `log_std` is a parameter or, with `std` 'state', the sum of a parameter and an output. Samples,
+    entropy and KLs are those of the whole deviation.
+
+    A maximum in place of the sum would have no gradient below the floor: a deviation that sank there
+    could never rise again. With the sum log_std has a share (std - min_std) / std of the gradient, and
+    the square of that share of the Fisher information. Near the floor this is small beside the damping
+    of a trust region.
+
+    Source: Freeman et al. (2021), "Brax - A Differentiable Physics Engine for Large Scale Rigid Body
+        Simulation", arXiv:2106.13281, the authors' code, for the sum.
+    """
+    mean, log_std = out, actor["log_std"]
     if cfg.std == "state":
         mean, change = jnp.split(out, 2, axis=-1)
-        return Gaussian(mean, jnp.clip(actor["log_std"] + change, *LOG_STD))
-    return Gaussian(out, jnp.broadcast_to(actor["log_std"], out.shape))
+        log_std = jnp.clip(log_std + change, *LOG_STD)
+    log_std = jnp.logaddexp(log_std, jnp.log(cfg.min_std))
+    return Gaussian(mean, jnp.broadcast_to(log_std, mean.shape))
 
 
 def value(critic: PyTree, obs: PyTree, cfg: Any) -> jax.Array:

@@ -97,7 +97,7 @@ def build(
             f"expected a multiple of {devices}, or 1"
         )
     algo: Algorithm = make(env, AXIS if split else None)
-    clocks = algo.clocks(configs[0])
+    clocks, *_ = map(algo.clocks, configs)  # which refuse settings that do not fit each other
     clocks = clocks._replace(steps=clocks.steps * raw_steps(env))
     check_data(clocks, data, train_cfg)
     if split:

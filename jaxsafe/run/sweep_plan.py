@@ -70,7 +70,9 @@ def plan(given: dict[str, Any], several: dict[str, list[Any]], extras: Extras = 
             words = ", ".join(f"{k}={as_text(v)}" for k, v in chosen.items())
             raise ConfigError(f"{words}: these settings occur twice")
         known.add(text)
-        settings.row.make(make_env(settings)).clocks(settings.algo)  # refuses sizes that do not fit
+        algo = settings.row.make(make_env(settings))
+        for cfg in settings.configs:
+            algo.clocks(cfg)  # refuses settings that do not fit each other
         groups[folder_name(len(groups), settings, chosen)] = settings
     swept = [f"{k}.name" if k in DEFAULT else k for k in several]
     where = Path(folder).expanduser() if folder else default_folder(groups)

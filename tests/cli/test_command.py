@@ -74,6 +74,8 @@ BAD = {
     "algo.gae_lambda=nan": "expected a number between 0 and 1",
     "algo.clip=wide": "expected a number",
     "algo.minibatches=7": "minibatches",
+    "algo.min_std=0.7": "min_std=0.7: expected less than 0.607, the standard deviation at the start",
+    "algo.min_std=[0,0.7]": "min_std=0.7: expected less than 0.607",
     "algo.cost_limit=[5,5]": "algo.cost_limit=5 occurs twice",
     "algo.cost_limit=[]": "not 0 of algo.cost_limit",
     "algo.cost_limit=[5,wide]": "expected a number",

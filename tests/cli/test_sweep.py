@@ -485,6 +485,7 @@ BAD = {
     "preset=auto,fast": "preset=fast: these settings occur twice",
     "env=point_goal1,car_gaol1": "did you mean 'car_goal1'?",
     "algo.minibatches=8,7": "minibatches=7",
+    "algo.min_std=0,0.7": "min_std=0.7",
     "resume=true": "the same command is given again",
     "max_parallel=0 algo.clip=0.1,0.2": "max_parallel=0: expected a whole number",
     "init_from=nowhere algo.clip=0.1,0.2": "not a run folder",

@@ -126,6 +126,24 @@ def test_an_entropy_bonus_raises_the_entropy_and_a_malus_lowers_it(name):
     assert low < none - 1e-3 < none + 1e-3 < high  # by steps of 3e-4, or within 0.02 nats
 
 
+@pytest.mark.parametrize("name", COMPILED)
+def test_a_deviation_that_sank_acts_at_its_floor_and_can_rise_and_fall_from_there(name):
+    floor, coefs = jnp.full(3, 0.3), jnp.array([-100.0, 0.0, 100.0])
+    ts = members(name, [0, 0, 0], cost_limit=jnp.full(3, 25.0), entropy_coef=coefs, min_std=floor)
+    actor = ts.params["actor"]
+    sunk = actor | {"log_std": jnp.full_like(actor["log_std"], np.log(0.3) - 3)}  # to 5% of it
+    ts = dataclasses.replace(ts, params=ts.params | {"actor": sunk})
+    after, metrics = compiled(name).together(ts)
+    assert metrics["train/nonfinite"].tolist() == [0, 0, 0]
+    assert (metrics["train/entropy"] > 2 * (np.log(0.3) + 1.41894)).all()
+    learned = after.params["actor"]["log_std"]
+    assert (learned[0] < sunk["log_std"][0]).all() and (learned[2] > sunk["log_std"][2]).all()
+    algo, one = compiled(name).algo, member(ts, 0)
+    obs, keys = one.rollout.state.obs[0], jax.random.split(jax.random.key(0), 4000)
+    draws = jax.vmap(lambda key: algo.policy.act(algo.learned(one), (), obs, key)[0])(keys)
+    np.testing.assert_allclose(draws.std(0), 0.3 * (1 + np.exp(-3)), rtol=0.05)
+
+
 def test_a_step_of_a_trust_region_stays_within_it_however_large_it_is():
     sizes = jnp.array([1e-3, 0.1, 5.0])
     _, m = compiled("trpo_pid").together(members("trpo_pid", [0, 0, 0], target_kl=sizes))

@@ -78,6 +78,30 @@ def test_a_std_of_the_state_starts_near_the_free_one_differs_by_state_and_is_cli
         np.testing.assert_array_equal(action_dist(moved, obs, cfg).log_std, jnp.full((4, 9, 3), bound))
 
 
+@pytest.mark.parametrize("std", ["free", "state"])
+def test_a_deviation_starts_where_it_would_without_a_floor_and_is_the_floor_and_what_is_learned(std):
+    cfg, obs = PPOConfig(std=std, min_std=0.2), jax.random.normal(jax.random.key(1), (9, 5))
+    actor = params(std=std, min_std=0.2)["actor"]
+    np.testing.assert_allclose(action_dist(actor, obs, cfg).log_std, -0.5, atol=0.1 * (std == "state"))
+    change = action_dist(actor, obs, PPOConfig(std=std)).log_std - actor["log_std"]
+    for learned in (-12.0, -1.0, 1.0):
+        dist = action_dist(actor | {"log_std": jnp.full(3, learned)}, obs, cfg)
+        np.testing.assert_allclose(jnp.exp(dist.log_std), 0.2 + jnp.exp(learned + change), rtol=1e-5)
+
+
+@pytest.mark.parametrize("floor", [0.0, 0.2])
+def test_a_deviation_has_its_share_above_the_floor_of_the_gradient(floor):
+    """All of it without a floor, to the last bit."""
+    actor, cfg = params()["actor"], PPOConfig(min_std=floor)
+    learned = jnp.array([-4.0, -1.0, 1.0])
+    slope = jax.jacobian(lambda x: action_dist(actor | {"log_std": x}, jnp.zeros(5), cfg).log_std)
+    if floor:
+        share = np.exp(learned) / (floor + np.exp(learned))  # (std - floor) / std
+        np.testing.assert_allclose(slope(learned), np.diag(share), rtol=1e-5)
+    else:
+        np.testing.assert_array_equal(slope(learned), np.eye(3))
+
+
 @pytest.mark.parametrize("settings", [{"activation": "relu"}, {"std": "state"}, {"init": "torch"}])
 def test_gradients_reach_every_parameter_and_are_finite(settings):
     cfg = PPOConfig(**settings)

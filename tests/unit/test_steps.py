@@ -268,3 +268,18 @@ def test_the_entropy_bonus_by_hand(iteration, decay, share):
     # entropies log std + log(2 pi e) / 2, of two dimensions: 1.41894 each at a std of 1
     np.testing.assert_allclose(gain, 0.2 * share * (2 * 1.4189385 - 1), rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(slope, 0.2 * share * np.ones(2), rtol=1e-3, atol=1e-6)
+
+
+def test_entropy_and_its_bonus_are_of_the_deviation_with_its_floor():
+    cfg = PPOConfig(**SMALL, entropy_coef=0.2, min_std=0.5)
+    params, batch = problem()
+
+    def bonus(log_std):
+        dist = action_dist(params["actor"] | {"log_std": log_std}, batch.obs, cfg)
+        surrogate = with_entropy(plain, jnp.int32(0))
+        return surrogate(dist, batch, batch.adv_r, cfg)[0] - plain(dist, batch, batch.adv_r, cfg)[0]
+
+    # deviations of 0.5 + 0.5 and 0.5 + 0.125, of which 1/2 and 1/5 are learned
+    gain, slope = jax.value_and_grad(bonus)(jnp.log(jnp.array([0.5, 0.125])))
+    np.testing.assert_allclose(gain, 0.2 * (2 * 1.4189385 + np.log(0.625)), rtol=1e-4)
+    np.testing.assert_allclose(slope, 0.2 * np.array([1 / 2, 1 / 5]), rtol=1e-3)

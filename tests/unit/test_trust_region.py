@@ -119,19 +119,21 @@ def test_the_line_search_stays_where_it_is_when_nothing_is_finite():
     assert not accepted and x[0] == 1.0
 
 
-def natural(step, bend=0.0, **options):
+def natural(step, bend=0.0, sunk=0.0, **options):
     """The flat step taken, its gradient and Fisher matrix (dense), the metrics, and the config.
 
     bend: of the objective, which loses so much times the square of the step.
+    sunk: nats by which the learned deviations have fallen since the start.
     """
     cfg = TRPOConfig(hidden=(4,), cg_iterations=60, **options)
-    return *taken(step, cfg, bend), cfg
+    return *taken(step, cfg, bend, sunk), cfg
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=FAST)
-def taken(step, cfg, bend):
+def taken(step, cfg, bend, sunk):
     keys = jax.random.split(jax.random.key(0), 3)
     actor = init_params(keys[0], jnp.zeros(3), 2, cfg)["actor"]
+    actor |= {"log_std": actor["log_std"] - sunk}
     obs = jax.random.normal(keys[1], (256, 3))
     old = action_dist(actor, obs, cfg)
     action = sample(old, keys[2])
@@ -180,3 +182,18 @@ def test_a_trust_region_step_never_lowers_its_objective():
     assert metrics["train/accepted"] == 1 and 0 <= metrics["gained"] < 1
     np.testing.assert_allclose(metrics["train/objective"], metrics["gained"], rtol=1e-3, atol=1e-6)
     assert metrics["train/kl"] < 0.01 and jnp.linalg.norm(step) < 0.95 * jnp.linalg.norm(long)
+
+
+@pytest.mark.parametrize("damping", [0.1, 0.0])
+@pytest.mark.parametrize("sunk", [3.0, 20.0, 200.0])
+def test_a_trust_region_step_is_finite_where_the_deviation_has_sunk_to_its_floor(sunk, damping):
+    """Of its Fisher information 1% is left, then 1e-16, then none: without damping H is singular."""
+    step, g, h, metrics, cfg = natural(trust_region, min_std=0.3, sunk=sunk, damping=damping)
+    assert jnp.isfinite(step).all() and metrics["train/nonfinite"] == 0
+    assert metrics["train/accepted"] == 1 and 0.1 * cfg.target_kl < metrics["train/kl"] <= cfg.target_kl
+    np.testing.assert_allclose(metrics["train/kl"], metrics["from old to new"], rtol=1e-4)
+    if damping:
+        exact = np.linalg.solve(np.asarray(h, np.float64), np.asarray(g, np.float64))
+        exact *= np.sqrt(2 * cfg.target_kl / (g @ exact))
+        shrunk = cfg.line_search_shrink ** float(metrics["train/line_search"])
+        np.testing.assert_allclose(step, shrunk * exact, rtol=2e-2, atol=2e-4)
