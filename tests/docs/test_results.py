@@ -1,6 +1,7 @@
 """What the results pages say must hold of the runs that they are made from."""
 
 import itertools
+import json
 import re
 import statistics
 from collections import Counter, defaultdict
@@ -153,3 +154,64 @@ def test_ten_algorithms_are_of_one_commit_and_evaluated_with_both_kinds_of_actio
     assert Counter(row["algo"] for row in rows) == dict.fromkeys(ten, 4 * 5)  # tasks and seeds
     assert {row["commit"][:7] for row in rows} == {"24de6da"}
     assert all(row["final return"] and row["final sampled return"] for row in rows)
+
+
+def test_the_first_table_of_offline_algorithms_has_what_their_policies_cost():
+    text, rows = (RESULTS / "offline" / "README.md").read_text(), rows_of("offline")
+    tasks = [
+        (env, beta)
+        for env in ("point_circle1", "car_circle1", "point_goal1")
+        for beta in ("0.25", "0.50", "0.75")
+    ]
+    found = re.findall(r"^\| `(\w+)` \|((?: [*\d.]+(?: \[\d+\])? \|){9})$", text, re.M)
+    assert len(found) == 8
+    for algo, cells in found:
+        costs = [cell.split()[0] for cell in cells.strip("|").split("|")]
+        for (env, beta), cost in zip(tasks, costs, strict=True):
+            run = f"algo={algo} dataset=runs/data/{env}/{beta}.hdf5"
+            one = [row for row in rows if row["env"] == env and row["run"].endswith(run)]
+            made, shown = mean(one, "final cost"), cost.strip("*")
+            assert f"{made:.{1 if '.' in shown else 0}f}" == shown, (algo, env, beta)
+            assert cost.startswith("**") == (made <= 25)
+
+
+@pytest.mark.parametrize(
+    "study, envs, returns, costs",
+    [
+        ("goal", ["point_goal1", "car_goal1"], ("11", "25"), ("16", "31")),
+        ("goal", ["point_goal2", "car_goal2"], ("0.5", "5"), ("20", "39")),
+        ("button", ["point_button1", "point_button2"], ("-1", "6.1"), ("10", "30")),
+        ("button", ["car_button1", "car_button2"], ("-1", "1.5"), ("12", "44")),
+    ],
+)
+def test_the_14_algorithms_with_a_limit_train_between_these_figures(study, envs, returns, costs):
+    others = ["ppo", "trpo", "pg", "npg", "pdo", "ipo", "crpo", "ppo_penalty"]
+    rows = [row for row in rows_of(study) if row["env"] in envs and row["algo"] not in others]
+    cells = {(row["env"], row["algo"]) for row in rows if "terminated" not in row["algo"]}
+    assert len(cells) == 14 * len(envs)
+    for name, said in {"return": returns, "cost": costs}.items():
+        made = [
+            mean([row for row in rows if (row["env"], row["algo"]) == cell], name) for cell in cells
+        ]
+        for value, figure in zip((min(made), max(made)), said, strict=True):
+            assert f"{value:.{len(figure.partition('.')[2])}f}" == figure
+
+
+def test_cpo_trains_within_1_2_of_its_limit_on_goal_and_button():
+    for study in ("goal", "button"):
+        rows = [row for row in rows_of(study) if row["algo"] == "cpo"]
+        for env in {row["env"] for row in rows}:
+            assert abs(mean(rows, "cost", env=env) - 25) <= 1.2
+
+
+@pytest.mark.parametrize("envs, times", [(2048, "4.3"), (32768, "9.1")])
+def test_training_is_so_many_times_as_fast_as_that_of_crax(envs, times):
+    lines = (RESULTS.parent / "data" / "benchmark_h200.jsonl").read_text().splitlines()
+    rows = [
+        row
+        for row in map(json.loads, lines)
+        if row.get("algo") == "ppo_lag" and row["num_envs"] == envs
+    ]
+    ours = [row for row in rows if row.get("solver") == "jaxsafe, all passes" and row["num_seeds"] == 1]
+    theirs = [row for row in rows if row["env"] == "safe_goal_point"]
+    assert f"{ours[-1]['env_steps_per_s'] / theirs[-1]['env_steps_per_s']:.1f}" == times
