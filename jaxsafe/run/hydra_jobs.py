@@ -170,6 +170,7 @@ def check_arguments(argv: list[str]) -> Request:
     given = typed.by_name
     if typed.multirun and given.keys() & {*distributed.OPTIONS}:
         raise ConfigError(f"{', '.join(distributed.OPTIONS)} are for one run, without --multirun")
+    check_sweeper(typed)
     for name in ONE_VALUE:
         if name in given and given[name].is_sweep_override():
             raise ConfigError(f"{name} takes one value, not a sweep")
@@ -214,6 +215,18 @@ def check_lengths(known: list[dict[str, Any]]) -> None:
     if len({*steps.values()}) > 1:
         each = ", ".join(f"{count:,} of {algo}" for algo, count in steps.items())
         raise ConfigError(f"total_steps are {each} by default; give one, such as total_steps=1e7")
+
+
+def check_sweeper(typed: Typed) -> None:
+    """Raise ConfigError for `hydra.sweeper.params`, unless it changes those of a sweeper in the user's
+    files. Hydra's own sweepers have none that an argument could change, and Hydra fails on it."""
+    if typed.files and "hydra/sweeper" in typed.by_name:
+        return
+    for name, override in typed.by_name.items():
+        if name.startswith("hydra.sweeper.params"):
+            raise ConfigError(
+                f"{override.input_line}: an option takes its values itself, as in -m algo.lr=1,2"
+            )
 
 
 def swept_otherwise(typed: Typed) -> bool:

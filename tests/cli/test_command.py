@@ -91,6 +91,12 @@ BAD = {
     "devices=512": "devices=512",
     "seed=1,2": "--multirun",
     "+seed=1": "without '+'",
+    "-m hydra.sweeper.params={algo.lr:1}": "an option takes its values itself, as in -m algo.lr=1,2",
+    "-m ++hydra.sweeper.params={seed:'1,2'} hydra/sweeper=basic": "algo.lr=1,2",
+    "-m +hydra.sweeper.params.algo.lr=1,2": "algo.lr=1,2",
+    "-m hydra.sweeper.params.algo.lr='1,2'": "algo.lr=1,2",
+    "-m --config-dir=. +hydra.sweeper.params.seed='1,2'": "algo.lr=1,2",
+    "hydra.sweeper.params={algo:'ppo,sac'}": "algo.lr=1,2",
     "seed": "cannot read",
     "algo.clip=[1": "cannot read",
     "preset=quick": "valid: auto, early_price, fast",
@@ -588,11 +594,10 @@ def test_algorithms_of_a_sweep_must_have_one_length():
 @pytest.mark.parametrize(
     "options",
     [
-        ["hydra.sweeper.params={env: 'walker2d_velocity,ant_velocity'}"],
-        ["hydra.sweeper.params={algo: 'ppo,sac'}"],
-        ["+hydra.sweeper.params.env='walker2d_velocity,ant_velocity'"],
         ["+hydra.sweeper.ax_config={params: {env: {type: choice, values: [ant_velocity]}}}"],
+        ["+hydra.sweeper.ax_config.params.algo={type: choice, values: [ppo, sac]}"],
         ["--config-dir=conf", "hydra/sweeper=mine"],
+        ["--config-dir=conf", "hydra/sweeper=mine", "hydra.sweeper.params={env: 'ant_velocity'}"],
     ],
 )
 def test_a_sweeper_that_may_choose_any_task_has_the_general_defaults_or_those_of_the_run_to_continue(
@@ -610,7 +615,7 @@ def test_a_sweeper_that_may_choose_any_task_has_the_general_defaults_or_those_of
     "options",
     [
         ["-m", "hydra.sweeper.max_batch_size=1"],
-        ["-m", "hydra.sweeper.params={algo.clip: '0.1,0.2', seed: '1,2'}"],
+        ["-m", "+hydra.sweeper.ax_config={params: {algo.clip: {type: range, bounds: [0.1, 0.2]}}}"],
         ["-m", "hydra/sweeper=basic"],
         ["hydra.verbose=true"],
     ],
