@@ -265,6 +265,7 @@ def train(
             valid one), a value of the wrong type or out of bounds, a run that does not fit the memory.
         jaxsafe.run.checkpoint.NotSaved, OSError: the disk failed; the last checkpoint stays.
         jaxsafe.run.divergence.Diverged: the run learns no more; likewise.
+        jaxsafe.run.memory.OutOfMemory: the memory was too small in the middle of it; likewise.
         KeyboardInterrupt: stopped, see above.
     """
     for name in distributed.OPTIONS:

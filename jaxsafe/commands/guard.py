@@ -9,7 +9,7 @@ import jax
 
 from jaxsafe.config import ConfigError, one_line
 from jaxsafe.report.film import NoVideo
-from jaxsafe.run import arguments, checkpoint
+from jaxsafe.run import arguments, checkpoint, memory
 from jaxsafe.run.divergence import Diverged
 
 DIVERGED = 3  # the exit status of a run that learns no more
@@ -25,7 +25,7 @@ def guarded(command: Callable[[], int]) -> int:
         return status
     except (ConfigError, *arguments.ERRORS) as error:
         return complain(one_line(error), 2)
-    except (checkpoint.NotSaved, NoVideo) as error:
+    except (checkpoint.NotSaved, memory.OutOfMemory, NoVideo) as error:
         return complain(one_line(error), 1)
     except Diverged as error:
         return complain(one_line(error), DIVERGED)
@@ -42,11 +42,9 @@ def guarded(command: Callable[[], int]) -> int:
         where = f" ({error.filename})" if error.filename else ""
         return complain(f"{error.strerror}{where}; what was saved stays", 1)
     except jax.errors.JaxRuntimeError as error:
-        if "RESOURCE_EXHAUSTED" not in str(error):
+        if not memory.is_exhausted(error):
             raise
-        return complain(
-            "the device is out of memory; use fewer num_envs, num_seeds or a shorter horizon", 1
-        )
+        return complain("out of memory; use fewer environments, seeds or episodes", 1)
 
 
 def complain(line: str, status: int) -> int:

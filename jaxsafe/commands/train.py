@@ -19,7 +19,8 @@ from jaxsafe.run.settings import Settings, settings_from_config, yours
 
 
 def main() -> int:
-    """Exit status: 2 for bad input, 1 for a failed disk, 3 if it diverged, 130 if stopped."""
+    """Exit status: 2 for bad input, 1 for a failed disk or a lack of memory, 3 if it diverged, 130 if
+    stopped."""
 
     def command() -> int:
         if {"-h", "--help"} & {*sys.argv}:

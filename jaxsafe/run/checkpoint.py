@@ -323,13 +323,18 @@ def verify(path: Path, manifest: Manifest) -> None:
 def host_memory() -> float:
     """Bytes of memory that a program can still have on this machine, or infinity where unknown."""
     limits = [math.inf]
-    with contextlib.suppress(OSError, ValueError):
-        rows = dict(line.split(":", 1) for line in Path("/proc/meminfo").read_text().splitlines())
-        limits.append(float(rows["MemAvailable"].split()[0]) * 1024)
+    with contextlib.suppress(OSError, ValueError, LookupError):
+        limits.append(in_proc("meminfo", "MemAvailable"))
     for path in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
-        with contextlib.suppress(OSError, ValueError):
-            limits.append(float(Path(path).read_text()))
+        with contextlib.suppress(OSError, ValueError, LookupError):
+            limits.append(float(Path(path).read_text()) - in_proc("self/status", "RssAnon"))
     return min(limits)
+
+
+def in_proc(name: str, field: str) -> float:
+    """Bytes that a file of Linux's /proc says."""
+    rows = dict(line.split(":", 1) for line in Path("/proc", name).read_text().splitlines())
+    return float(rows[field].split()[0]) * 1024
 
 
 def check_stored(state: Path, leaves: Mapping[str, tuple[str, tuple[int, ...]]], orbax: Any) -> None:

@@ -8,13 +8,13 @@ import dataclasses
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from jaxsafe.learn.constraints import limits_by_name
-from jaxsafe.run import checkpoint, clock, distributed, divergence, files, memory, programs, run_folder
+from jaxsafe.run import checkpoint, clock, distributed, divergence, files, programs, run_folder
 from jaxsafe.run.divergence import Diverged
 from jaxsafe.run.evaluate import COLUMNS
 from jaxsafe.run.interrupts import Interrupts
@@ -33,6 +33,7 @@ class Hooks(NamedTuple):
     """What a session adds to the loop.
 
     resume_command: the command that continues the run, printed when it is stopped early.
+    check(update) looks at the compiled update before it runs.
     adapt(ts) -> ts changes a fresh train state, to start from another policy; not used on resumption.
     evaluate(learned) -> {name: [M]} measures the policies of all members, for the columns
         `evaluate.COLUMNS`; process 0 calls it. None: they are not measured.
@@ -41,6 +42,7 @@ class Hooks(NamedTuple):
     """
 
     resume_command: str
+    check: Callable[[Any], None] = lambda update: None
     adapt: Callable[[PyTree], PyTree] = lambda ts: ts
     evaluate: Callable[[PyTree], dict[str, np.ndarray]] | None = None
     about: Callable[[Member], str] = str
@@ -72,7 +74,7 @@ def train(
     Raises:
         checkpoint.NotSaved, OSError: the disk failed; the last good checkpoint stays.
         divergence.Diverged: no member learns any more; likewise.
-        memory.TooLarge: an update cannot fit the memory.
+        memory.TooLarge: by `hooks.check`, an update cannot fit the memory.
     """
     iterations, unit = clock.iterations(train_cfg, program.clocks), clock.unit(program.clocks)
     store = files.inside(folder, "checkpoints")
@@ -90,7 +92,8 @@ def train(
         names = sorted(jax.eval_shape(program.update, start.ts, program.shared())[1])
         names += COLUMNS if hooks.evaluate else ()
         update = programs.compiled(program, start.ts)
-        memory.check_work_memory(update, program.start[1])
+        jax.block_until_ready(start.ts)  # so that a check of the memory finds it there
+        hooks.check(update)
         report.line(f"compiled in {time.perf_counter() - begun:.1f} s")
         stop.nothing_to_save = ""
 

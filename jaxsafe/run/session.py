@@ -15,12 +15,11 @@ import jaxsafe
 from jaxsafe.config import ConfigError, flat
 from jaxsafe.envs.wrap import innermost
 from jaxsafe.nvidia import warp_problem
-from jaxsafe.run import checkpoint, clock, dataset, distributed, files, loop, run_folder
+from jaxsafe.run import checkpoint, clock, dataset, distributed, files, loop, memory, run_folder
 from jaxsafe.run.devices import check_devices, device_name, use_compilation_cache
 from jaxsafe.run.evaluate import TRAINING, keys_of_episodes, make_training_evaluation
 from jaxsafe.run.interrupts import Interrupts
 from jaxsafe.run.loggers import Callback, check_logger, wandb_callback
-from jaxsafe.run.memory import check_memory, check_state_memory
 from jaxsafe.run.plain import differences
 from jaxsafe.run.policies import warm_start
 from jaxsafe.run.programs import Program, build
@@ -171,14 +170,14 @@ def prepare(settings: Settings) -> tuple[Env, Program]:
     check_devices(train)
     check_logger(train.logger)
     env = make_env(settings)
-    check_memory(env, settings)
+    memory.check_memory(env, settings)
     data: Any = ()
     if train.dataset is not None:
         data = dataset.read_dataset(train.dataset, env.episode_length)
     for cfg in settings.configs:
         settings.row.check(cfg, env, data)
     program = build(env, settings.row.make, settings.configs, train, data)
-    check_state_memory(program, env, settings)
+    memory.check_state_memory(program, env, settings)
     return env, program
 
 
@@ -200,7 +199,8 @@ def run(session: Session, report: Reporter, finish: Finish) -> int:
     """Train, then `finish`. Returns the exit status: 0, or 130 if the user stopped it.
 
     Raises:
-        ConfigError: another process is training in the folder.
+        ConfigError: another process is training in the folder; memory.TooLarge: an update cannot fit.
+        memory.OutOfMemory: the memory was too small all the same.
         divergence.Diverged: the run learns no more.
     """
     hooks = hooks_of(session, report)  # what it refuses leaves no folder
@@ -237,7 +237,8 @@ def run_alone(session: Session, report: Reporter, finish: Finish, hooks: loop.Ho
     env = settings.plain()["env"]
     if train.dataset is not None and (line := dataset.other_task(train.dataset, env)):
         report.line(line)
-    stopped = loop.train(program, train, session.folder, report, hooks)
+    with memory.watched(program, session.env, settings) as check:
+        stopped = loop.train(program, train, session.folder, report, hooks._replace(check=check))
     distributed.part()
     if stopped:
         return 130

@@ -85,6 +85,9 @@ BAD = {
     "num_envs=1e7": "use fewer num_envs",
     "num_envs=1e6 env.observe_vision=true algo.encoder=cnn": "num_envs or a smaller env.vision_size",
     "algo=sac_lag algo.replay_size=1e9 env.observe_vision=true algo.encoder=cnn": (
+        "use a smaller algo.replay_size or env.vision_size"
+    ),
+    "algo=sac_lag algo.replay_size=1e9 env.observe_vision=true algo.encoder=cnn num_seeds=2": (
         "use a smaller algo.replay_size, env.vision_size or num_seeds"
     ),
     "num_envs=1e9": "expected a whole number between 1 and 16777216",

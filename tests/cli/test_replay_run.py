@@ -12,7 +12,7 @@ from toys import Corridor
 from jaxsafe.algos import ALGOS
 from jaxsafe.commands import train
 from jaxsafe.learn.planning import planning_bytes
-from jaxsafe.run import checkpoint, memory, run_folder
+from jaxsafe.run import checkpoint, memory, programs, run_folder
 from jaxsafe.run.run_folder import read_metrics
 
 SAC = (
@@ -135,7 +135,11 @@ def test_a_run_that_has_lost_its_checkpoints_is_not_begun_anew_over_its_metrics(
 @pytest.mark.parametrize(
     "options, message",
     [
-        (["algo.replay_size=2e9"], "GiB of it replay"),
+        (
+            ["algo.replay_size=2e9"],
+            "a run keeps 72.6 GiB a device (train state 0.0, replay 72.6), this machine has 7.5 GiB; "
+            "use a smaller algo.replay_size",
+        ),
         (["algo.n_step=300"], "replay_size=250 holds 64 steps of 4 environments"),
         (["algo.batch_size=1000"], "the nearest that fit are"),
         (
@@ -174,16 +178,57 @@ def test_plans_that_do_not_fit_are_one_line(tmp_path, capsys, monkeypatch):
 
 def test_an_update_that_does_not_fit_is_one_line(tmp_path, capsys, monkeypatch):
     """Everything but the compiled update fits."""
-    large, few = (8e9, "this machine"), (1000.0, "this machine")
-    monkeypatch.setattr(memory, "device_memory", lambda: large)
+    monkeypatch.setattr(memory, "device_memory", lambda: (8e9, "this machine"))
 
-    def checked(update, cfg):
-        monkeypatch.setattr(memory, "device_memory", lambda: few)
-        check(update, cfg)
+    def counted(*given):
+        monkeypatch.setattr(memory, "device_memory", lambda: (1000.0, "this machine"))
+        return use_of(*given)
 
-    check = memory.check_work_memory
-    monkeypatch.setattr(memory, "check_work_memory", checked)
-    assert typed("train", *SAC, f"run_dir={tmp_path / 'run'}") == 2
+    use_of = memory.use_of
+    monkeypatch.setattr(memory, "use_of", counted)
+    assert typed("train", *SAC, f"run_dir={tmp_path / 'run'}", "num_seeds=2") == 2
     (line,) = [x for x in capsys.readouterr().err.splitlines() if x.startswith("error: ")]
-    assert "an update works in" in line and "this machine has 0.0; use a smaller num_envs, num" in line
-    assert line.endswith("num_seeds or algo.batch_size")
+    assert "an update needs 0.0 GiB a device (train state 0.0, replay 0.0, working arrays 0.0)" in line
+    assert "this machine has 0.0 GiB; use a smaller algo.batch_size, num_envs, " in line
+    assert line.endswith(" or num_seeds")
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        "RESOURCE_EXHAUSTED: Out of memory while trying to allocate 64424509440 bytes.",
+        "INTERNAL: Error dispatching computation: Out of memory allocating 4800000000 bytes.",
+    ],
+)
+def test_a_device_that_runs_out_of_memory_is_one_line_and_leaves_what_was_saved(
+    tmp_path, capsys, monkeypatch, said
+):
+    """XLA's error comes in the fourth update, which may begin with a checkpoint after each."""
+
+    def tired(program, ts):
+        update, done = compiled(program, ts), iter(range(3))
+
+        class Tired:
+            memory_analysis = update.memory_analysis
+
+            def __call__(self, *given):
+                if next(done, None) is None:
+                    raise jax.errors.JaxRuntimeError(message)
+                return update(*given)
+
+        return Tired()
+
+    run, compiled, message = tmp_path / "run", programs.compiled, said
+    args = (*SAC, f"total_steps={8 * STEPS}", f"run_dir={run}", "checkpoint_iterations=1")
+    monkeypatch.setattr(programs, "compiled", tired)
+    assert typed("train", *args, "eval_every=1e6") == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: out of memory; use a smaller ") and "algo.batch_size" in line
+    assert line.endswith(" or eval_episodes; what was saved stays")
+    at = run_folder.newest_progress(run)
+    assert at is not None and at.iteration == 3 and len(read_metrics(run)["steps"]) == 3
+    message = "INTERNAL: no such kernel"
+    with pytest.raises(jax.errors.JaxRuntimeError):  # any other error of XLA's is nobody's mistake
+        typed("train", *args, "eval_every=1e6", "resume=true")
+    monkeypatch.setattr(programs, "compiled", compiled)
+    assert typed("train", *args, "eval_every=1e6", "resume=true") == 0
