@@ -38,6 +38,8 @@ NUMBER = re.compile(r"bool|bfloat16|float(16|32|64)|u?int(8|16|32|64)")  # dtype
 NAME = re.compile(r"[\w.'\[\]<>-]+")  # of a leaf
 OVERHEAD = 64 * files.MB  # bytes by which the files may exceed their arrays
 
+Kind = tuple[str, tuple[int, ...]]  # the dtype and shape of an array
+
 
 class CheckpointError(ConfigError):
     """A checkpoint that cannot be used. The message is one line for the user."""
@@ -73,7 +75,7 @@ class Manifest(NamedTuple):
 
     at: Progress
     files: dict[str, str]  # path under the checkpoint -> SHA-256
-    leaves: dict[str, tuple[str, tuple[int, ...]]]  # name -> dtype, shape
+    leaves: dict[str, Kind]
     since: int = 0  # the iteration from which on its replay holds everything, see types.Shared
 
 
@@ -172,7 +174,7 @@ def save(folder: Path, ts: PyTree, at: Progress, since: int = 0, replay: bool = 
             **at._asdict(),
             "since": since,
             "files": {name: digest(part / name) for name in files.below(part)},
-            "leaves": {k: [str(v.dtype), list(v.shape)] for k, v in arrays.items()},
+            "leaves": kinds(arrays),
         }
         files.write(part / "manifest.json", json.dumps(manifest, indent=1))
         for name in files.below(part):
@@ -208,19 +210,16 @@ def restore(
     """
     arrays, manifest = load(folder, warn)
     expected = as_data(like)
-    if replay_bytes(like) and not any(map(in_replay, manifest.leaves)):
-        empty = {name: np.zeros(x.shape, x.dtype) for name, x in expected.items() if in_replay(name)}
-        arrays |= empty
-        known = {name: (str(x.dtype), x.shape) for name, x in empty.items()}
-        manifest = manifest._replace(leaves=manifest.leaves | known, since=manifest.at.iteration)
-    arrays = joined_alike({name: arrays[name] for name in manifest.leaves}, expected)
-    manifest = manifest._replace(leaves={k: (str(x.dtype), x.shape) for k, x in arrays.items()})
-    for name in sorted({*expected, *manifest.leaves}):
-        want = (str(expected[name].dtype), tuple(expected[name].shape)) if name in expected else None
-        if (have := manifest.leaves.get(name)) != want:
+    if replay_bytes(like) and not any(map(in_replay, arrays)):
+        arrays |= {name: np.zeros(x.shape, x.dtype) for name, x in expected.items() if in_replay(name)}
+        manifest = manifest._replace(since=manifest.at.iteration)
+    arrays = joined_alike(arrays, expected)
+    have, want = kinds(arrays), kinds(expected)
+    for name in sorted({*have, *want}):
+        if have.get(name) != want.get(name):
             raise CheckpointError(
-                f"{folder} has another train state: {name} is {leaf_in_words(have)}, "
-                f"not {leaf_in_words(want)}"
+                f"{folder} has another train state: {name} is {leaf_in_words(have.get(name))}, "
+                f"not {leaf_in_words(want.get(name))}"
             )
     return from_arrays(like, arrays), manifest
 
@@ -294,7 +293,11 @@ def read_manifest(path: Path) -> Manifest:
     return manifest
 
 
-def size_of(leaves: Mapping[str, tuple[str, tuple[int, ...]]]) -> int:
+def kinds(arrays: Mapping[str, Any]) -> dict[str, Kind]:
+    return {name: (str(x.dtype), tuple(x.shape)) for name, x in arrays.items()}
+
+
+def size_of(leaves: Mapping[str, Kind]) -> int:
     """The bytes of arrays of these dtypes and shapes."""
     return sum(dtype_of(dtype).itemsize * math.prod(shape) for dtype, shape in leaves.values())
 
@@ -337,7 +340,7 @@ def in_proc(name: str, field: str) -> float:
     return float(rows[field].split()[0]) * 1024
 
 
-def check_stored(state: Path, leaves: Mapping[str, tuple[str, tuple[int, ...]]], orbax: Any) -> None:
+def check_stored(state: Path, leaves: Mapping[str, Kind], orbax: Any) -> None:
     """Raise CheckpointError unless Orbax's own files say the same of their arrays: it would read what
     they say."""
     stored = {k: v for k, v in orbax.metadata(state).item_metadata.tree.items() if v is not None}
@@ -354,25 +357,19 @@ def check_stored(state: Path, leaves: Mapping[str, tuple[str, tuple[int, ...]]],
 
 def read_leaves(path: Path, manifest: Manifest) -> dict[str, np.ndarray]:
     """Read exactly the arrays that the manifest lists, as host arrays of those shapes and dtypes."""
-    empty = {
-        k: np.zeros(shape, dtype_of(dtype))
-        for k, (dtype, shape) in manifest.leaves.items()
-        if 0 in shape
-    }
     like = {  # one number each, whatever the shape
         k: np.broadcast_to(np.zeros((), dtype_of(dtype)), shape)
         for k, (dtype, shape) in manifest.leaves.items()
-        if 0 not in shape
     }
+    stored = {k: x for k, x in like.items() if x.size}
     with orbax_checkpointer() as orbax:
-        check_stored((path / "state").absolute(), {k: manifest.leaves[k] for k in like}, orbax)
-        restored = orbax.restore((path / "state").absolute(), args=ocp.args.StandardRestore(like))  # type: ignore[call-arg]
-    for name, (dtype, shape) in manifest.leaves.items():
-        if name in like and (str(restored[name].dtype), restored[name].shape) != (dtype, shape):
-            raise CheckpointError(
-                f"{name} is {leaf_in_words((str(restored[name].dtype), restored[name].shape))}"
-            )
-    return {**empty, **restored}
+        check_stored((path / "state").absolute(), kinds(stored), orbax)
+        restored = orbax.restore((path / "state").absolute(), args=ocp.args.StandardRestore(stored))  # type: ignore[call-arg]
+    arrays = {k: restored[k] if k in stored else np.array(x) for k, x in like.items()}
+    for name, kind in kinds(arrays).items():
+        if kind != manifest.leaves[name]:
+            raise CheckpointError(f"{name} is {leaf_in_words(kind)}")
+    return arrays
 
 
 def checkpoints(folder: Path) -> list[Path]:
@@ -400,7 +397,7 @@ def sync(path: Path) -> None:
         os.close(handle)
 
 
-def leaf_in_words(leaf: tuple[str, tuple[int, ...]] | None) -> str:
+def leaf_in_words(leaf: Kind | None) -> str:
     return "absent" if leaf is None else f"{leaf[0]}{list(leaf[1])}"
 
 

@@ -174,13 +174,12 @@ def learned_from(like: PyTree, policy: dict[str, np.ndarray], configs: PyTree, s
     like = jax.tree.map(lambda x: jax.ShapeDtypeStruct((rows, *x.shape), x.dtype), like)
     check_policy(like, policy, source)
     arrays = policy | checkpoint.to_arrays({"config": configs})
-    for name, want in checkpoint.as_data(like).items():
-        have = checkpoint.leaf_in_words(
-            (str(arrays[name].dtype), arrays[name].shape) if name in arrays else None
-        )
-        if have != (expected := checkpoint.leaf_in_words((str(want.dtype), want.shape))):
+    have = checkpoint.kinds(arrays)
+    for name, want in checkpoint.kinds(checkpoint.as_data(like)).items():
+        if have.get(name) != want:
             raise ConfigError(
-                f"the policy of {source} does not fit: {name} is {have}, expected {expected}"
+                f"the policy of {source} does not fit: {name} is "
+                f"{checkpoint.leaf_in_words(have.get(name))}, expected {checkpoint.leaf_in_words(want)}"
             )
     return checkpoint.from_arrays(like, arrays)
 
