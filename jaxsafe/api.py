@@ -128,7 +128,7 @@ class Run:
         Empty before the first iteration.
         """
         table = run_folder.read_metrics(self.folder)
-        num = len(self.settings.configs) * self.settings.train.num_seeds
+        num = self.settings.num_members
         rows = len(table["steps"]) // num if table else 0
         whole = {name: x[: rows * num].reshape(rows, num) for name, x in table.items()}
         common = {*run_folder.INDEX} - {"seed"}

@@ -65,13 +65,12 @@ def finish(session: Session, report: Reporter, stop: Interrupts) -> None:
     def video() -> None:
         film([run().one(0)], folder / "video.mp4", filmed)
 
-    members = len(settings.configs) * train.num_seeds
     wanted = {
         "curves": (curves, True, ""),
         "evaluation": (
             scores,
             train.eval_episodes > 0,
-            f"evaluating {members} x {train.eval_episodes} episodes ...",
+            f"evaluating {settings.num_members} x {train.eval_episodes} episodes ...",
         ),
         "video": (video, train.video, "filming an episode ..."),
     }

@@ -54,7 +54,7 @@ class RunPolicies(NamedTuple):
         Raises:
             ConfigError: the run has fewer.
         """
-        count = len(self.settings.configs) * self.settings.train.num_seeds
+        count = self.settings.num_members
         if not 0 <= index < count:
             raise ConfigError(f"index {index}: the run has {count} policies, from 0, in {self.folder}")
         learned = jax.tree.map(lambda x: x[index], self.learned)

@@ -161,6 +161,11 @@ class Settings(NamedTuple):
         return self.configs[0]
 
     @property
+    def num_members(self) -> int:
+        """Policies that the run trains: each seed of each setting."""
+        return len(self.configs) * self.train.num_seeds
+
+    @property
     def extras(self) -> Extras:
         """What another run folder with the same names is resolved with."""
         return Extras({self.env_name: self.env_entry}, {self.algo_name: self.row})

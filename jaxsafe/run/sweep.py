@@ -62,12 +62,12 @@ def train(sweep: Sweep, resume_command: str, report: Reporter, after: After) -> 
             parallel[name], first = begin(sweep, name, resume_command, report)
             compiled[len(first.members)] = first
             write_folder(sweep, parallel)
-        elif sweep.max_parallel not in (None, parallel[name]) and parallel[name] < members_of(settings):
+        elif sweep.max_parallel not in (None, parallel[name]) and parallel[name] < settings.num_members:
             report.line(f"{name} goes on as it began, {parallel[name]} members at once")
         pieces = parts(settings, parallel[name])
         if len(pieces) > 1:
             report.line(
-                f"{name}: {members_of(settings)} members in {len(pieces)} parts, one after the other"
+                f"{name}: {settings.num_members} members in {len(pieces)} parts, one after the other"
             )
         for i, piece in enumerate(pieces):
             part = name if len(pieces) == 1 else f"{name}.part{i:03d}"
@@ -137,10 +137,6 @@ def finished(settings: Settings, folder: Path) -> bool:
 # ---- parts of a group --------------------------------------------------------------------------
 
 
-def members_of(settings: Settings) -> int:
-    return len(settings.configs) * settings.train.num_seeds
-
-
 def parts(settings: Settings, parallel: int) -> list[Settings]:
     """`settings` in parts of at most `parallel` members, of about one size: whole settings, or seeds of
     one. Several members that run at once are as many on each device."""
@@ -181,7 +177,7 @@ def slices(count: int, most: int, step: int = 1) -> list[slice]:
 
 def members_at_once(settings: Settings, most: int | None) -> tuple[int, Program]:
     """How many members run at once, `most` or what the memory holds; and the first part's program."""
-    count, devices = members_of(settings), settings.train.devices
+    count, devices = settings.num_members, settings.train.devices
     if most:
         most = on_devices(min(count, most), devices)
         return most, first_program(settings, most)

@@ -198,7 +198,7 @@ def test_parts_split_over_the_devices(limits, seeds, parallel, sizes):
     asked = planned(f"algo.cost_limit={values}", f"num_seeds={seeds}", "devices=2")
     (settings,) = asked.groups.values()
     pieces = sweep.parts(settings, parallel)
-    assert [sweep.members_of(piece) for piece in pieces] == sizes
+    assert [piece.num_members for piece in pieces] == sizes
     trained = [
         (c.cost_limit, s)
         for p in pieces
