@@ -48,7 +48,7 @@ def command() -> int:
     limit = f" | cost limit {limits_in_words(limits_of(settings.algo))}" if alone else ""
     print(
         f"{settings.env_name} | {settings.algo_name} | "
-        f"{settings.train.num_seeds} x {args.episodes} episodes, "
+        f"{settings.num_members} x {args.episodes} episodes, "
         f"{'sampled' if args.sampled else 'mean'} actions{limit}",
         flush=True,
     )

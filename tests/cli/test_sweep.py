@@ -360,6 +360,12 @@ def test_the_policies_of_a_group_are_evaluated_setting_by_setting(finished):
         assert s.rows["return"].mean == pytest.approx(alone.ret.mean(), rel=1e-5)
 
 
+def test_evaluate_says_how_many_policies_it_plays(finished, capsys):
+    (folder,) = finished.glob("0*")
+    assert shell.typed("evaluate", str(folder), "--episodes", "3") == 0
+    assert "| 8 x 3 episodes, mean actions\n" in capsys.readouterr().out  # 4 settings of 2 seeds
+
+
 def write(folder: Path, configs: dict[str, Any], table: list[tuple]) -> None:
     """A run folder with some rows of seed, cost limit (None: no column), return and cost."""
     folder.mkdir(parents=True)
