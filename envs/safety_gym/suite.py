@@ -200,34 +200,28 @@ SEDITOR: dict[str, Options] = {
 }
 
 
-def suite() -> dict[str, Options]:
-    """Name -> overrides, for the 27 tasks, run, circle and the grid tests.
-
-    The robot's own overrides come last, so Car's small box wins over Push's.
-    """
+def of_robots(tasks: dict[str, Options], *robots: str) -> dict[str, Options]:
+    """Name -> overrides; the robot's own come last, so Car's small box wins over Push's."""
     return {
         f"{robot}_{task}": options | ROBOTS[robot]
-        for robot in ROBOTS
-        for task, options in (TASKS | GRIDS).items()
+        for robot in robots
+        for task, options in tasks.items()
     }
+
+
+def suite() -> dict[str, Options]:
+    """Name -> overrides, for the 27 tasks, run, circle and the grid tests."""
+    return of_robots(TASKS | GRIDS, *ROBOTS)
 
 
 def circles_and_runs() -> dict[str, Options]:
     """Name -> overrides, for Safety-Gymnasium's Circle and Run of Point and Car."""
-    return {
-        f"{robot}_{task}": options | ROBOTS[robot]
-        for robot in ("point", "car")
-        for task, options in GYMNASIUM.items()
-    }
+    return of_robots(GYMNASIUM, "point", "car")
 
 
 def seditor() -> dict[str, Options]:
     """Name -> overrides, for the tasks of SEditor."""
-    return {
-        f"seditor_{robot}_{task}": options | ROBOTS[robot]
-        for robot in ("point", "car")
-        for task, options in SEDITOR.items()
-    }
+    return {f"seditor_{name}": options for name, options in of_robots(SEDITOR, "point", "car").items()}
 
 
 def ruled() -> list[str]:
