@@ -7,6 +7,7 @@ which draws the arrays over it.
 """
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -73,8 +74,8 @@ class Scene:
     robot_height: float  # of body `robot` at the start, m
     robot_nq: int
     robot_nv: int
-    frees: dict[str, int]  # kind -> number of free bodies
-    mocaps: dict[str, int]  # kind -> number of mocap bodies
+    frees: dict[str, int]  # kind -> number of free bodies, in the order of FREES
+    mocaps: dict[str, int]  # kind -> number of mocap bodies, in the order of MOCAPS
     orbit: np.ndarray  # [nmocap] radius of each mocap body's circle; 0 for those at rest
     watched: dict[str, list[str]]  # kind -> bodies whose contacts with the robot are counted
 
@@ -112,21 +113,22 @@ class Scene:
         return sum(map(len, self.watched.values()))
 
     def contact_slice(self, kind: str) -> slice:
-        kinds = list(self.watched)
-        start = sum(len(self.watched[k]) for k in kinds[: kinds.index(kind)])
-        return slice(start, start + len(self.watched[kind]))
+        return entries({k: len(names) for k, names in self.watched.items()}, kind)
 
     def qpos_slice(self, kind: str) -> slice:
-        start = self.robot_nq + 7 * sum(self.frees[k] for k in FREES[: FREES.index(kind)])
-        return slice(start, start + 7 * self.frees[kind])
+        return entries(self.frees, kind, 7, self.robot_nq)
 
     def qvel_slice(self, kind: str) -> slice:
-        start = self.robot_nv + 6 * sum(self.frees[k] for k in FREES[: FREES.index(kind)])
-        return slice(start, start + 6 * self.frees[kind])
+        return entries(self.frees, kind, 6, self.robot_nv)
 
     def mocap_slice(self, kind: str) -> slice:
-        start = sum(self.mocaps[k] for k in MOCAPS[: MOCAPS.index(kind)])
-        return slice(start, start + self.mocaps[kind])
+        return entries(self.mocaps, kind)
+
+
+def entries(counts: dict[str, int], kind: str, each: int = 1, start: int = 0) -> slice:
+    """Where the objects of `kind` are, if those of `counts` come from `start` on, in its order."""
+    start += each * sum(counts[k] for k in itertools.takewhile(kind.__ne__, counts))
+    return slice(start, start + each * counts[kind])
 
 
 def robot_file(base: str) -> Path:
