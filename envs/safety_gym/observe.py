@@ -95,9 +95,7 @@ def coordinates(arena: Arena, world: World, readings: Readings) -> dict[str, jax
     position, rotation = arena.robot_pose(world)
 
     def ego(targets: jax.Array) -> jax.Array:
-        """[n, 2] of positions [n, 2] on the floor."""
-        offset = jnp.pad(targets - position[:2], ((0, 0), (0, 1)), constant_values=-position[2])
-        return (offset[:, :, None] * rotation[:, :2]).sum(1)
+        return sensing.in_frame(targets, position, rotation)
 
     def sensor(name: str) -> jax.Array:
         return arena.sensor(readings, name)

@@ -15,6 +15,16 @@ TINY = 1e-12
 PARALLEL = 1e-6  # in float32 a ray this close to a face runs along it
 
 
+def in_frame(targets: jax.Array, position: jax.Array, rotation: jax.Array) -> jax.Array:
+    """Targets [n, 2] on the floor, in the robot's frame: the first two coordinates, float [n, 2].
+
+    A target's height counts as 0 and the robot's does not, so a tilted robot sees its own height
+    leak into them (kept from the original).
+    """
+    offset = jnp.pad(targets - position[:2], ((0, 0), (0, 1)), constant_values=-position[2])
+    return (offset[:, :, None] * rotation[:, :2]).sum(1)
+
+
 def pseudo_lidar(
     targets: jax.Array,
     position: jax.Array,
@@ -26,20 +36,18 @@ def pseudo_lidar(
 ) -> jax.Array:
     """Closeness of the nearest target in each of `bins` sectors around the robot.
 
-    A target's height counts as 0 and the robot's does not, so a tilted robot sees its own height
-    leak into the reading (kept from the original). The sector of a target exactly ahead is taken
-    modulo `bins`, where the original raises an IndexError.
+    The sector of a target exactly ahead is taken modulo `bins`, where the original raises an
+    IndexError.
 
     Args:
-        targets: float [n, 2] (m).
+        targets: float [n, 2] (m), as of `in_frame`.
         position, rotation: float [3], [3, 3] of the robot's body.
         max_dist: range of the linear law (m); None for exp(-exp_gain distance).
         alias: share the reading with the two sectors beside, by the angle within the sector.
     Returns:
         float [bins] in [0, 1].
     """
-    offset = jnp.pad(targets - position[:2], ((0, 0), (0, 1)), constant_values=-position[2])
-    ego = (offset[:, :, None] * rotation[:, :2]).sum(1)  # first two components of R'(target - position)
+    ego = in_frame(targets, position, rotation)
     distance = jnp.sqrt(jnp.maximum(jnp.square(ego).sum(-1), TINY**2))
     width = 2 * jnp.pi / bins
     angle = jnp.mod(jnp.arctan2(ego[:, 1], ego[:, 0]), 2 * jnp.pi)
