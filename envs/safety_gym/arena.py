@@ -145,15 +145,16 @@ class Arena:
             return jnp.append(self.positions(world, "buttons")[world.goal_button], height)
         return jnp.zeros(3)
 
-    def distances(self, world: World) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Robot to goal in the plane, robot to box and box to goal in space (m; 0 without them)."""
+    def with_distances(self, world: World) -> World:
+        """`world` with how far it is now from robot to goal in the plane, and from robot to box and box
+        to goal in space (m; 0 without them)."""
         robot, goal = self.robot_pose(world)[0], self.goal_position(world)
-        zero = jnp.zeros(())
-        dist_goal = norm((robot - goal)[:2]) if self.goal_kind else zero
-        if self.config.task != "push":
-            return dist_goal, zero, zero
-        box = self.box_position(world)
-        return dist_goal, norm(robot - box), norm(box - goal)
+        dist_goal = norm((robot - goal)[:2]) if self.goal_kind else jnp.zeros(())
+        dist_box = box_goal = jnp.zeros(())
+        if self.config.task == "push":
+            box = self.box_position(world)
+            dist_box, box_goal = norm(robot - box), norm(box - goal)
+        return world.replace(last_dist_goal=dist_goal, last_dist_box=dist_box, last_box_goal=box_goal)
 
     def layout_now(self, world: World) -> jax.Array:
         """The layout with what has moved where it is now; gremlins count at their circles' centres."""

@@ -12,12 +12,9 @@ from jaxsafe.envs.safety_gym.arena import Arena, World, norm
 
 def measured(arena: Arena, world: World, readings: Readings) -> World:
     """`world` with what rewards are made of, measured where its bodies are now."""
-    dist_goal, dist_box, box_goal = arena.distances(world)
+    world = arena.with_distances(world)
     moves = arena.config.task in ("x", "z", "circle")
-    com = arena.sensor(readings, "subtreecom") if moves else world.last_com
-    return world.replace(
-        last_dist_goal=dist_goal, last_dist_box=dist_box, last_box_goal=box_goal, last_com=com
-    )
+    return world.replace(last_com=arena.sensor(readings, "subtreecom")) if moves else world
 
 
 def reward(arena: Arena, before: World, after: World, readings: Readings) -> jax.Array:

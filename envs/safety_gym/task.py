@@ -261,9 +261,7 @@ class SafetyGym:
             new = world.replace(goal_button=button, buttons_timer=delay)
         else:
             new = world.replace(layout=world.layout.at[self.place.names.index("goal")].set(place))
-        dist_goal, dist_box, box_goal = self.arena.distances(new)
-        new = new.replace(last_dist_goal=dist_goal, last_dist_box=dist_box, last_box_goal=box_goal)
-        return where(wanted, new, world)
+        return where(wanted, self.arena.with_distances(new), world)
 
 
 def where(chosen: jax.Array, new: PyTree, old: PyTree) -> PyTree:
