@@ -43,7 +43,7 @@ KINDS = ("hazards", "vases", "pillars", "buttons", "gremlins", "walls")
 class SafetyGymConfig:
     """A task: robot, layout, observation, reward and constraints. Lengths in m, angles in rad.
 
-    Options that begin with `ours` are not Safety Gym's.
+    Options whose comments begin with `ours` are not Safety Gym's.
     """
 
     # ours: whose rules, where Safety Gym and its successors differ
