@@ -6,13 +6,14 @@ from pathlib import Path
 from jaxsafe.report import plots, tables, trade_off
 from jaxsafe.report.comparison_tables import (
     SCORES,
-    across,
     aggregates,
     as_csv,
     details,
     improvements,
     known_of,
     notes,
+    of_aggregates,
+    of_improvements,
     results,
 )
 from jaxsafe.report.group import Group, period, suite
@@ -30,8 +31,11 @@ def write(
     found = aggregates(scored) if scored.tasks else {}
     pairs = improvements(both) if both.tasks else {}
     main = [results(groups, metric, published) for metric in ("return", "cost")]
-    rest = [*details(groups), *(across(scored, found, {}) if len(scored.tasks) > 1 else [])]
-    rest += across(both, {}, pairs) if pairs else []
+    rest = details(groups)
+    if len(scored.tasks) > 1:
+        rest.append(of_aggregates(scored, found))
+    if pairs:
+        rest.append(of_improvements(both, pairs))
     remarks = notes(groups)
     parts = [f"{t.caption}\n\n{tables.markdown(t)}" for t in (*main, *rest)]
     text = "\n".join([*parts, *([f"Notes: {'; '.join(remarks)}.\n"] if remarks else [])])

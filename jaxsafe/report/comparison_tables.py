@@ -24,8 +24,8 @@ FINAL = (
     "final return", "final cost", "final violation rate", "final discounted return",
     "final discounted cost",
 )  # fmt: skip
-
 SCORES = ("normalised return", "normalised violation", "normalised cost rate")
+STATISTICS = {"mean": stats.mean, "IQM": stats.iqm}
 
 
 def results(
@@ -134,7 +134,7 @@ def aggregates(s: Suite) -> dict[tuple[str, str, str], Estimate]:
         (name, metric, kind): stats.of_measure(metric, *s.samples(name, metric), statistic=statistic)
         for name in s.groups
         for metric in SCORES
-        for kind, statistic in (("mean", stats.mean), ("IQM", stats.iqm))
+        for kind, statistic in STATISTICS.items()
     }
 
 
@@ -147,35 +147,32 @@ def improvements(s: Suite) -> dict[tuple[str, str, str], Estimate]:
     }
 
 
-def across(s: Suite, found: Mapping, pairs: Mapping) -> list[Table]:
-    out = []
-    of = f"{len(s.tasks)} tasks ({', '.join(s.tasks)})" if len(s.tasks) > 1 else s.tasks[0]
-    if found:
-        header = [
-            "setting",
-            *(f"{m.split(' ', 1)[1]}, {kind}" for m in SCORES for kind in ("mean", "IQM")),
-        ]
-        rows = [
-            [
-                f"`{n}`",
-                *(tables.cell(found[n, m, kind], ".3g") for m in SCORES for kind in ("mean", "IQM")),
-            ]
-            for n in s.groups
-        ]
-        caption = f"Normalised scores over {of}: mean and interquartile mean, stratified 95% intervals."
-        out.append(Table(caption, header, rows))
-    if pairs:
-        rows = [
-            [f"`{a}`", f"`{b}`", *(tables.cell(pairs[a, b, m], ".2f") for m in ("return", "cost"))]
-            for a, b, metric in pairs
-            if metric == "return"
-        ]
-        caption = (
-            f"Probability of improvement over {of}: that a seed of X has the higher return, or the "
-            "lower cost, than one of Y."
-        )
-        out.append(Table(caption, ["X", "Y", "higher return", "lower cost"], rows, 2))
-    return out
+def in_words(envs: Sequence[str]) -> str:
+    return f"{len(envs)} tasks ({', '.join(envs)})" if len(envs) > 1 else envs[0]
+
+
+def of_aggregates(s: Suite, found: Mapping[tuple[str, str, str], Estimate]) -> Table:
+    columns = [(metric, kind) for metric in SCORES for kind in STATISTICS]
+    header = ["setting", *(f"{metric.split(' ', 1)[1]}, {kind}" for metric, kind in columns)]
+    rows = [[f"`{n}`", *(tables.cell(found[n, *c], ".3g") for c in columns)] for n in s.groups]
+    caption = (
+        f"Normalised scores over {in_words(s.tasks)}: mean and interquartile mean, stratified 95% "
+        "intervals."
+    )
+    return Table(caption, header, rows)
+
+
+def of_improvements(s: Suite, pairs: Mapping[tuple[str, str, str], Estimate]) -> Table:
+    rows = [
+        [f"`{a}`", f"`{b}`", *(tables.cell(pairs[a, b, m], ".2f") for m in ("return", "cost"))]
+        for a, b, metric in pairs
+        if metric == "return"
+    ]
+    caption = (
+        f"Probability of improvement over {in_words(s.tasks)}: that a seed of X has the higher "
+        "return, or the lower cost, than one of Y."
+    )
+    return Table(caption, ["X", "Y", "higher return", "lower cost"], rows, 2)
 
 
 def notes(groups: Sequence[Group]) -> list[str]:
@@ -213,10 +210,9 @@ def as_csv(groups: Sequence[Group], both: Suite, scored: Suite, found: Mapping, 
     writer = csv.writer(out, lineterminator="\n")
     by = list(groups[0].by)
     writer.writerow(["task", *by, "seeds", "metric", "statistic", "value", "low", "high"])
-    kinds = (("mean", stats.mean), ("IQM", stats.iqm))
     for g in groups:
         for metric in dict.fromkeys(m for run in g.runs for m in run.values):
-            for kind, statistic in kinds:
+            for kind, statistic in STATISTICS.items():
                 e = g.estimate(metric, statistic)
                 writer.writerow([g.env, *g.by.values(), len(g.costs), metric, kind, *e])
 
