@@ -1,7 +1,8 @@
 """What evaluation says of a run: estimates over its seeds, in a table and in evaluation.json."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -105,20 +106,17 @@ def summary(
     if rate is not None:
         rows["cost rate (training)"] = stats.of_measure("cost rate", rate)
     if env_name in scores.CHARACTERISTIC:
-
-        def scaled(score: Callable, of: Estimate, *args: float) -> Estimate:
-            return Estimate(*(float(score(env_name, x, *args)) for x in of))
-
-        rows["normalised return"] = scaled(scores.normalized_return, rows["return"])
+        rows["normalised return"] = rows["return"].map(partial(scores.normalized_return, env_name))
         if cost_limit is not None:
-            violation = scaled(scores.normalized_violation, rows["cost"], cost_limit)
+            violation = rows["cost"].map(lambda x: scores.normalized_violation(env_name, x, cost_limit))
             if len(found["cost"]) > 1:  # not linear: seeds within the limit do not excuse the others
                 of_seeds = scores.normalized_violation(env_name, found["cost"].mean(1), cost_limit)
                 violation = stats.of_measure("normalised violation", of_seeds)
             rows["normalised violation"] = violation
         if rate is not None:
-            of_raw = Estimate(*(x / repeat for x in rows["cost rate (training)"]))
-            rows["normalised cost rate"] = scaled(scores.normalized_cost_rate, of_raw)
+            rows["normalised cost rate"] = rows["cost rate (training)"].map(
+                lambda x: scores.normalized_cost_rate(env_name, x / repeat)
+            )
     return rows
 
 
@@ -128,10 +126,9 @@ def dsrl_scores(
     """DSRL's normalised scores. Its return needs the task's reference, its cost only the limit."""
     found = {}
     if env_name in scores.DSRL:
-        ret = Estimate(*(float(scores.dsrl_return(env_name, x)) for x in rows["return"]))
-        found["DSRL return"] = ret
+        found["DSRL return"] = rows["return"].map(partial(scores.dsrl_return, env_name))
     if cost_limit is not None:
-        found["DSRL cost"] = Estimate(*(float(scores.dsrl_cost(x, cost_limit)) for x in rows["cost"]))
+        found["DSRL cost"] = rows["cost"].map(lambda x: scores.dsrl_cost(x, cost_limit))
     return found
 
 

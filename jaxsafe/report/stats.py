@@ -42,6 +42,10 @@ class Estimate(NamedTuple):
     low: float
     high: float
 
+    def map(self, rising: Callable[[float], float]) -> "Estimate":
+        """That of a rising function of the number, as a float each."""
+        return Estimate(*(float(rising(x)) for x in self))
+
 
 def has_interval(*samples: np.ndarray) -> bool:
     """Whether each sample [S, ...] has seeds enough for an interval, in tables and figures alike."""
