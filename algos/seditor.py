@@ -21,7 +21,7 @@ from jaxsafe.config import (
     config,
 )
 from jaxsafe.learn.acting import Learned
-from jaxsafe.learn.batch import device_count, pmean
+from jaxsafe.learn.batch import aligned, device_count, pmean
 from jaxsafe.learn.bill import PriceClockConfig
 from jaxsafe.learn.constraints import constrained_costs, each, limit, metrics_by_constraint, signal
 from jaxsafe.learn.critics import Values, init_cost_critics, values_of_each, with_reduced_cost
@@ -362,7 +362,7 @@ def with_entropy(paid: Values, found: Edited, rows: Record, scene: Scene) -> Val
     """`paid`, where alpha_1 H(pi) counts as reward and against cost, unless the episode has failed."""
     params, _, _, cfg = scene
     bonus = jnp.where(rows.terminated, 0.0, -jnp.exp(params["log_alpha"]) * found.log_prob)
-    over_costs = bonus.reshape(*bonus.shape, *(1,) * (paid.cost.ndim - bonus.ndim))
+    over_costs = aligned(bonus, paid.cost)
     return Values(paid.reward + cfg.discount * bonus, paid.cost - cfg.cost_discount * over_costs)
 
 

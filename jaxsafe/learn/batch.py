@@ -53,11 +53,14 @@ def select(condition: jax.Array, new: PyTree, old: PyTree) -> PyTree:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
 
 
+def aligned(x: jax.Array, like: jax.Array) -> jax.Array:
+    """`x` with axes of 1 at its end, as many as `like` has more: entry i of `x` goes with row i."""
+    return x.reshape(*x.shape, *(1,) * (like.ndim - x.ndim))
+
+
 def select_rows(mask: jax.Array, new: PyTree, old: PyTree) -> PyTree:
     """`new` where `mask` [N] holds, else `old` [N, ...]; leaves of `new` may broadcast."""
-    return jax.tree.map(
-        lambda a, b: jnp.where(mask.reshape(mask.shape + (1,) * (b.ndim - 1)), a, b), new, old
-    )
+    return jax.tree.map(lambda a, b: jnp.where(aligned(mask, b), a, b), new, old)
 
 
 def all_finite(tree: PyTree) -> jax.Array:

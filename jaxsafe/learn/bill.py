@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxsafe.config import Bounds, config
-from jaxsafe.learn.batch import all_finite, psum, select
+from jaxsafe.learn.batch import aligned, all_finite, psum, select
 from jaxsafe.learn.constraints import Names, limit
 from jaxsafe.learn.treatments import Treatment
 from jaxsafe.types import Count, PyTree
@@ -46,10 +46,8 @@ def empty_bill(cfg: Any, names: Names) -> Bill:
 
 def charge(bill: Bill, cost: jax.Array, real: jax.Array, axis_name: str | None) -> Bill:
     """`bill` with `cost`, float [T, N] or [T, N, K], of the steps that are `real`, bool [T, N]."""
-    mask = real.reshape(*real.shape, *(1,) * (cost.ndim - 2))
-    more, steps, age = psum(
-        (jnp.where(mask, cost, 0.0).sum((0, 1)), real.sum(), jnp.int32(real.size)), axis_name
-    )
+    charged = jnp.where(aligned(real, cost), cost, 0.0).sum((0, 1))
+    more, steps, age = psum((charged, real.sum(), jnp.int32(real.size)), axis_name)
     return Bill(bill.cost + more, bill.steps + steps, bill.age + age)
 
 

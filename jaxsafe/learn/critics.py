@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxsafe.learn.batch import select_rows
 from jaxsafe.learn.constraints import Names, each
 from jaxsafe.learn.replay import Transitions
 from jaxsafe.learn.treatments import Treatment, no_treatment
@@ -92,8 +93,7 @@ def with_reduced_cost(
 
 def while_it_lasts(batch: Transitions, values: jax.Array) -> jax.Array:
     """`values` [B, ...] of the next states, which are 0 where an episode terminated."""
-    ended = batch.terminated.reshape(-1, *(1,) * (values.ndim - 1))
-    return jnp.where(ended, 0.0, values)
+    return select_rows(batch.terminated, 0.0, values)
 
 
 def targets_of(batch: Transitions, charged: jax.Array, after: Values, names: Names, cfg: Any) -> Values:

@@ -22,7 +22,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
-from jaxsafe.learn.batch import pmean, psum, select_rows
+from jaxsafe.learn.batch import aligned, pmean, psum, select_rows
 from jaxsafe.types import Count, PyTree
 
 
@@ -98,7 +98,7 @@ class Transitions(NamedTuple):
 
     def mean(self, x: jax.Array) -> jax.Array:
         """The mean of `x` [B, ...] over the transitions: this device's share of it."""
-        return (self.weight.reshape(-1, *(1,) * (x.ndim - 1)) * x).sum(0)
+        return (aligned(self.weight, x) * x).sum(0)
 
 
 def ring_rows(transitions: int, num_envs: int, block: int) -> int:
@@ -186,10 +186,8 @@ def transitions(
 
     def total(x: jax.Array, discount: jax.Array | float) -> jax.Array:
         """Over the steps that happened, of x [n + 1, B, ...]."""
-        like_x = (-1, *(1,) * (x.ndim - 1))
-        factors = (jnp.asarray(discount) ** jnp.arange(n_step)).reshape(like_x)
-        counts = happened.reshape(*happened.shape, *(1,) * (x.ndim - 2))
-        return jnp.where(counts, factors * x[1:], 0).sum(0)
+        factors = aligned(jnp.asarray(discount) ** jnp.arange(n_step), x)
+        return jnp.where(aligned(happened, x), factors * x[1:], 0).sum(0)
 
     return Transitions(
         obs=take(ring.obs, span, index),
