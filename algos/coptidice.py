@@ -22,7 +22,7 @@ from jaxsafe.learn.offline import (
 from jaxsafe.learn.replay import Transitions
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.steps import Trainable, descend_each, skipping_adam
-from jaxsafe.learn.treatments import lagrangian
+from jaxsafe.learn.treatments import lagrangian, price_of
 from jaxsafe.nn.bounded import bounded_action, bounded_policy, init_bounded
 from jaxsafe.nn.gaussian import log_prob
 from jaxsafe.nn.networks import coarse_mlp
@@ -146,7 +146,7 @@ def learner(env: Env) -> Learner:
     ) -> tuple[Trainable, Metrics]:
         params, several = nets.params, names(cfg)
         cost = constrained(batch, several)
-        price = jnp.dot(cost, at.dual.lam, precision=jax.lax.Precision.HIGHEST)
+        price = price_of(cost, at.dual)
 
         def paired(x: jax.Array) -> jax.Array:
             """What goes with values [B]: `x` [B], or [B, 1] where it goes with all of them."""

@@ -32,7 +32,7 @@ from jaxsafe.learn.offline import (
 from jaxsafe.learn.replay import Transitions
 from jaxsafe.learn.row import Row
 from jaxsafe.learn.steps import Trainable, descend_each, follow, skipping_adam
-from jaxsafe.learn.treatments import Treatment, lagrangian, no_treatment
+from jaxsafe.learn.treatments import Treatment, lagrangian, no_treatment, price_of
 from jaxsafe.nn.bounded import bounded_action, bounded_policy, init_bounded
 from jaxsafe.nn.gaussian import log_prob
 from jaxsafe.types import Algorithm, Env, Metrics, PyTree
@@ -202,7 +202,7 @@ def idle(cfg: Any) -> bool:
 
 def minus_price(dual: Any, adv_r: jax.Array, adv_c: jax.Array) -> jax.Array:
     """A = A_r - sum_i lam_i A_ci: the temperature sets the scale of A, so that nothing divides it."""
-    return adv_r - jnp.dot(adv_c, dual.lam, precision=jax.lax.Precision.HIGHEST)
+    return adv_r - price_of(adv_c, dual)
 
 
 unscaled = lagrangian._replace(advantage=minus_price)

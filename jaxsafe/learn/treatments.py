@@ -78,10 +78,14 @@ def ascended(dual: Multiplier, episode_cost: jax.Array, cfg: Any, eps: float | j
     return Multiplier(jnp.clip(lam, 0.0, cfg.lam_max), opt_state)
 
 
+def price_of(costs: jax.Array, dual: Any) -> jax.Array:
+    """sum_i lam_i C_i over the constraints, float [B]; `costs` are [B], or [B, K] of several."""
+    return jnp.dot(costs, dual.lam, precision=jax.lax.Precision.HIGHEST)  # of one, their product
+
+
 def mixed(dual: Any, adv_r: jax.Array, adv_c: jax.Array) -> jax.Array:
-    """A = (A_r - sum_i lam_i A_ci) / (1 + sum_i lam_i), over the constraints; A_c is [B] or [B, K]."""
-    price = jnp.dot(adv_c, dual.lam, precision=jax.lax.Precision.HIGHEST)  # of one, their product
-    return (adv_r - price) / (1.0 + dual.lam.sum())
+    """A = (A_r - sum_i lam_i A_ci) / (1 + sum_i lam_i), over the constraints."""
+    return (adv_r - price_of(adv_c, dual)) / (1.0 + dual.lam.sum())
 
 
 # Ray, Achiam and Amodei (2019), and the scale from their code
