@@ -83,7 +83,7 @@ def check_memory(env: Env, settings: Settings) -> None:
     seen = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(observation_like(env)))
     step = 2 * seen + 4 * (env.action_size + 8 + len(env.cost_names))  # bytes
     steps = settings.row.make(env, None).clocks(settings.algo).steps
-    members = len(settings.configs) * settings.train.num_seeds
+    members = settings.num_members
     need = step * steps * members // settings.train.devices
     if not fits(need):
         what = f"{steps:,} environment steps an update x {members} seeds"

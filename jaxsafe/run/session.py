@@ -136,7 +136,7 @@ def check_same_run(settings: Settings, folder: Path) -> None:
     """Raise ConfigError if the run in `folder` has other settings than these."""
     saved = flat(settings_of_run(run_folder.read_config(folder), settings.extras).plain())
     free = {*NOT_COMPARED}
-    if len(settings.configs) * settings.train.num_seeds > 1:
+    if settings.num_members > 1:
         free.add("devices")  # each member is whole on one of them
     path, known = settings.train.dataset, run_folder.dataset_of(folder)
     if path is not None and known:
