@@ -234,7 +234,8 @@ def test_every_float_of_every_algorithm_may_differ_between_members(name):
     }
     # a horizon that every `learn_every` divides
     cfg = kind(**small) if offline else kind(num_envs=256, horizon=80, **small)
-    other = replace(cfg, **{field: 0.25 for field in fields_of(kind, float)})
+    values = dict.fromkeys(fields_of(kind, float), 0.25) | {"total_iterations": 2.5, "budget_ramp": 2.5}
+    other = replace(cfg, **{k: x for k, x in values.items() if hasattr(kind, k)})
     data = data_set_like(Corridor()) if offline else ()
     train = TrainConfig(num_seeds=2, total_updates=1) if offline else TrainConfig(num_seeds=2)
     program = build(Corridor(), algos.ALGOS[name].make, (cfg, other), train, data)
