@@ -23,7 +23,6 @@ study.yaml has these keys; the first four are needed:
 import functools
 import io
 import re
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -392,16 +391,17 @@ def pictures_of(
     images, name = study.folder.parent / "images", study.folder.name
     looks = styles(groups)
     found = []
-    crowd = max(Counter(g.env for g in groups).values(), default=0)
-    if len(looks) > 1 and crowd <= MOST:
-        theirs = {(g.env, g.name): beside(g, known) for g in groups}
-        draw = functools.partial(trade_off.draw, groups, LATE, theirs, looks)
-        caption = f"Return against cost of {LATE}, a point a setting"
+    shown = first_of_each_task(groups, MOST)
+    if len(looks) > 1:
+        theirs = {(g.env, g.name): beside(g, known) for g in shown}
+        some = f" of the first {MOST} settings of a task" if len(shown) < len(groups) else ""
+        draw = functools.partial(trade_off.draw, shown, LATE, theirs, looks)
+        caption = f"Return against cost of {LATE}{some}, a point a setting"
         if any(theirs.values()):  # these are of evaluated policies, and so are ours then
-            draw = functools.partial(trade_off.draw, final(groups), "evaluated policies", theirs, looks)
+            draw = functools.partial(trade_off.draw, final(shown), "evaluated policies", theirs, looks)
             caption = (
-                "Return against cost of evaluated policies, a point a setting; hollow diamonds are "
-                "published means"
+                f"Return against cost of evaluated policies{some}, a point a setting; hollow diamonds "
+                "are published means"
             )
         found.append(Picture(images / f"{name}-trade_off.png", caption, draw))
     read = read_ends(study.ends) if study.ends else {}
@@ -417,6 +417,12 @@ def pictures_of(
         caption = f"Return, cost and cost rate over training{where}: {told}"
         found.append(Picture(images / f"{name}-curves{i}.png", caption, draw))
     return found
+
+
+def first_of_each_task(groups: Sequence[Group], most: int) -> list[Group]:
+    """The first `most` groups of each task: a study names the most important runs first."""
+    first = [[g for g in groups if g.env == env][:most] for env in tasks_of(groups)]
+    return [g for found in first for g in found]
 
 
 def chunks(groups: Sequence[Group]) -> list[list[Group]]:

@@ -508,6 +508,17 @@ def test_a_page_replaces_the_pictures_of_its_study_and_no_others(toy, tmp_path):
     assert kept == {"toy-curves1.png", "toy-two-curves1.png", "toy-mine.png"}
 
 
+def test_of_a_crowd_the_first_settings_of_each_task_have_points(toy, tmp_path, monkeypatch):
+    monkeypatch.setattr(studies, "MOST", 1)
+    for i, run in enumerate(toy.runs):
+        trained(tmp_path / str(i), toy.command(run))
+        (one,) = read_one(tmp_path / str(i))
+        studies.add(toy, run, one, study_files.Origin())
+    studies.write_page(toy)
+    page = (toy.folder / "README.md").read_text()
+    assert "![Return against cost of last 10% of training of the first 1 settings of a task" in page
+
+
 @pytest.mark.parametrize("where, name", [("toy", "."), ("toy/images", ".."), (".", "./toy")])
 def test_a_study_has_its_name_whichever_way_its_folder_is_given(
     where, name, toy, tmp_path, monkeypatch
