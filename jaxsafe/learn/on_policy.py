@@ -426,6 +426,7 @@ def on_policy_loop(env: Env, method: Method, axis_name: str | None) -> Algorithm
         metrics |= step_metrics(env, traj, rate, length, axis_name)
         dist = action_dist(improved.actor, batch.obs, cfg)
         metrics["train/entropy"] = batch_mean(entropy(dist), axis_name)
+        metrics["train/std"] = batch_mean(jnp.exp(dist.log_std).mean(-1), axis_name)
         return after, jax.tree.map(jnp.float32, metrics)
 
     def clocks(cfg: Any) -> Clocks:

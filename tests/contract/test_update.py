@@ -136,6 +136,8 @@ def test_a_deviation_that_sank_acts_at_its_floor_and_can_rise_and_fall_from_ther
     after, metrics = compiled(name).together(ts)
     assert metrics["train/nonfinite"].tolist() == [0, 0, 0]
     assert (metrics["train/entropy"] > 2 * (np.log(0.3) + 1.41894)).all()
+    acts_by = 0.3 + np.exp(after.params["actor"]["log_std"]).mean(-1)
+    np.testing.assert_allclose(metrics["train/std"], acts_by, rtol=1e-5)
     learned = after.params["actor"]["log_std"]
     assert (learned[0] < sunk["log_std"][0]).all() and (learned[2] > sunk["log_std"][2]).all()
     algo, one = compiled(name).algo, member(ts, 0)
