@@ -387,7 +387,8 @@ def said(g: Group, told: set[str], odd: set[str]) -> dict[str, Any]:
 def pictures_of(
     study: Study, groups: Sequence[Group], known: Mapping[tuple[str, str], Published]
 ) -> list[Picture]:
-    """Return against cost, and curves of at most `HIGH` tasks and `CHUNK` settings a figure."""
+    """Return against cost of at most `MOST` settings of a task, and curves of at most `HIGH` tasks and
+    `CHUNK` settings a figure."""
     images, name = study.folder.parent / "images", study.folder.name
     looks = styles(groups)
     found = []
