@@ -76,6 +76,7 @@ class LOOPConfig(ModelBasedConfig, sac.SACConfig):
     # paper.
     target_entropy: Annotated[float, Bounds(-100, 100)] = -1.0
     replay_ratio: Amount = 64  # Transitions replayed for each environment step. OmniSafe has 256.
+    model_lr: Rate = 2e-3  # Adam's step of the model. OmniSafe has 1e-3.
     # Transitions of a step of each model, of all devices together, drawn with replacement. OmniSafe has
     # 256.
     model_batch: Amount = 1024
@@ -162,7 +163,7 @@ NAVIGATION: dict[str, Any] = pets.NAVIGATION | NETS | {
     "critic_lr": 1e-3, "temperature": 10 * 1000 / 7, "max_grad_norm": math.inf,
 }  # fmt: skip
 PLANS: dict[str, Any] = {  # of velocity tasks, and the delay of the actor
-    "plan_steps": 3, "plan_var": 0.1, "policy_delay": 2, "temperature": 1000 / 3,
+    "plan_steps": 3, "plan_var": 0.1, "policy_delay": 2, "temperature": 1000 / 3, "model_lr": 1e-3,
 }  # fmt: skip
 VELOCITY: dict[str, Any] = pets.VELOCITY | NETS | PLANS | {"alpha_init": 0.2}
 SAFE: dict[str, Any] = {"cost_limit": 1.0}

@@ -6,7 +6,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import jax
 import jax.numpy as jnp
 
-from jaxsafe.config import Amount, Bounds, Iterations, Weight, config
+from jaxsafe.config import Amount, Bounds, Iterations, Rate, Weight, config
 from jaxsafe.learn.bill import PriceClockConfig
 from jaxsafe.learn.conventions import Convention
 from jaxsafe.learn.model_based import ModelBasedConfig, model_based
@@ -60,6 +60,7 @@ class PETSConfig(ModelBasedConfig, ReplayConfig):
     learning_starts: Annotated[int, Bounds(0, 2**31 - 1)] = 2_000
     # The best plans, which make the next mean and variance. As in OmniSafe.
     elites: Amount = 64
+    model_lr: Rate = 2e-3  # Adam's step of the model. The paper and OmniSafe have 1e-3.
     # Transitions of a step of each model, of all devices together, drawn with replacement. OmniSafe has
     # 256.
     model_batch: Amount = 1024
@@ -175,10 +176,10 @@ def make_cautious(env: Env, axis_name: str | None = None) -> Algorithm:
 # env.observation=coordinates, where 5 raw steps are one step here. An update of 40 steps is ours.
 ALONE: dict[str, Any] = {
     "num_envs": 1, "horizon": 40, "stagger": False, "model_batch": 256, "max_epochs": 1000,
-    "epoch_steps": 0, "foresee_end": False,
+    "epoch_steps": 0, "model_lr": 1e-3, "foresee_end": False,
 }  # fmt: skip
 NAVIGATION: dict[str, Any] = ALONE | {"refit_every": 240, "learn_cost": False}
-PLANS: dict[str, Any] = {"plan_steps": 16, "plan_var": 0.1}  # of velocity tasks
+PLANS: dict[str, Any] = {"plan_steps": 16, "plan_var": 0.1, "model_lr": 1e-3}  # of velocity tasks
 VELOCITY: dict[str, Any] = ALONE | PLANS | {
     "refit_every": 1200, "learning_starts": 10_000, "replay_size": 1_000_000,
 }  # fmt: skip

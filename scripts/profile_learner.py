@@ -1,10 +1,12 @@
 """Time updates without physics: python scripts/profile_learner.py ppo_lag [key=value ...] --seeds 5
+python scripts/profile_learner.py dreamer_lag preset=pixels --vision 64 64
 
 The environment has the sizes of point_goal1 and costs nothing to step, so that what is left of an
-update is the learner: acting, estimates, the policy's step and the critics'. An offline algorithm has
-100,000 transitions of random numbers. Options are preset=, compat= and algo.OPTION= of train. Prints
-the median, the floating-point operations of matrix products, and with --kernels what an update consists
-of. On a GPU that is compiled without CUDA graphs, which hide what their kernels come from.
+update is the learner: acting, estimates, the policy's step and the critics'. With --vision it shows
+noise beside its numbers. An offline algorithm has 100,000 transitions of random numbers. Options are
+preset=, compat= and algo.OPTION= of train. Prints the median, the floating-point operations of matrix
+products, and with --kernels what an update consists of. On a GPU that is compiled without CUDA graphs,
+which hide what their kernels come from.
 """
 
 import argparse
@@ -36,8 +38,12 @@ with leaving_at_ctrl_c():
 
 @dataclass(frozen=True)
 class Weightless:
-    """60 numbers that rotate; observation, reward and cost are read off them."""
+    """60 numbers that rotate; observation, reward and cost are read off them.
 
+    vision: width and height of a picture, if one is observed, too.
+    """
+
+    vision: tuple[int, int] | None = None
     obs_size: int = 60
     action_size: int = 2
     episode_length: int = 1000
@@ -50,7 +56,14 @@ class Weightless:
         return self._state(0.99 * jnp.roll(state.physics, 1) + 0.01 * action.sum())
 
     def _state(self, x: jax.Array) -> State:
-        return State(x, x, x[0], jnp.abs(x[1]), jnp.abs(x[1:2]), jnp.bool_(False), {})
+        return State(x, self._observed(x), x[0], jnp.abs(x[1]), jnp.abs(x[1:2]), jnp.bool_(False), {})
+
+    def _observed(self, x: jax.Array) -> Any:
+        if self.vision is None:
+            return x
+        width, height = self.vision
+        noise = jnp.resize(100 * x, (height, width, 3)).astype(jnp.uint8)
+        return {"vector": x, "vision": noise}
 
 
 def transitions(env: Weightless, count: int = 100_000) -> DataSet:
@@ -140,6 +153,7 @@ def command() -> int:
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--num-envs", type=int, help="of each seed")
     parser.add_argument("--horizon", type=int)
+    parser.add_argument("--vision", type=int, nargs=2, metavar=("WIDTH", "HEIGHT"))
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--kernels", type=int, default=0, help="list so many of the slowest kernels")
     args = parser.parse_intermixed_args()
@@ -152,7 +166,8 @@ def command() -> int:
         raise ConfigError(f"{args.algo} has no environments: leave out --num-envs and --horizon")
     cfg = config_of(args.algo, args.options, num_envs=args.num_envs, horizon=args.horizon)
     data = transitions(Weightless()) if offline else ()
-    state, update = training(Weightless(), args.algo, cfg, args.seeds, devices=1, data=data)
+    env = Weightless(vision=tuple(args.vision) if args.vision else None)
+    state, update = training(env, args.algo, cfg, args.seeds, devices=1, data=data)
     size = f"{cfg.updates} gradient steps" if offline else f"{cfg.num_envs} x {cfg.horizon}"
     warm_up = 0 if offline else -(-getattr(cfg, "learning_starts", 0) // (cfg.num_envs * cfg.horizon))
     products = products_of(jax.make_jaxpr(update)(state, np.int32(0)).jaxpr) / 1e12

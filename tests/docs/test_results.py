@@ -97,9 +97,9 @@ def test_the_cells_beside_omnisafes_are_of_data_made_at_these_commits(env, cells
 
 
 def test_a_planner_within_a_limit_earns_and_costs_next_to_nothing_and_a_blind_one_costs_much():
-    rows = rows_of("planning")
+    rows, sizes = rows_of("planning"), "algo.model_lr=1e-3 num_seeds=5 total_steps=1e6"
     planned, blind = (
-        {"env": "point_goal1", "run": f"env=point_goal1 algo={algo} num_seeds=5 total_steps=1e6"}
+        {"env": "point_goal1", "run": f"env=point_goal1 algo={algo} {sizes}"}
         for algo in ("cce_pets", "pets")
     )
     assert mean(rows, "final return", **planned) >= 24 and mean(rows, "final cost", **planned) <= 3
