@@ -20,7 +20,7 @@ from jaxsafe.learn.sequences import SequenceBatch
 from jaxsafe.learn.timetable import RoundConfig
 from jaxsafe.nn.coders import Decoder, Encoder, VectorDecoder, VectorEncoder, check_picture
 from jaxsafe.nn.gaussian import Gaussian, entropy, log_prob, sample
-from jaxsafe.nn.recurrent import states_along
+from jaxsafe.nn.recurrent import scanned, states_along
 from jaxsafe.nn.rssm import SIZES, Head, Latent, Size, WorldModel, kl
 from jaxsafe.nn.two_hot import BINS, two_hot_loss, two_hot_mean
 from jaxsafe.types import Env, Metrics, PyTree
@@ -31,6 +31,7 @@ SizeName = Literal[
 ]  # fmt: skip
 CHANCE = 1  # outputs of a head that gives a probability; one that gives a number has BINS
 STD = (0.1, 1.0)  # range of the actor's standard deviation, as in the authors' code
+SMALL = 2**16  # elements of an array whose length is summed beside that of others
 
 
 @config
@@ -162,14 +163,27 @@ def clip_by_share(share: jax.Array | float) -> optax.GradientTransformation:
     least."""
 
     def clip(grads: PyTree, params: PyTree) -> PyTree:
-        def one(grad: jax.Array, param: jax.Array) -> jax.Array:
-            length = jnp.sqrt(jnp.sum(grad**2))
-            longest = share * jnp.maximum(1e-3, jnp.sqrt(jnp.sum(param**2)))
+        def one(grad: jax.Array, length: jax.Array, size: jax.Array) -> jax.Array:
+            longest = share * jnp.maximum(1e-3, size)
             return grad * jnp.minimum(1.0, longest / jnp.maximum(length, 1e-30))
 
-        return jax.tree.map(one, grads, params)
+        return jax.tree.map(one, grads, lengths(grads), lengths(params))
 
     return optax.stateless(clip)
+
+
+def lengths(arrays: PyTree) -> PyTree:
+    """The Euclidean length of each array. Small ones of one size are added up side by side: on a GPU a
+    sum of its own for each takes longer than all else that is done with it."""
+    leaves, tree = jax.tree.flatten(arrays)
+    alike: dict[int, list[int]] = {}
+    for i, x in enumerate(leaves):
+        alike.setdefault(x.size if x.size <= SMALL else -i, []).append(i)
+    found: dict[int, jax.Array] = {}
+    for group in alike.values():
+        rows = jnp.stack([leaves[i].ravel() for i in group])
+        found |= zip(group, jnp.sqrt(jnp.sum(rows**2, axis=1)), strict=True)
+    return tree.unflatten([found[i] for i in range(len(leaves))])
 
 
 # ---- the model's loss --------------------------------------------------------------------------
@@ -342,19 +356,28 @@ def dream(
         alive: float [S], 1 where the episode goes on at the start.
     """
     fixed = jax.lax.stop_gradient
-    params = fixed(params)
-    player = actor_params if cfg.actor_grad == "backprop" else fixed(actor_params)
+    params, start = fixed(params), fixed(start)
 
-    def step(latent: Latent, key: jax.Array) -> tuple[Latent, tuple[jax.Array, jax.Array]]:
-        act_key, model_key = jax.random.split(key)
-        action = sample(actor(player, fixed(latent.features)), act_key)
+    def act(player: PyTree, latent: Latent, key: jax.Array) -> jax.Array:
+        return sample(actor(player, fixed(latent.features)), key)
+
+    def step(
+        both: tuple[PyTree, PyTree], state: tuple[Latent, jax.Array], _: tuple[()], key: jax.Array
+    ) -> tuple[Latent, jax.Array]:
+        """(latent, the action that led to it) -> the same, a step on."""
+        (player, params), latent, (act_key, model_key) = both, state[0], jax.random.split(key)
+        action = act(player, latent, act_key)
         after: Any = world.apply(params, latent, action, model_key, method="imagine")
-        return after, (latent.features, action)
+        return after, action
 
+    begin = start, jnp.zeros_like(act(actor_params, start, key))
     keys = jax.random.split(key, cfg.imagine_steps)
-    last, (features, action) = jax.lax.scan(step, fixed(start), keys)
-    dist = actor(actor_params, fixed(features))
-    features = jnp.concatenate([features, last.features[None]])
+    if cfg.actor_grad == "backprop":
+        later, action = states_along(step, (actor_params, params), begin, (), keys)
+    else:
+        later, action = scanned(step, (fixed(actor_params), params), begin, (), keys)
+    features = jnp.concatenate([start.features[None], later.features])
+    dist = actor(actor_params, fixed(features[:-1]))
     says = read(world, params, features)
     says["cont"] = says["cont"].at[0].set(alive)
     return Dreams(

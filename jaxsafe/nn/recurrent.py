@@ -1,12 +1,13 @@
 """Networks with a memory: a gated recurrent unit between two feed-forward parts; and gradients along
 sequences."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from jax.extend.core import Var
 
 from jaxsafe.nn.initializers import orthogonal
 from jaxsafe.types import PyTree
@@ -109,11 +110,13 @@ def scanned(
 def gradient_at_once(
     step: Callable[..., PyTree], params: PyTree, start: PyTree, inputs: PyTree, given: PyTree
 ) -> PyTree:
-    """`scanned`, with a gradient of `params` that is taken of all steps at once.
+    """`scanned`, with a gradient that is taken of all steps at once, but for what one step hands to the
+    one before.
 
-    A scan adds it up step by step, by a product and a sum for each array of weights. For small networks
-    that is most of the kernels of a GPU. Here a step is worked out three times in place of once, which
-    takes a CPU longer.
+    A scan adds up the gradient of `params` step by step, by a product and a sum for each array of
+    weights. For small networks that is most of the kernels of a GPU. Here only the slopes of the states
+    go from step to step. What they are multiplied by is known before, as all states are. A step is
+    worked out twice in place of once, which takes a CPU longer.
     """
 
     @jax.custom_vjp
@@ -128,20 +131,70 @@ def gradient_at_once(
         params, start, states, inputs, given = kept
         before = jax.tree.map(lambda x, xs: jnp.concatenate([x[None], xs[:-1]]), start, states)
 
-        def backward(later: PyTree, x: tuple[PyTree, ...]) -> tuple[PyTree, tuple[PyTree, PyTree]]:
-            state, input, given, slope = x
+        def pull(x: tuple[PyTree, PyTree, PyTree]) -> PyTree:
+            """(slope of the state after a step) -> (of the state before, of the input)."""
+            state, input, given = x
+            return jax.vjp(lambda state, input: step(params, state, input, given), state, input)[1]
+
+        pull_of, rows = at_once(pull, (before, inputs, given))
+
+        def backward(later: PyTree, x: tuple[PyTree, PyTree]) -> tuple[PyTree, tuple[PyTree, PyTree]]:
+            row, slope = x
             total = jax.tree.map(jnp.add, later, slope)
-            pull = jax.vjp(lambda state, input: step(params, state, input, given), state, input)[1]
-            earlier, of_input = pull(total)
+            earlier, of_input = pull_of(row)(total)
             return earlier, (total, of_input)
 
         nothing = jax.tree.map(jnp.zeros_like, start)
-        of_start, (totals, of_inputs) = jax.lax.scan(
-            backward, nothing, (before, inputs, given, slopes), reverse=True
-        )
+        of_start, (totals, of_inputs) = jax.lax.scan(backward, nothing, (rows, slopes), reverse=True)
         every = jax.vmap(step, in_axes=(None, 0, 0, 0))
         [of_params] = jax.vjp(lambda params: every(params, before, inputs, given), params)[1](totals)
         return of_params, of_start, of_inputs, None
 
     run.defvjp(keep, gradient)
     return run(params, start, inputs, given)
+
+
+def at_once(
+    fn: Callable[[PyTree], PyTree], xs: PyTree
+) -> tuple[Callable[[list[jax.Array]], PyTree], list[jax.Array]]:
+    """`fn` of all rows of `xs` [T, ...], worked out together.
+
+    Returns:
+        get: row t of `rows` -> `fn` of row t of `xs`.
+        rows: [T, ...], what depends on `xs`. The rest, as what is made of weights alone, `get` knows.
+    """
+    tree: Any = None
+
+    def leaves_of(x: PyTree) -> list[jax.Array]:
+        nonlocal tree
+        leaves, tree = jax.tree.flatten(fn(x))
+        return leaves
+
+    first = jax.tree.map(lambda x: x[0], xs)
+    depends = dependence(leaves_of, first)
+
+    def those(leaves: list[jax.Array], depend: bool) -> list[jax.Array]:
+        return [x for x, on_row in zip(leaves, depends, strict=True) if on_row == depend]
+
+    known = those(leaves_of(first), False)
+    rows = jax.vmap(lambda x: those(leaves_of(x), True))(xs)
+
+    def get(row: list[jax.Array]) -> PyTree:
+        of_row, of_none = iter(row), iter(known)
+        return jax.tree.unflatten(tree, [next(of_row if on_row else of_none) for on_row in depends])
+
+    return get, rows
+
+
+def dependence(fn: Callable[[PyTree], list[jax.Array]], x: PyTree) -> list[bool]:
+    """Which arrays of `fn(x)` depend on `x`. Others are made of what `fn` holds."""
+    program = jax.make_jaxpr(fn)(x).jaxpr
+    found = set(program.invars)
+
+    def any_of(variables: Sequence[Any]) -> bool:
+        return any(isinstance(v, Var) and v in found for v in variables)
+
+    for operation in program.eqns:
+        if any_of(operation.invars):
+            found.update(operation.outvars)
+    return [any_of([v]) for v in program.outvars]

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsafe.nn.recurrent import GRU, Recurrent, gradient_at_once, scanned
+from jaxsafe.nn.recurrent import GRU, Recurrent, at_once, gradient_at_once, scanned
 
 STEPS, ROWS, SIZE, WIDTH = 7, 3, 4, 2
 
@@ -48,6 +48,16 @@ def test_the_gradient_of_all_steps_at_once_is_that_of_a_scan(of):
     chex.assert_trees_all_close(value, expected, rtol=1e-6)
     chex.assert_trees_all_close(slope, slope_of_scan, rtol=1e-4, atol=1e-4)
     assert all(jnp.abs(x).max() > 0.1 for x in jax.tree.leaves(slope))
+
+
+def test_what_depends_on_no_row_is_worked_out_once():
+    weights, xs = jnp.array([2.0, 3.0]), jnp.arange(1.0, 5.0)
+    get, rows = at_once(lambda x: {"of weights": weights**2, "of both": weights * x, "of x": x + 1}, xs)
+    assert sorted(x.shape for x in rows) == [(4,), (4, 2)]
+    for t, x in enumerate(xs):
+        found = get(jax.tree.map(lambda rows, t=t: rows[t], rows))
+        expected = {"of weights": weights**2, "of both": weights * x, "of x": x + 1}
+        chex.assert_trees_all_close(found, expected)
 
 
 def test_a_unit_and_what_is_around_it_by_hand():

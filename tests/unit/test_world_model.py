@@ -26,7 +26,7 @@ from jaxsafe.learn.replay import Record, Source, Span
 from jaxsafe.learn.rollout import init_rollout
 from jaxsafe.learn.sequences import SequenceBatch, drawn_sequences
 from jaxsafe.learn.world_model import Dreams
-from jaxsafe.nn import coders, rssm, two_hot
+from jaxsafe.nn import coders, recurrent, rssm, two_hot
 from jaxsafe.nn.gaussian import Gaussian
 
 FLOAT32 = {jnp.dtype("float32")}
@@ -305,6 +305,30 @@ def test_a_critic_is_held_back_by_what_its_slow_copy_says(monkeypatch):
     np.testing.assert_allclose(found, expected, rtol=1e-5)
 
 
+def test_a_gradient_step_is_the_same_with_the_gradients_of_sequences_and_dreams_at_once(monkeypatch):
+    """As GPUs take them. The model learns along rows and in dreams, the actor through its dreams."""
+    cfg = dreamer.DreamerConfig(size="tiny", actor_grad="backprop", imagine_steps=3, overshoot=2)
+    rows, env = recorded(Ticker(episode_length=5, lives=(3, 9)), 8), Ticker()
+    monkeypatch.setattr(dreaming, "laprop", lambda lr, cfg: optax.sgd(1.0))
+    learner = dreaming_learner(env, dreamer.blind)
+    at = GradientStep(jnp.int32(0), jnp.float32(1), jax.random.key(1))
+    batch = SequenceBatch(rows, jnp.full(3, 1 / 3))
+    nets = jax.jit(lambda key: learner.init(key, 3, 1, cfg), compiler_options=FAST)(jax.random.key(0))
+    params = jax.tree.map(lambda x: x + 0.1 * jnp.sin(jnp.arange(x.size)).reshape(x.shape), nets.params)
+    nets = nets._replace(params=params)
+
+    def moved_by(run):
+        monkeypatch.setattr(world_model, "states_along", run)
+        step = jax.jit(lambda nets: learner.step(nets, batch, at, cfg, None)[0], compiler_options=FAST)
+        after = step(nets).params
+        return {x: ravel_pytree(after[x])[0] - ravel_pytree(params[x])[0] for x in ("model", "actor")}
+
+    one_by_one, at_once = moved_by(recurrent.scanned), moved_by(recurrent.gradient_at_once)
+    for name, moves in one_by_one.items():
+        assert jnp.abs(moves).max() > 1e-3
+        np.testing.assert_allclose(at_once[name], moves, rtol=1e-3, atol=1e-5)
+
+
 def test_each_network_learns_of_its_own_loss_alone(monkeypatch):
     """By backprop, where what actors and critics learn is a function of latents and of one another.
     Without the actor's loss model and critic learn the same, and without the critic's model and actor
@@ -400,6 +424,24 @@ def test_only_long_gradients_are_shortened_array_by_array():
     got, _ = clip.update(grads, clip.init(params), params)
     np.testing.assert_allclose(got["a"], grads["a"], rtol=1e-6)  # just within 0.3 * 5
     np.testing.assert_allclose(jnp.linalg.norm(got["b"]), 0.3 * 1e-3, rtol=1e-5)
+
+
+def test_the_lengths_of_arrays_of_one_size_of_others_and_of_large_ones(monkeypatch):
+    monkeypatch.setattr(world_model, "SMALL", 6)
+    shapes = {
+        "bias": (3,),
+        "scale": (3,),
+        "kernel": (2, 3),
+        "weight": (3, 2),
+        "large": (7,),
+        "more": (7,),
+    }
+    keys = jax.random.split(jax.random.key(0), len(shapes))
+    arrays = {x: jax.random.normal(k, s) for k, (x, s) in zip(keys, shapes.items(), strict=True)}
+    found = world_model.lengths(arrays)
+    assert found.keys() == arrays.keys()
+    for name, x in arrays.items():
+        np.testing.assert_allclose(found[name], np.linalg.norm(x), rtol=1e-6)
 
 
 def test_steps_rise_to_the_learning_rate_and_forget_the_size_of_gradients():
