@@ -16,6 +16,7 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from jaxsafe.config import ConfigError, flat
 from jaxsafe.envs.wrap import raw_steps
+from jaxsafe.learn.observations import observation_like
 from jaxsafe.run import checkpoint, clock, run_folder
 from jaxsafe.run.settings import TrainConfig
 from jaxsafe.types import Algorithm, Clocks, Env, PyTree, Shared
@@ -86,7 +87,7 @@ def build(
         data: the data set, for an algorithm that takes no environment steps.
     Raises:
         ConfigError: the members, or the environments of a lone one, do not split over the devices; a
-            data set that is missing, or that the algorithm has no use for.
+            data set that is missing, or that the algorithm has no use for; pictures on several GPUs.
     """
     devices, run = train_cfg.devices, members(configs, train_cfg)
     split = len(run) == 1 and devices > 1  # the environments of a lone member, over the devices
@@ -96,6 +97,7 @@ def build(
             f"devices={devices}: "
             f"expected a multiple of {devices}, or 1"
         )
+    check_pictures(env, devices)
     algo: Algorithm = make(env, AXIS if split else None)
     clocks, *_ = map(algo.clocks, configs)  # which refuse settings that do not fit each other
     clocks = clocks._replace(steps=clocks.steps * raw_steps(env))
@@ -141,6 +143,15 @@ def check_data(clocks: Clocks, data: PyTree, train_cfg: TrainConfig) -> None:
         raise ConfigError(f"dataset={train_cfg.dataset}: this algorithm learns from no data set")
     if not data and not clocks.steps:
         raise ConfigError("an offline algorithm learns from a data set: give dataset=PATH")
+
+
+def check_pictures(env: Env, devices: int) -> None:
+    """Raise ConfigError for pictures on several GPUs: to compile them ends the process (jax 0.11.2)."""
+    if devices > 1 and jax.default_backend() == "gpu" and isinstance(observation_like(env), dict):
+        raise ConfigError(
+            f"devices={devices}: jax 0.11.2 crashes as it compiles pictures for several GPUs; "
+            "expected 1, on which all seeds train side by side"
+        )
 
 
 def check_split(clocks: Clocks, cfg: Any, devices: int) -> None:

@@ -29,6 +29,7 @@ from jaxsafe.learn.replay import Record
 from jaxsafe.learn.sequences import SequenceBatch
 from jaxsafe.nn.beta import beta_policy
 from jaxsafe.nn.critics import q_values
+from jaxsafe.run import programs
 from jaxsafe.run.dataset import read_dataset, write_dataset
 from jaxsafe.types import Policy, Shared, State
 
@@ -267,3 +268,12 @@ def test_dreamer_learns_where_the_patch_is(name):
     _, metrics = jax.jit(training(algo, cfg, 100))(jax.random.key(0))
     assert metrics["train/return"][-20:].mean() > 4
     assert (metrics["train/nonfinite"] == 0).all()
+
+
+def test_pictures_on_several_gpus_are_refused_before_they_are_compiled(monkeypatch):
+    programs.check_pictures(Patch(), 2)  # on a CPU they are fine
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    programs.check_pictures(Patch(), 1)
+    programs.check_pictures(Corridor(), 2)
+    with pytest.raises(ConfigError, match=r"devices=2: jax .* pictures for several GPUs; expected 1"):
+        programs.check_pictures(Patch(), 2)
