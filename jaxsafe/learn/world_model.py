@@ -173,12 +173,12 @@ def clip_by_share(share: jax.Array | float) -> optax.GradientTransformation:
 
 
 def lengths(arrays: PyTree) -> PyTree:
-    """The Euclidean length of each array. Small ones of one size are added up side by side: on a GPU a
-    sum of its own for each takes longer than all else that is done with it."""
+    """The Euclidean length of each array, float []. Small ones of one size are summed side by side: a
+    sum is a kernel of a GPU, and a model has a hundred small arrays."""
     leaves, tree = jax.tree.flatten(arrays)
     alike: dict[int, list[int]] = {}
     for i, x in enumerate(leaves):
-        alike.setdefault(x.size if x.size <= SMALL else -i, []).append(i)
+        alike.setdefault(x.size if x.size <= SMALL else -1 - i, []).append(i)
     found: dict[int, jax.Array] = {}
     for group in alike.values():
         rows = jnp.stack([leaves[i].ravel() for i in group])

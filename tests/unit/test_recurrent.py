@@ -50,6 +50,27 @@ def test_the_gradient_of_all_steps_at_once_is_that_of_a_scan(of):
     assert all(jnp.abs(x).max() > 0.1 for x in jax.tree.leaves(slope))
 
 
+def test_the_gradients_of_several_seeds_side_by_side_are_those_of_each():
+    net, draw = Noisy(), jax.random.split(jax.random.key(0), 4)
+    start, inputs = jnp.zeros((ROWS, SIZE)), jax.random.normal(draw[0], (STEPS, ROWS, WIDTH))
+    given = jax.random.uniform(draw[1], (STEPS, ROWS)) < 0.3, jax.random.split(draw[2], STEPS)
+    one = start, inputs[0], *jax.tree.map(lambda x: x[0], given)
+    params = jax.vmap(lambda key: net.init(key, *one))(jax.random.split(draw[3], 2))
+
+    @jax.jit
+    def slope(params):
+        def step(params, h, x, given):
+            return net.apply(params, h, x, *given)
+
+        return jax.grad(lambda p: (gradient_at_once(step, p, start, inputs, given) ** 2).sum())(params)
+
+    apart = [slope(jax.tree.map(lambda x, i=i: x[i], params)) for i in range(2)]
+    beside = jax.jit(jax.vmap(slope))(params)
+    chex.assert_trees_all_close(
+        beside, jax.tree.map(lambda *x: jnp.stack(x), *apart), rtol=1e-4, atol=1e-5
+    )
+
+
 def test_what_depends_on_no_row_is_worked_out_once():
     weights, xs = jnp.array([2.0, 3.0]), jnp.arange(1.0, 5.0)
     get, rows = at_once(lambda x: {"of weights": weights**2, "of both": weights * x, "of x": x + 1}, xs)
