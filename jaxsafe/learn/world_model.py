@@ -358,19 +358,16 @@ def dream(
     fixed = jax.lax.stop_gradient
     params, start = fixed(params), fixed(start)
 
-    def act(player: PyTree, latent: Latent, key: jax.Array) -> jax.Array:
-        return sample(actor(player, fixed(latent.features)), key)
-
     def step(
         both: tuple[PyTree, PyTree], state: tuple[Latent, jax.Array], _: tuple[()], key: jax.Array
     ) -> tuple[Latent, jax.Array]:
         """(latent, the action that led to it) -> the same, a step on."""
         (player, params), latent, (act_key, model_key) = both, state[0], jax.random.split(key)
-        action = act(player, latent, act_key)
+        action = sample(actor(player, fixed(latent.features)), act_key)
         after: Any = world.apply(params, latent, action, model_key, method="imagine")
         return after, action
 
-    begin = start, jnp.zeros_like(act(actor_params, start, key))
+    begin = start, jnp.zeros_like(actor(actor_params, start.features).mean)
     keys = jax.random.split(key, cfg.imagine_steps)
     if cfg.actor_grad == "backprop":
         later, action = states_along(step, (actor_params, params), begin, (), keys)
