@@ -8,6 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from PIL import Image
 from shell import typed
 
 from jaxsafe import algos, envs
@@ -21,6 +24,7 @@ from jaxsafe.report import (
     read,
     scores,
     stats,
+    studies,
     sweep_summary,
     tables,
     trade_off,
@@ -441,6 +445,20 @@ def test_every_algorithm_has_one_colour():
     names = [name for names in looks.COLORS.values() for name in names.split()]
     assert sorted(names) == sorted(algos.ALGOS)
     assert looks.color_of("mine:priced") in looks.COLORS
+
+
+def test_a_small_picture_keeps_the_colours_of_all_settings_apart(tmp_path):
+    colors = [looks.shaded(color, count) for count in range(2) for color in looks.COLORS]
+    figure = Figure(figsize=(8, 6))
+    axes = figure.subplots()
+    for i, color in enumerate(colors):
+        axes.plot([i], [i], "o", color=color, label=f"a setting with a long name {i}")
+        axes.plot(np.random.default_rng(i).normal(i, 1, 50), color=color)
+    axes.legend(ncols=2)
+    studies.save_small(figure, tmp_path / "small.png")
+    small = np.asarray(Image.open(tmp_path / "small.png").convert("RGB")).reshape(-1, 3).astype(int)
+    for color in 255 * np.array([to_rgb(color) for color in colors]):
+        assert np.abs(small - color).max(-1).min() < 12, color
 
 
 def test_two_seeds_are_two_lines_and_three_have_a_band(tmp_path):
