@@ -38,7 +38,7 @@ from jaxsafe.learn.world_model import (
     world_of,
 )
 from jaxsafe.nn.gaussian import Gaussian, sample
-from jaxsafe.nn.rssm import Latent, WorldModel
+from jaxsafe.nn.rssm import Latent, WorldModel, converted
 from jaxsafe.nn.two_hot import BINS, two_hot_loss
 from jaxsafe.types import Env, Metrics, Policy, PyTree
 
@@ -318,6 +318,7 @@ def dreaming_learner(
         targets |= behaviour.targets(env, batch.rows, cfg)
 
         def loss(trained: dict[str, PyTree]) -> tuple[jax.Array, dict[str, Any]]:
+            trained = converted(trained, cfg.hidden_dtype)
             of_model, (latents, metrics) = model_loss(
                 world, trained["model"], batch, targets, model_key, cfg
             )

@@ -85,20 +85,21 @@ def vector_loss(decoded: jax.Array, obs: jax.Array) -> jax.Array:
 # ---- pictures ----------------------------------------------------------------------------------
 
 
-# Of one axis. A square has two pixels. READS[a, d, s] is 1 where tap d of the kernel, for pixel a of
-# the square, falls on place s of the patch. In REPEATED_READS two neighbouring pixels are one place.
+# Of one axis. A square of results has two pixels. It reads three squares of the input: of two pixels,
+# or in REPEATED_READS of one that is repeated. READS[a, d, s, p] is 1 where tap d of the kernel, for
+# pixel a of the results, falls on pixel p of square s.
 PIXEL, TAP = np.mgrid[:2, :SIDE]
-READS = ((PIXEL + TAP)[..., None] == np.arange(SIDE + 1)).astype(np.float32)
-REPEATED_READS = ((PIXEL + TAP)[..., None] // 2 == np.arange(SIDE // 2 + 1)).astype(np.float32)
+READS = ((PIXEL + TAP)[..., None] == np.arange(6)).astype(np.float32).reshape(2, SIDE, 3, 2)
+REPEATED_READS = ((PIXEL + TAP)[..., None] // 2 == np.arange(3)).astype(np.float32)[..., None]
 
 
 class Convolution(nn.Module):
     """A 5 x 5 convolution whose results lie in squares of 2 x 2 pixels, float [..., h, w, 2, 2, out].
 
     Its input is [..., 2 h, 2 w, C]. If it `grows` the input is [..., h, w, C], and each pixel is first
-    repeated as 2 x 2. One matrix product gives the four results of a square from all pixels that they
-    read: 6 x 6, or 3 x 3 if it grows. This copies fewer pixels than a patch for each result does. On a
-    CPU it is far faster than XLA's convolution: see `patches`.
+    repeated as 2 x 2. One matrix product gives the four results of a square from the 3 x 3 squares that
+    they read. This copies fewer pixels than a patch for each result does. On a CPU it is far faster
+    than XLA's convolution: see `patches`.
     """
 
     out: int
@@ -109,12 +110,21 @@ class Convolution(nn.Module):
     def __call__(self, x: jax.Array) -> jax.Array:
         kernel = self.param("kernel", fan_in(1.0), (SIDE, SIDE, x.shape[-1], self.out))
         bias = self.param("bias", nn.initializers.zeros, (self.out,))
-        reads, stride = (REPEATED_READS, 1) if self.grows else (READS, 2)
-        # row and column of the place that is read (s, t), of the tap (d, e), of the pixel (a, b)
-        matrix = jnp.einsum("ads,bet,deco->stcabo", reads, reads, kernel, precision="highest")
-        seen = patches(x.astype(self.dtype), reads.shape[-1], stride)
-        squares = seen @ matrix.reshape(seen.shape[-1], 4 * self.out).astype(self.dtype)
-        return squares.reshape(*squares.shape[:-1], 2, 2, self.out) + bias.astype(self.dtype)
+        reads = REPEATED_READS if self.grows else READS
+        # row and column of the square that is read (s, t) and of its pixel (p, q), of the tap (d, e),
+        # of the result's pixel (a, b)
+        matrix = jnp.einsum("adsp,betq,deco->stpqcabo", reads, reads, kernel, precision="highest")
+        x = x.astype(self.dtype)
+        seen = patches(x if self.grows else squares_of(x), side=3, stride=1)
+        results = seen @ matrix.reshape(seen.shape[-1], 4 * self.out).astype(self.dtype)
+        return results.reshape(*results.shape[:-1], 2, 2, self.out) + bias.astype(self.dtype)
+
+
+def squares_of(picture: jax.Array) -> jax.Array:
+    """The pixels of each square of 2 x 2 side by side: [..., 2 h, 2 w, C] -> [..., h, w, 4 C]."""
+    *front, height, width, channels = picture.shape
+    rows = picture.reshape(*front, height // 2, 2, width // 2, 2, channels)
+    return jnp.moveaxis(rows, -4, -3).reshape(*front, height // 2, width // 2, 4 * channels)
 
 
 def picture_of(squares: jax.Array) -> jax.Array:

@@ -12,6 +12,7 @@ Source: Hafner et al. (2025), "Mastering Diverse Control Tasks through World Mod
     arXiv:2301.04104; sizes, the recurrent unit and initial weights are from the authors' code.
 """
 
+import re
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -19,7 +20,11 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from jaxsafe.types import PyTree
+
 UNIFORM = 0.01  # the probability that a draw of a latent is uniform
+# names of hidden layers' weights
+HIDDEN = re.compile(r"Hidden_\d+/Dense_\d+/|BlockDense_\d+/")
 
 
 class Size(NamedTuple):
@@ -176,6 +181,16 @@ class Memory(nn.Module):
         reset, candidate, gate = jnp.split(gates, 3, axis=-1)
         keep = 1 - nn.sigmoid(join(gate) - 1)
         return (1 - keep) * jnp.tanh(nn.sigmoid(join(reset)) * join(candidate)) + keep * latent.deter
+
+
+def converted(params: PyTree, dtype: str) -> PyTree:
+    """`params` with the weights of hidden layers in `dtype`, as their products read them. XLA converts
+    a weight that a loop reads at each step anew, and so do this once, before the loop."""
+
+    def one(path: tuple[Any, ...], x: jax.Array) -> jax.Array:
+        return x.astype(dtype) if HIDDEN.search("/".join(key.key for key in path)) else x
+
+    return params if dtype == "float32" else jax.tree_util.tree_map_with_path(one, params)
 
 
 # ---- categorical latents -----------------------------------------------------------------------

@@ -872,7 +872,7 @@ def test_hidden_layers_in_bfloat16_change_a_loss_and_its_gradient_little():
         return rssm.WorldModel(size, coders.Encoder(size, 21), coders.Decoder(size, (12, 12, 3), 7), ())
 
     def loss(params, dtype):
-        world = model(dtype)
+        world, params = model(dtype), rssm.converted(params, dtype)
         embedded = world.apply(params, obs, method="embed")
         after: Any = world.apply(params, latent, jnp.ones((64, 2)), embedded, None, method="observe")
         believed: Any = world.apply(params, after.deter, embedded, method="beliefs")
@@ -894,3 +894,27 @@ def test_hidden_layers_in_bfloat16_change_a_loss_and_its_gradient_little():
         np.concatenate([np.ravel(x) for x in jax.tree.leaves(g)]) for g in (slopes, exact_slopes)
     )
     assert 1e-4 < np.linalg.norm(flat - exact_flat) / np.linalg.norm(exact_flat) < 0.1
+
+
+def test_weights_are_converted_before_a_loop_and_not_by_its_steps():
+    size = rssm.SIZES["tiny"]._replace(dtype="bfloat16")
+    world = rssm.WorldModel(size, coders.VectorEncoder(size, 21), coders.VectorDecoder(size, 7), ())
+    action, key = jnp.ones(2), jax.random.key(0)
+    params = jax.eval_shape(partial(world.init, method="everything"), key, jnp.ones(7), action)
+    latent, seen = world.apply({}, method="start"), jnp.ones(size.units)
+
+    def step(params):
+        observed: Any = world.apply(params, latent, action, seen, key, method="observe")
+        imagined: Any = world.apply(params, latent, action, key, method="imagine")
+        return observed, imagined
+
+    def conversions(params):
+        program = jax.make_jaxpr(step)(params).jaxpr
+        casts = [e for e in program.eqns if e.primitive.name == "convert_element_type"]
+        return sum(e.invars[0] in program.invars for e in casts)
+
+    converted = jax.eval_shape(partial(rssm.converted, dtype="bfloat16"), params)
+    layers = (5 + 1) + (5 + 2)  # of the memory, and what follows it
+    assert conversions(params) == 2 * layers and conversions(converted) == 0
+    assert jax.tree.map(jnp.shape, converted) == jax.tree.map(jnp.shape, params)
+    assert rssm.converted(params, "float32") is params
