@@ -4,6 +4,7 @@ import contextlib
 import signal
 import socket
 import threading
+import time
 from collections.abc import Callable
 from types import TracebackType
 
@@ -11,12 +12,14 @@ from jaxsafe.run import distributed
 
 EXIT_STATUS = 130
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+MOMENT = 0.5  # s, within which two signals are one
 
 
 class Interrupts:
     """The first signal sets `requested`; the second, or any while `nothing_to_save`, leaves at once.
 
     A terminal that closes sends SIGHUP, perhaps several times. Under nohup it is not listened to.
+    `timeout` signals a program and then its group, so that what comes within a `MOMENT` is one signal.
 
     Python runs signal handlers between its own instructions only, and one XLA compilation can
     take minutes. So a thread reads the signals from the wakeup socket, which is written at once.
@@ -63,14 +66,16 @@ class Interrupts:
         self.requested = True
 
     def _listen(self) -> None:
+        first = 0.0
         with self.reader:
             while received := self.reader.recv(1):
-                if received[0] not in SIGNALS or (received[0] == signal.SIGHUP and self.requested):
+                echo = received[0] == signal.SIGHUP or time.monotonic() < first + MOMENT
+                if received[0] not in SIGNALS or (self.requested and echo):
                     continue
                 if self.requested or self.nothing_to_save:
                     self._try_to_say(self.nothing_to_save or "stopped without a last checkpoint")
                     distributed.exit_all(EXIT_STATUS)
-                self.requested = True
+                self.requested, first = True, time.monotonic()
                 self._try_to_say(
                     "stopping after this iteration, with a checkpoint; Ctrl-C again leaves at once"
                 )
