@@ -8,7 +8,16 @@ import inspect
 from collections.abc import Callable
 from typing import Any, Literal
 
-from jaxsafe.config import ConfigError, UnnamedCode, convert, from_dict, import_object, nearest, shown
+from jaxsafe.config import (
+    OWN_CODE,
+    ConfigError,
+    UnnamedCode,
+    convert,
+    from_dict,
+    import_object,
+    nearest,
+    shown,
+)
 from jaxsafe.envs import pendulum
 from jaxsafe.envs.check import check_env
 from jaxsafe.envs.engines.choose import ENGINES
@@ -97,7 +106,7 @@ def canonical(name: str) -> str:
         return ALIASES[name]
     if ":" in name:
         raise UnnamedCode("env", name)
-    raise ConfigError(f"unknown environment {name!r}{nearest(name, [*ENVS, *ALIASES])}")
+    raise ConfigError(f"unknown environment {name!r}{nearest(name, [*ENVS, *ALIASES], OWN_CODE)}")
 
 
 def implied_by(name: str) -> dict[str, Any]:

@@ -17,6 +17,8 @@ from typing import Annotated, Any, NamedTuple, TypeVar, dataclass_transform
 import jax
 
 T = TypeVar("T")
+LISTED = 20  # names that a message lists
+OWN_CODE = "; your own is MODULE:NAME"
 
 
 class ConfigError(ValueError):
@@ -136,12 +138,13 @@ def flat(values: dict[str, Any]) -> dict[str, Any]:
     return out
 
 
-def nearest(name: str, names: typing.Iterable[str]) -> str:
-    """'; did you mean X?' for the closest of `names`, or the list of them if none is close."""
-    names = sorted(names)
+def nearest(name: str, names: typing.Iterable[str], more: str = "") -> str:
+    """'; did you mean X?' for the closest of `names`, or, if none is close, some of them and `more`."""
+    names = sorted(names, key=str.swapcase)  # small letters first
     close = difflib.get_close_matches(name, names, n=3, cutoff=0.5)
     if not close:
-        return f"; valid: {', '.join(names)}"
+        others = f" and {len(names) - LISTED} others" * (len(names) > LISTED)
+        return f"; valid: {', '.join(names[:LISTED])}{others}{more}"
 
     def likeness(candidate: str) -> tuple[float, int, int]:
         ratio = difflib.SequenceMatcher(None, candidate, name).ratio()

@@ -318,7 +318,7 @@ def command() -> int:
         help="also measure another library, as crax=PYTHON (see peers.py)",
     )
     parser.add_argument("--json", type=Path, help="append the rows to this file, a line each")
-    args = parser.parse_intermixed_args()
+    args = parser.parse_args()
     args.env_options = [text for text in args.envs if text.startswith("env.") and "=" in text]
     args.options = [text for text in args.envs if "=" in text and text not in args.env_options]
     args.envs = [text for text in args.envs if "=" not in text]

@@ -9,6 +9,7 @@ from typing import Any
 
 from jaxsafe.commands.guard import guarded
 from jaxsafe.config import ConfigError, Seed, convert, nearest
+from jaxsafe.run import files
 from jaxsafe.run.collect import Ingredient, Size, data_file, shares, write
 from jaxsafe.run.devices import use_compilation_cache
 from jaxsafe.run.flags import Parser
@@ -52,6 +53,8 @@ def command() -> int:
         if name not in (*OPTIONS, *(text.partition("=")[0] for text in CODE)):
             raise ConfigError(f"unknown option {name}{nearest(name, OPTIONS)}")
     size, out, sampled, seed = settings(OPTIONS | given)
+    if files.there(out):
+        raise ConfigError(f"out={out}: this data set is there already; name another file, or delete it")
     recipe = shares([word for word in words if not is_option(word)])
     use_compilation_cache()
     with Interrupts(functools.partial(print, flush=True)) as stop:

@@ -104,7 +104,8 @@ class Group(NamedTuple):
     @property
     def held(self) -> str:
         """Whether each limit is: 'unclear' where the mean is above it and its interval is not, or, of
-        two seeds, which have none, one is not; 'diverged' where a seed did, whatever it cost."""
+        two seeds, which have none, one is not, and where few episodes ended; 'diverged' where a seed
+        did, whatever it cost."""
         if self.diverged:
             return "diverged"
 
@@ -118,7 +119,8 @@ class Group(NamedTuple):
             return "unclear" if low <= limit else "no"
 
         found = {answer(cost_title(name), most) for name, most in self.limits.items()}
-        return next((word for word in ("no", "-", "unclear", "yes") if word in found), "-")
+        word = next((word for word in ("no", "-", "unclear", "yes") if word in found), "-")
+        return word if word == "-" or not (self.estimated or self.few_episodes) else "unclear"
 
 
 @functools.cache

@@ -53,7 +53,8 @@ def curves(
     cost_limit: float,
     own_limits: Mapping[str, float] = MappingProxyType({}),
 ) -> None:
-    """Write the PNG: a line a seed, and for three seeds or more their mean and 95% interval.
+    """Write the PNG: a line a seed, and for three seeds or more their mean and 95% interval. Offline
+    there may be nothing to draw, and then there is none.
 
     Evaluations during training are points on dashed lines, each the mean over seeds.
 
@@ -71,10 +72,11 @@ def curves(
     limits = limits or {"train/cost": (cost_limit, "algo.cost_limit")}
     figure = Figure(figsize=(5 * len(panels), 4), layout="constrained")
     FigureCanvasAgg(figure)
-    settings = run_folder.by_setting(metrics)
+    settings, drawn = run_folder.by_setting(metrics), False
     for axes, (name, what) in zip(figure.subplots(1, len(panels)), panels, strict=True):
         for i, (setting, table) in enumerate(settings.items()):
             trained = name in table and len(table["steps"])
+            drawn = drawn or trained
             if trained:
                 column, estimated = drawn_of(table, name)
                 draw_setting(axes, name, *by_seed(table, column), f"C{i % 10}", setting, estimated)
@@ -82,6 +84,7 @@ def curves(
                 if (column := name.replace("train/", "eval/") + end) in table:
                     look = {"marker": marker, "mfc": "none" if end else None, "color": f"C{i % 10}"}
                     label = called if trained or not setting else f"{setting}, {called}"
+                    drawn = True
                     axes.plot(*evaluated(table, column), ls="--", lw=1, label=label, **look)
         if name in limits:
             common, column = limits[name]
@@ -92,7 +95,8 @@ def curves(
         if axes.get_legend_handles_labels()[0]:
             axes.legend(frameon=False, fontsize="small")
     figure.suptitle(title)
-    write(figure, path, dpi=120)
+    if drawn:
+        write(figure, path, dpi=120)
 
 
 def calibration(risks: Mapping[str, Mapping[str, Sequence[float]]], path: Path, title: str) -> None:
@@ -194,9 +198,10 @@ def learning(
     """Return, cost and, where they are known, cost rate so far and override rate over training: a row a
     task, a line a setting.
 
-    A point is the mean over one of at most 50 equal stretches of training; the band is the 95%
-    interval over seeds. Fewer than three seeds are a thin line each. A line ends where the first of
-    its seeds does. The panel holds all means and nearly all seeds. Intervals may reach beyond it.
+    A point is the mean over one of at most 50 equal stretches of training, fewer of a run that is
+    shorter than another; the band is the 95% interval over seeds. Fewer than three seeds are a thin
+    line each. A line ends where the first of its seeds does. The panel holds all means and nearly all
+    seeds. Intervals may reach beyond it.
 
     Args:
         groups: what to draw.
@@ -228,10 +233,14 @@ def draw_task(
 ) -> None:
     """The row of one task in `learning`: `panels` by their metric."""
     runs = [run for g in groups for run in g.runs]
-    count = min(50, *(len(np.unique(run.table["iteration"])) for run in runs))
-    edges = np.linspace(0, max(run.steps for run in runs), count + 1)
+    longest = max(run.steps for run in runs)
+    # of the longest run; in each stretch of the others is a row, too
+    rows = [len(np.unique(run.table["iteration"])) * longest / run.steps for run in runs]
+    count = min(50, *rows)
     held: dict[str, list[float]] = {name: [] for name in panels}  # what the panels must hold
     for g in groups:
+        last = max(run.steps for run in g.runs)
+        edges = np.linspace(0, last, max(1, int(count * last / longest)) + 1)
         for name, axes in panels.items():
             if all(name in run.table for run in g.runs):
                 guess = g.estimated and name not in RATES
@@ -256,7 +265,7 @@ def draw_task(
     for name, axes in panels.items():
         axes.set_visible(bool(axes.lines))  # not a rate that no run of this task has
         what = RATES.get(name) or f"{name.removeprefix('train/')} of an episode"
-        frames = {"xlim": (0, edges[-1]), "ylim": frame(held[name])}
+        frames = {"xlim": (0, longest), "ylim": frame(held[name])}
         axes.set(title=groups[0].env, xlabel=clocks, ylabel=what, **frames)
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
 

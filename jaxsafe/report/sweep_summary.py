@@ -32,7 +32,7 @@ def summarise(folder: Path, extras: Extras = NO_EXTRAS) -> str:
     files.write(folder / "summary.csv", as_csv(rows))
     title = period(rows)
     title += ", mean and 95% interval" * any(stats.has_interval(row.costs) for row in rows)
-    title += f"; {plots.ESTIMATED}" * any(row.estimated for row in rows)
+    title += f"\n{plots.ESTIMATED}" * any(row.estimated for row in rows)
     plots.save(trade_off.draw(rows, title), folder / "summary")
     return text
 

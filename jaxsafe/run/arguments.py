@@ -58,7 +58,10 @@ def parse(text: str) -> Override:
     try:
         return OverridesParser.create().parse_override(text)
     except HydraException as error:
-        raise ConfigError(f"cannot read {text!r}: {' '.join(str(error).split())}") from error
+        raise ConfigError(
+            f"cannot read {text!r}; expected key=value without spaces, as algo.cost_limit=5,10 or "
+            "env.vision_size=[60,40]"
+        ) from error
 
 
 def argument(name: str, value: str | Path) -> str:

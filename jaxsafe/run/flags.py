@@ -9,7 +9,10 @@ from jaxsafe.config import ConfigError, convert, kind_in_words
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose errors are lines for the user, like all others."""
+    """A parser whose errors are lines for the user, like all others. Options may stand anywhere."""
+
+    def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
+        return self.parse_intermixed_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
         raise ConfigError(message)

@@ -80,7 +80,7 @@ def train(
     store = files.inside(folder, "checkpoints")
     resuming = bool(distributed.from_process_0(np.array(bool(checkpoint.checkpoints(store)))))
     with report, Interrupts(report.line, report.hosted) as stop:
-        nothing = hooks.resume_command if resuming else "nothing to save"
+        nothing = hooks.resume_command if resuming or train_cfg.resume else "nothing to save"
         stop.nothing_to_save = f"stopped before the first update; {nothing}"
         begun = time.perf_counter()
         program = program._replace(data=distributed.place(program.data, program.everywhere))

@@ -64,7 +64,9 @@ def read_config(folder: Path) -> dict[str, Any]:
     """
     path = folder / "config.yaml"
     if not files.there(path):
-        raise ConfigError(f"{folder} is not a run folder: it has no config.yaml")
+        inside = sorted(folder.glob("*/config.yaml"))
+        hint = f"; there is {inside[0].parent}" if inside else ""
+        raise ConfigError(f"{folder} is not a run folder: it has no config.yaml{hint}")
     config = files.read_yaml(path)
     groups = [config.get(g) if isinstance(config, dict) else None for g in ("env", "algo")]
     if not all(isinstance(g, dict) and isinstance(g.get("name"), str) for g in groups):

@@ -17,6 +17,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 from jaxsafe import algos, envs
 from jaxsafe.algos import Row
 from jaxsafe.config import (
+    OWN_CODE,
     Amount,
     Bounds,
     ConfigError,
@@ -367,7 +368,7 @@ def find_algo(name: str, extras: Extras = NO_EXTRAS) -> Row:
         return known[name]
     if ":" in name:
         raise UnnamedCode("algo", name)
-    raise ConfigError(f"unknown algo {name!r}{nearest(name, known)}")
+    raise ConfigError(f"unknown algo {name!r}{nearest(name, known, OWN_CODE)}")
 
 
 def load(kind: str, name: str) -> None:

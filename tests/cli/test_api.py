@@ -353,6 +353,15 @@ def test_an_interrupt_with_nothing_to_save_leaves_the_program_running(monkeypatc
 # ---- sweeps ----------------------------------------------------------------------------------
 
 
+def test_a_sweep_that_is_stopped_before_an_update_says_how_it_goes_on(monkeypatch):
+    def compiling(program: programs.Program, ts: Any) -> Any:
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(programs, "compiled", compiling)
+    with pytest.raises(KeyboardInterrupt, match=r"stopped before the first update; (?!nothing)"):
+        jaxsafe.sweep(Corridor(), cost_limit=[5, 10], max_parallel=1, run_dir="sweep", **TINY)
+
+
 def planned(env: Any, algo: Any = None, **options: Any) -> Sweep:
     choice = api.chosen(env, algo)
     return plan(*api.asked_for(choice, options), choice.extras)

@@ -98,6 +98,14 @@ def test_a_recipe_has_the_limits_in_force_of_each_setting(run):
     assert collect.about(several)["limits"] == [{"cost": 25.0}, {"cost wall": 10.0}]
 
 
+def test_a_data_set_that_is_there_is_not_overwritten(run, tmp_path, capsys):
+    out = tmp_path / "data.npz"
+    out.write_text("hours of work")
+    assert typed("collect", str(run), TOY, "size=40", f"out={out}") == 2
+    assert f"out={out}: this data set is there already; name another" in capsys.readouterr().err
+    assert out.read_text() == "hours of work"
+
+
 def test_the_same_command_collects_the_same_and_mean_actions_are_not_sampled_ones(run, tmp_path):
     files = [tmp_path / f"{i}.npz" for i in range(3)]
     for out, actions in zip(files, ("sampled", "sampled", "mean"), strict=True):

@@ -80,6 +80,10 @@ WRONG = {
     "migrate omnisafe nowhere.json": "cannot read nowhere.json",
     "benchmark point_gol1": "did you mean 'point_goal1'?",
     "benchmark --algo nope": "unknown algo 'nope'",
+    "train env=my_envs": "others; your own is MODULE:NAME",
+    "train point_goal1 ppo": "cannot read 'point_goal1'; expected key=value without spaces",
+    "evaluate nowhere --episodes 3 algo=nope": "nowhere is not a run folder",
+    "plot nowhere --by algo.lr elsewhere": "nowhere",
     "benchmark point_goal1 --num-envs -5": "expected a whole number between 1 and",
     "study nothing": "no study nothing",
 }

@@ -125,7 +125,7 @@ def test_a_grid_over_named_limits_is_side_by_side_too():
 def test_a_sweep_over_a_named_limit_from_training_to_summary(tmp_path, capsys):
     folder = tmp_path / "sweep"
     limits = ["algo.cost_limits.wall=0.5,50", "num_seeds=2"]
-    train(folder, *limits, "eval_episodes=2")
+    train(folder, *limits, "eval_episodes=2", "total_steps=1920")
     assert "algo.cost_limits.wall=50: return" in capsys.readouterr().out
     (run,) = folder.glob("0*")
     tables = run_folder.by_setting(run_folder.read_metrics(run))
@@ -139,7 +139,7 @@ def test_a_sweep_over_a_named_limit_from_training_to_summary(tmp_path, capsys):
     assert text[0] == (
         "| algo.cost_limits.wall | seeds | steps | return | cost | cost wall | limit | limit held |"
     )
-    assert text[2].startswith("| 0.5 | 2 | 192 |")
+    assert text[2].startswith("| 0.5 | 2 | 1,920 |")
     assert text[2].endswith(f"| wall 0.5 | {rows[0].held} |")
     with (folder / "summary.csv").open() as file:
         assert [row["cost_limit_wall"] for row in csv.DictReader(file)] == ["0.5", "50.0"]
