@@ -94,7 +94,8 @@ def train(
         update = programs.compiled(program, start.ts)
         jax.block_until_ready(start.ts)  # so that a check of the memory finds it there
         hooks.check(update)
-        report.line(f"compiled in {time.perf_counter() - begun:.1f} s")
+        spent = time.perf_counter() - begun
+        report.line(f"compiled in {spent:.1f} s; an iteration is {unit.each:,} {unit.name}")
         stop.nothing_to_save = ""
 
         leads = distributed.leads()
