@@ -155,6 +155,17 @@ def other_task(path: str, env: dict[str, Any]) -> str:
     return ""
 
 
+def oddities(path: str, data: DataSet) -> list[str]:
+    """A warning of each kind of numbers that no environment gives."""
+    most, least = float(abs(data.action).max()), float(data.cost.min())
+    found = []
+    if most > 1 + 1e-5:
+        found.append(f"actions up to {most:g}, which the tasks here cut to [-1, 1]")
+    if least < 0:
+        found.append(f"costs down to {least:g}; expected 0 or more")
+    return [f"warning: dataset={path} has {line}" for line in found]
+
+
 def from_flat(path: str, source: Source) -> DataSet:
     for name in ARRAYS:
         if name not in source.names:

@@ -235,8 +235,10 @@ def run_alone(session: Session, report: Reporter, finish: Finish, hooks: loop.Ho
     if line := about_replay(program, train):
         report.line(line)
     env = settings.plain()["env"]
-    if train.dataset is not None and (line := dataset.other_task(train.dataset, env)):
-        report.line(line)
+    if train.dataset is not None:
+        odd = dataset.oddities(train.dataset, program.data)
+        for line in filter(None, (dataset.other_task(train.dataset, env), *odd)):
+            report.line(line)
     with memory.watched(program, session.env, settings) as check:
         stopped = loop.train(program, train, session.folder, report, hooks._replace(check=check))
     distributed.part()

@@ -253,6 +253,16 @@ def test_data_of_another_task_is_one_line_that_names_both(tmp_path, capsys):
         assert out.count("warning: ") == out.count(f"warning: {said}") == lines
 
 
+def test_numbers_that_no_environment_gives_are_a_line_each(data):
+    sound = dataset.read_dataset(str(data))
+    assert dataset.oddities("x", sound) == []
+    odd = sound._replace(action=7 * sound.action, cost=-sound.cost)
+    actions, costs = dataset.oddities("x", odd)
+    most = 7 * np.abs(sound.action).max()
+    assert actions.startswith(f"warning: dataset=x has actions up to {most:g}, which")
+    assert costs == "warning: dataset=x has costs down to -1; expected 0 or more"
+
+
 def test_a_lone_seed_without_environments_does_not_split_over_devices(data, monkeypatch):
     monkeypatch.setattr(session, "check_devices", lambda train: None)
     with pytest.raises(ConfigError, match="devices=2: a lone seed has no environments to split"):
