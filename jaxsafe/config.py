@@ -17,7 +17,7 @@ from typing import Annotated, Any, NamedTuple, TypeVar, dataclass_transform
 import jax
 
 T = TypeVar("T")
-LISTED = 20  # names that a message lists
+LISTED = 30  # names that a message lists
 OWN_CODE = "; your own is MODULE:NAME"
 
 
