@@ -135,7 +135,7 @@ def agree_on_folder(settings: Settings, job: int | None, say: Callable[[str], No
 def check_same_run(settings: Settings, folder: Path) -> None:
     """Raise ConfigError if the run in `folder` has other settings than these."""
     saved = flat(settings_of_run(run_folder.read_config(folder), settings.extras).plain())
-    free = {*NOT_COMPARED}
+    free = {*NOT_COMPARED, "num_envs"}  # algo.num_envs has that number, too
     if settings.num_members > 1:
         free.add("devices")  # each member is whole on one of them
     path, known = settings.train.dataset, run_folder.dataset_of(folder)

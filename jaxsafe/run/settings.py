@@ -315,7 +315,13 @@ def resumed(
             raise ConfigError(f"{kind}={name}: {folder} was trained with {there}")
     begun = run_folder.newest_progress(folder) is not None  # then it starts from no other run
     check_read_from(saved, folder, {*given, "init_from"} if begun else given)
-    return dataclasses.asdict(TrainConfig()) | saved.plain()
+    options = dataclasses.asdict(TrainConfig()) | saved.plain()
+    if "algo.num_envs" in given:  # what is typed replaces the number by both of its names
+        options["num_envs"] = None
+    elif "num_envs" in given and "num_envs" in options["algo"]:
+        train = saved.train
+        options["algo"]["num_envs"] = algo_options(saved.row, train.preset, train.compat)["num_envs"]
+    return options
 
 
 def check_read_from(saved: Settings, folder: Path, given: Collection[str]) -> None:

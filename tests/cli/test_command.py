@@ -5,6 +5,7 @@ real environment.
 """
 
 import dataclasses
+import itertools
 import re
 import resource
 import shutil
@@ -322,6 +323,23 @@ def test_a_folder_with_a_run_is_not_overwritten_nor_resumed_with_other_settings(
     shutil.rmtree(run / "checkpoints")  # what is left of a run is not overwritten either
     with pytest.raises(ConfigError, match="already holds a run"):
         session.choose_folder(settled(f"run_dir={run}"), None, print)
+
+
+def test_num_envs_and_algo_num_envs_are_one_number_to_a_resumed_run(tmp_path):
+    """By whichever name it had it then, and has it now."""
+    for first, then in itertools.product(("num_envs", "algo.num_envs"), repeat=2):
+        run = tmp_path / f"{first},{then}"
+        run.mkdir()
+        run_folder.write_config(
+            run, settings.settings_from_options(settings.nested({first: 64})).plain()
+        )
+        same, other = (
+            settings.settings_from_options(settings.nested({"resume": str(run), then: count}))
+            for count in (64, 16)
+        )
+        assert session.choose_folder(same, None, print) == run
+        with pytest.raises(ConfigError, match=r"algo.num_envs=16 but .* was trained with 64"):
+            session.choose_folder(other, None, print)
 
 
 @pytest.mark.parametrize(
