@@ -175,7 +175,7 @@ def lines_or_dots(axes: Axes, x: np.ndarray, y: np.ndarray | float, **style: Any
     lines = axes.plot(x, y, **style)
     for line in lines:
         if np.isfinite(np.asarray(line.get_ydata(), float)).sum() == 1:
-            line.set_marker("o")
+            line.set(marker="o", clip_on=False)  # whole at the edge, where its run ends
     return lines
 
 

@@ -170,6 +170,7 @@ def test_a_single_point_is_a_dot_and_more_are_a_line(seeds):
         plots.draw_setting(axes, "train/return", np.arange(3), one, "C0", "")
         plots.traces(axes, "train/return", np.arange(3), one, "")
         assert {str(line.get_marker()) for line in axes.lines} == {marker}
+        assert {line.get_clip_on() for line in axes.lines} == {marker == "None"}  # a dot is whole
 
 
 def test_evaluations_of_settings_side_by_side_are_named_where_training_has_no_episodes(
