@@ -60,8 +60,10 @@ class AMBSConfig(dreamer.ForesightConfig):
         copt    w = 1 - sigmoid(kappa (R_t - C discount^T)), without gradient
         none    w = 1, and no A_pen
 
-    A is Dreamer's advantage. A_pen is that of -c under pi, discounted by `cost_discount` and scaled as
-    Dreamer's. A violation i steps ahead costs discount^(i-1) C, so R tells whether there is one within
+    A is Dreamer's advantage. A_pen is that of -c under pi, discounted by `cost_discount` and divided by
+    S_pen: Dreamer's scale of these returns, at least `least_penalty_scale`. So in units of reward pi
+    pays penalty_coef C S / S_pen for a violation, and the rarer they are in dreams, the more. A
+    violation i steps ahead costs discount^(i-1) C, so R tells whether there is one within
     T steps. The shield's dreams have only H = `shield_steps` steps. V_i stand for the rest. The shield
     acts in training, evaluation and films. What is dreamed begins with actions of pi that are drawn
     anew, unless `verify_action` has the proposed one dreamed first.
@@ -90,7 +92,9 @@ class AMBSConfig(dreamer.ForesightConfig):
     from their code.
     Differs from it: Dreamer is the later one, whose actor learns by reinforce (`actor_grad=backprop`
     has the authors'). An end of the episode also ends the costs that V_i foresee. Time limits are no
-    ends (`limit_ends=true` has them). Mean actions are shielded, too. The defaults are from runs on
+    ends (`limit_ends=true` has them). A violation of probability p costs p C, the mean of what the head
+    says. In their code, the mean of symlogs, it costs (1 + C)^p - 1, a quarter of that at p = 0.1. Mean
+    actions are shielded, too. The defaults are from runs on
     point_goal1 (docs/results/shielding): the model foresees cost, as Dreamer-PID's does, cost is
     discounted sooner, and the shield lets more through, by the exact bound. `preset=plpg`, `penl` and
     `copt` are the authors'.
@@ -109,6 +113,9 @@ class AMBSConfig(dreamer.ForesightConfig):
     penalty: Literal["penl", "plpg", "copt", "none"] = "penl"
     # The weight of A_pen. The authors have 1 with penl and copt, and 0.8 with plpg.
     penalty_coef: Weight = 1.0
+    # The least scale of the returns of -c, by which A_pen is divided. With 1, as the authors have it, a
+    # violation costs more reward the fewer there are.
+    least_penalty_scale: Annotated[float, Bounds(1e-6, 1e6)] = 1.0
     # Costs of the environment that are violations where they are above 0. []: `cost`.
     labels: tuple[str, ...] = ()
     violation_cost: Annotated[float, Bounds(1e-3, 1e6)] = 10.0  # C, as in the paper.
@@ -216,10 +223,11 @@ def learn(trained: dict[str, PyTree], memory: PyTree, scene: Scene, key: jax.Arr
     paid = scene.judge("critic_p", dreams, -cost, cfg.cost_discount)
     range_r = moved(memory["reward"], earned.returns, axis_name)
     range_p = moved(memory["penalty"], paid.returns, axis_name)
+    scale_r, scale_p = range_r.scale(least), range_p.scale(cfg.least_penalty_scale)
     value_c = safety_value(scene.params, dreams.features, cfg)
     found = Advantages(
-        reward=earned.advantage / range_r.scale(least),
-        penalty=paid.advantage / range_p.scale(least),
+        reward=earned.advantage / scale_r,
+        penalty=paid.advantage / scale_p,
         cost=cost,
         value_safe=scene.value(scene.params["critic_safe"], dreams.features),
         returns_c=dream_returns(cost, value_c, dreams.read["cont"], discount=discount, decay=1.0),
@@ -241,8 +249,8 @@ def learn(trained: dict[str, PyTree], memory: PyTree, scene: Scene, key: jax.Arr
         "train/entropy": scene.over_dreams(dreams.entropy),
         "train/value": scene.over_dreams(earned.value[:-1]),
         "train/value_c": scene.over_dreams(value_c[:-1]),
-        "train/return_scale": range_r.scale(least),
-        "train/penalty_scale": range_p.scale(least),
+        "train/return_scale": scale_r,
+        "train/penalty_scale": scale_p,
     }
     return Outcome(loss, {"reward": range_r, "penalty": range_p, "safe": range_safe}, metrics)
 

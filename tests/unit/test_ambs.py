@@ -352,6 +352,22 @@ def test_each_advantage_is_divided_by_the_range_of_its_own_returns(monkeypatch):
     np.testing.assert_allclose(safe, (-cost[1, 1:] - 0.5) / now["safe"], rtol=1e-5)
 
 
+def test_the_scale_of_the_penalty_alone_has_a_least_one_so_that_rare_violations_cost_no_more_reward(
+    monkeypatch,
+):
+    """Costs of either policy are in no dream but one of 101, so their returns have no range."""
+    rare = jnp.zeros((2, 2, 101)).at[..., 50].set(9.0)
+    ones = jnp.ones_like(rare)
+    says = {"reward": ones, "cost": rare, "cont": ones, "safe": ones}
+    for least in (1.0, 20.0):
+        cfg = dataclasses.replace(CFG, penalty="none", least_scale=2.0, least_penalty_scale=least)
+        heard = listen(monkeypatch, says, cfg)
+        (found,), (_, safe) = heard.found, heard.climbed[0]
+        np.testing.assert_allclose(found.penalty, (-rare[0, 1:] - 0.5) / least, rtol=1e-6)
+        np.testing.assert_allclose(safe, (-rare[1, 1:] - 0.5) / 2.0, rtol=1e-6)
+        np.testing.assert_allclose(found.reward, 0.25)
+
+
 def test_what_copt_sums_goes_on_after_a_violation(monkeypatch):
     """Three steps, each with a violation, and then what the critics say, which counts 10 at most."""
     ones = jnp.ones((2, 4, 1))
