@@ -22,6 +22,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -136,138 +137,142 @@ def stopping(event: threading.Event) -> Iterator[None]:
             signal.signal(ending, handler)
 
 
-def work(study: Study, args: argparse.Namespace, train: Callable[[list[str], Place], int]) -> int:
-    """Train what is left, several at once. Returns the exit status.
+def work(study: Study, runs: list[str], folder: Path, slots: list[str | None], end: float) -> int:
+    """Train runs of a study, several at once. Returns the exit status.
 
+    Args:
+        runs: in the order in which they begin.
+        folder: which holds their run folders.
+        slots: the GPU of each run that is trained at once, as of `Place`.
+        end: when to stop, in seconds of `time.monotonic`.
     Raises:
         checkpoint.NotSaved: nobody can write where the runs or the study are.
     """
-    runs, stop, one_at_a_time = args.runs / study.folder.name, threading.Event(), threading.Lock()
-    todo: queue.SimpleQueue[str] = queue.SimpleQueue()
-    asked = left(study, args.only, runs)
-    for folder in (runs, study.folder) if asked else ():  # before hours of training
-        with checkpoint.writing_to(folder):
-            files.try_writing(folder)
-    for run in asked:
-        todo.put(run)
+    for place in (folder, study.folder) if runs else ():  # before hours of training
+        with checkpoint.writing_to(place):
+            files.try_writing(place)
     for word in " ".join([*study.options, *study.runs]).split():
         kind, _, name = word.partition("=")
         if kind in ("env", "algo"):  # the user's own are imported here, too, to read what came out
             load(kind, name)
-    end = time.monotonic() + 60 * args.minutes
-    failed: list[str] = []
-    unfinished: list[str] = []
+    free: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+    for gpu in slots:
+        free.put(gpu)
+    stop, adding = threading.Event(), threading.Lock()
 
     def late() -> bool:
         return stop.is_set() or time.monotonic() >= end
 
-    def one(run: str, gpu: str | None) -> None:
-        name, start = study_files.name_of(run), time.monotonic()
-        if late():
-            unfinished.append(name)
-            return
-        folder = runs / name
+    def state_of(run: str) -> str:
+        gpu = free.get()
         try:
-            with files.held(folder) if folder.exists() else contextlib.nullcontext():
-                pass
-        except ConfigError as error:  # a second command on the same study
-            unfinished.append(name)
-            print(f"{name}: {error}", flush=True)
-            return
-        status = train(study.command(run), Place(folder, gpu, late))
-        minutes = f"{(time.monotonic() - start) / 60:.1f} minutes"
-        if status in STOPPED:
-            unfinished.append(name)
-            print(f"{name}: stopped, {minutes}", flush=True)
-            return
-        with one_at_a_time:
-            trained = read_one(folder) if files.there(run_folder.metrics_file(folder)) else []
-            if len(trained) > 1:
-                raise ConfigError(f"{run}: expected one setting a run, not {len(trained)} side by side")
-            failure = {0: "", DIVERGED: "diverged"}.get(status, "failed")
-            for setting in trained:
-                studies.add(study, run, setting, studies.origin_of(folder), failure)
-        failed.extend([name] * (status not in (0, DIVERGED)))
-        result = {0: "done", DIVERGED: "diverged"}.get(status, "failed")
-        result += f", see {log_of(folder)}" if status else ""
-        print(f"{name}: {result}, {minutes}", flush=True)
+            return trained(study, run, Place(folder / study_files.name_of(run), gpu, late), adding)
+        except Exception as error:  # the other runs go on
+            print(f"{study_files.name_of(run)}: {error!r}", flush=True)
+            return "failed"
+        finally:
+            free.put(gpu)
 
-    def worker(gpu: str | None) -> None:
-        with contextlib.suppress(queue.Empty):
-            while True:
-                run = todo.get_nowait()
-                try:
-                    one(run, gpu)
-                except Exception as error:  # the other runs go on
-                    failed.append(study_files.name_of(run))
-                    print(f"{study_files.name_of(run)}: {error!r}", flush=True)
-
-    print(f"{len(asked)} of {len(study.runs)} runs to do", flush=True)
-    gpus = args.gpus.split(",") if args.gpus else [None]
-    threads = [threading.Thread(target=worker, args=(gpu,)) for gpu in gpus * args.at_once]
-    with stopping(stop):
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-    if len(unfinished) + len(failed) < len(asked) and study_files.holds_study(study.folder):
+    print(f"{len(runs)} of {len(study.runs)} runs to do", flush=True)
+    with stopping(stop), ThreadPoolExecutor(len(slots)) as threads:
+        ends = dict(zip(map(study_files.name_of, runs), threads.map(state_of, runs), strict=True))
+    lasting = [name for kind in ("", "failed") for name, state in ends.items() if state == kind]
+    if len(lasting) < len(runs) and study_files.holds_study(study.folder):
         studies.write_page(study)
-    print(f"left to do: {', '.join(unfinished + failed) or 'nothing'}")
-    return 1 if failed else 130 if unfinished else 0
+    print(f"left to do: {', '.join(lasting) or 'nothing'}")
+    return 1 if "failed" in ends.values() else 130 if lasting else 0
 
 
-def main(train: Callable[[list[str], Place], int] = train) -> int:
-    """The command study. `train` is what trains one run."""
+def trained(study: Study, run: str, place: Place, adding: threading.Lock) -> str:
+    """Train a run, and add what it made to its study. Returns how it ended: done, diverged, failed, or
+    '' if it did not.
 
-    def study_command() -> int:
-        parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-        parser.add_argument("study", metavar="NAME", help="a study in docs/results, or its folder")
-        parser.add_argument("--list", action="store_true", help="only list which runs are done")
-        parser.add_argument(
-            "--commands",
-            action="store_true",
-            help="only print the commands that are left, for a scheduler",
-        )
-        parser.add_argument("--page", action="store_true", help="only draw the page")
-        parser.add_argument(
-            "--minutes", type=number(Minutes), default=float("inf"), help="stop after so many minutes"
-        )
-        parser.add_argument(
-            "--only",
-            nargs="+",
-            default=[],
-            metavar="RUN",
-            help="only these runs, by the names that --list prints",
-        )
-        parser.add_argument("--gpus", help="which GPUs to use, as 0,1,2,3")
-        parser.add_argument(
-            "--at-once", type=number(Devices), default=1, help="runs at a time on each GPU (default 1)"
-        )
-        parser.add_argument(
-            "--runs",
-            type=Path,
-            default=Path("runs") / "studies",
-            metavar="DIR",
-            help="where the run folders are (default runs/studies)",
-        )
-        args = parser.parse_args()
-        study = studies.read(find_study(args.study))
-        names = [study_files.name_of(run) for run in study.runs]
-        for name in args.only:
-            if name not in names:
-                raise ConfigError(f"--only {name}{nearest(name, names)}")
-        runs = args.runs / study.folder.name
-        if args.list:
-            print(listing(study, runs))
-            return 0
-        if args.commands:
-            for run in left(study, args.only, runs):
-                options = in_folder(study.command(run), runs / study_files.name_of(run))
-                print(shlex.join(["python", "scripts/train.py", *options]))
-            return 0
-        if args.page:
-            studies.write_page(study)
-            return 0
-        return work(study, args, train)
+    Args:
+        adding: held by the run that is added.
+    """
+    folder, start = place.folder, time.monotonic()
+    if place.late():
+        return ""
+    try:
+        with files.held(folder) if folder.exists() else contextlib.nullcontext():
+            pass
+    except ConfigError as error:  # a second command on the same study
+        print(f"{folder.name}: {error}", flush=True)
+        return ""
+    status = train(study.command(run), place)
+    minutes = f"{(time.monotonic() - start) / 60:.1f} minutes"
+    if status in STOPPED:
+        print(f"{folder.name}: stopped, {minutes}", flush=True)
+        return ""
+    state = {0: "done", DIVERGED: "diverged"}.get(status, "failed")
+    with adding:
+        found = read_one(folder) if files.there(run_folder.metrics_file(folder)) else []
+        if len(found) > 1:
+            raise ConfigError(f"{run}: expected one setting a run, not {len(found)} side by side")
+        for setting in found:
+            failure = "" if state == "done" else state
+            studies.add(study, run, setting, studies.origin_of(folder), failure)
+    log = f", see {log_of(folder)}" if status else ""
+    print(f"{folder.name}: {state}{log}, {minutes}", flush=True)
+    return state
 
-    return guarded(study_command)
+
+def main() -> int:
+    """Exit status: see above."""
+    return guarded(command)
+
+
+def command() -> int:
+    args = new_parser().parse_args()
+    study = studies.read(find_study(args.study))
+    names = [study_files.name_of(run) for run in study.runs]
+    for name in args.only:
+        if name not in names:
+            raise ConfigError(f"--only {name}{nearest(name, names)}")
+    folder = args.runs / study.folder.name
+    if args.list:
+        print(listing(study, folder))
+        return 0
+    if args.page:
+        studies.write_page(study)
+        return 0
+    runs = left(study, args.only, folder)
+    if args.commands:
+        for run in runs:
+            options = in_folder(study.command(run), folder / study_files.name_of(run))
+            print(shlex.join(["python", "scripts/train.py", *options]))
+        return 0
+    slots = args.at_once * (args.gpus.split(",") if args.gpus else [None])
+    return work(study, runs, folder, slots, time.monotonic() + 60 * args.minutes)
+
+
+def new_parser() -> argparse.ArgumentParser:
+    parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("study", metavar="NAME", help="a study in docs/results, or its folder")
+    parser.add_argument("--list", action="store_true", help="only list which runs are done")
+    parser.add_argument(
+        "--commands", action="store_true", help="only print the commands that are left, for a scheduler"
+    )
+    parser.add_argument("--page", action="store_true", help="only draw the page")
+    parser.add_argument(
+        "--minutes", type=number(Minutes), default=float("inf"), help="stop after so many minutes"
+    )
+    parser.add_argument(
+        "--only",
+        nargs="+",
+        default=[],
+        metavar="RUN",
+        help="only these runs, by the names that --list prints",
+    )
+    parser.add_argument("--gpus", help="which GPUs to use, as 0,1,2,3")
+    parser.add_argument(
+        "--at-once", type=number(Devices), default=1, help="runs at a time on each GPU (default 1)"
+    )
+    parser.add_argument(
+        "--runs",
+        type=Path,
+        default=Path("runs") / "studies",
+        metavar="DIR",
+        help="where the run folders are (default runs/studies)",
+    )
+    return parser

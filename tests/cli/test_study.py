@@ -75,7 +75,8 @@ def trained(folder: Path, options: list[str], steps: int = 4000, nonfinite: Any 
 
 def call(monkeypatch, *arguments: Any, train: Any = command.train) -> int:
     monkeypatch.setattr(sys, "argv", ["study.py", *map(str, arguments)])
-    return command.main(train)
+    monkeypatch.setattr(command, "train", train)
+    return command.main()
 
 
 # ---- the files -------------------------------------------------------------------------------
@@ -466,6 +467,28 @@ def test_a_run_that_another_process_trains_is_left_to_it(toy, tmp_path, monkeypa
     assert f"point_goal1-cpo: another process is training in {busy}\n" in out
     assert "left to do: point_goal1-cpo\n" in out
     assert asked == ["point_goal1-ppo_lag-algo.dual_lr_0.2"]
+    assert [row["algo"] for row in study_files.read(toy.folder).rows] == ["ppo_lag"] * 2
+
+
+def test_runs_at_the_same_time_have_a_gpu_each_and_one_that_breaks_leaves_the_other(
+    toy, tmp_path, monkeypatch, capsys
+):
+    gpus, begun = [], threading.Barrier(2, timeout=60)  # neither goes on before both have begun
+
+    def train(options: list[str], place: command.Place) -> int:
+        gpus.append(place.gpu)
+        begun.wait()
+        if "algo=cpo" in options:
+            raise OSError("no such kernel")
+        trained(place.folder, options)
+        return 0
+
+    arguments = (toy.folder, "--runs", tmp_path / "runs", "--gpus", "3,5")
+    assert call(monkeypatch, *arguments, train=train) == 1
+    assert sorted(gpus) == ["3", "5"]
+    out = capsys.readouterr().out
+    assert "point_goal1-cpo: OSError('no such kernel')\n" in out
+    assert "left to do: point_goal1-cpo\n" in out
     assert [row["algo"] for row in study_files.read(toy.folder).rows] == ["ppo_lag"] * 2
 
 
