@@ -266,7 +266,7 @@ def main() -> int:
     return guarded(command)
 
 
-def command() -> int:
+def new_parser() -> argparse.ArgumentParser:
     parser = Parser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument(
         "envs",
@@ -318,7 +318,13 @@ def command() -> int:
         help="also measure another library, as crax=PYTHON (see peers.py)",
     )
     parser.add_argument("--json", type=Path, help="append the rows to this file, a line each")
-    args = parser.parse_args()
+    return parser
+
+
+def arguments() -> argparse.Namespace:
+    """What was typed, checked before anything is compiled, with the settings among `envs` apart: those
+    of the tasks in `env_options`, those of --algo in `options`."""
+    args = new_parser().parse_args()
     args.env_options = [text for text in args.envs if text.startswith("env.") and "=" in text]
     args.options = [text for text in args.envs if "=" in text and text not in args.env_options]
     args.envs = [text for text in args.envs if "=" not in text]
@@ -341,6 +347,11 @@ def command() -> int:
             args.json.open("a").close()
     except OSError as error:
         raise ConfigError(f"--json {args.json}: {error.strerror}") from error
+    return args
+
+
+def command() -> int:
+    args = arguments()
     use_compilation_cache()
     about = versions()
     print(f"{' '.join(f'{k} {v}' for k, v in about.items())}")
