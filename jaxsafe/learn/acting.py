@@ -82,6 +82,11 @@ class Player(NamedTuple):
         return action, carry, jax.tree.map(jnp.float32, said)
 
 
+def first_carries(policy: Policy, learned: PyTree, num_envs: int) -> PyTree:
+    """The carries [N, ...] at the start of N episodes."""
+    return jax.tree.map(lambda x: jnp.broadcast_to(x, (num_envs, *x.shape)), policy.init(learned))
+
+
 def reset_carry(policy: Policy, learned: PyTree, carry: PyTree, first: jax.Array) -> PyTree:
     """`carry` [N, ...], with that of a new episode where `first` [N] holds."""
     return select_rows(first, policy.init(learned), carry)

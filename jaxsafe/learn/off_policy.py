@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxsafe.config import Norm, Rate, Share, Units, config
-from jaxsafe.learn.acting import Acted, ActInAll, Learned, Player, learned_of
+from jaxsafe.learn.acting import Acted, ActInAll, Learned, Player, first_carries, learned_of
 from jaxsafe.learn.batch import all_finite, device_key, masked_mean, psum, select
 from jaxsafe.learn.bill import charge, empty_bill, settle
 from jaxsafe.learn.constraints import Names, check_cost_names, metrics_by_constraint, signal
@@ -132,9 +132,9 @@ def off_policy(
         nets = learner.init(params_key, env.obs_size, env.action_size, cfg)
         dual = treatment.init(cfg)
         normaliser = init_normaliser(env.obs_size) if normalises(cfg) else ()
-        carry = policy.init(Learned(cfg, nets.params, dual, normaliser))
-        every = jax.tree.map(lambda x: jnp.broadcast_to(x, (cfg.num_envs, *x.shape)), carry)
-        stepping = started(dataclasses.replace(rollout, carry=every))
+        learned = Learned(cfg, nets.params, dual, normaliser)
+        carry = first_carries(policy, learned, cfg.num_envs)
+        stepping = started(dataclasses.replace(rollout, carry=carry))
         actions = jnp.zeros((cfg.num_envs, env.action_size))
         return TrainState(
             config=cfg,

@@ -30,7 +30,7 @@ from jaxsafe.config import (
     check_values,
     config,
 )
-from jaxsafe.learn.acting import Acted, Learned, learned_of, reset_carry
+from jaxsafe.learn.acting import Acted, Learned, first_carries, learned_of, reset_carry
 from jaxsafe.learn.augment import Augmentation, no_augmentation
 from jaxsafe.learn.batch import all_finite, batch_mean, device_key, psum, select
 from jaxsafe.learn.constraints import (
@@ -337,7 +337,9 @@ def on_policy_loop(env: Env, method: Method, axis_name: str | None) -> Algorithm
         obs = jax.tree.map(operator.itemgetter(0), rollout.state.obs)
         check_observation(obs, cfg)
         nets = init_nets(params_key, blank(obs), wrapped.action_size, names, cfg)
-        carry = jnp.zeros((cfg.num_envs, cfg.hidden[-1])) if cfg.trunk == "gru" else ()
+        normaliser = init_normaliser(env.obs_size) if cfg.obs_normalize else ()
+        learned = Learned(cfg, nets.params, dual, normaliser)
+        carry = first_carries(gaussian_policy, learned, cfg.num_envs)
         return TrainState(
             config=cfg,
             params=nets.params,
@@ -346,7 +348,7 @@ def on_policy_loop(env: Env, method: Method, axis_name: str | None) -> Algorithm
                 "critics": nets.opt_state,
             },
             dual=dual,
-            normaliser=init_normaliser(env.obs_size) if cfg.obs_normalize else (),
+            normaliser=normaliser,
             signal_normaliser=init_signal_normaliser(cfg, len(names) or 1),
             rollout=dataclasses.replace(rollout, carry=carry),
             lost_time=no_lost_time(),
