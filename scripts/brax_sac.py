@@ -48,7 +48,7 @@ def command() -> int:
     parser.add_argument(
         "--backend", default="generalized", choices=BACKENDS, help="of Brax (generalized)"
     )
-    args = parser.parse_intermixed_args()
+    args = parser.parse_args()
     names = [word for word in args.words if "=" not in word] or ["halfcheetah"]
     if len(names) > 1:
         raise ConfigError(f"{' '.join(names)}: expected one task")

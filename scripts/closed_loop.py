@@ -24,6 +24,7 @@ with leaving_at_ctrl_c():
     from jaxsafe.commands.guard import guarded
     from jaxsafe.config import ConfigError
     from jaxsafe.learn.rollout import collect, init_rollout, memoryless
+    from jaxsafe.run.flags import Parser
 
 TURN, NOISE = 4.0, 0.3  # action per radian, and its standard deviation
 
@@ -114,7 +115,7 @@ def table(rows: list[dict]) -> str:
 
 
 def command() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = Parser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("envs", nargs="*", metavar="ENV")
     parser.add_argument("--variants", nargs="+", default=["c", "c:3"], metavar="ENGINE[:K]")
     parser.add_argument("--episodes", type=int, default=128)

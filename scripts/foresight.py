@@ -25,6 +25,7 @@ with leaving_at_ctrl_c():
     from jaxsafe.learn.dreaming import Behaviour
     from jaxsafe.learn.world_model import read, world_of
     from jaxsafe.report.dreams import Episode, foreseen, play
+    from jaxsafe.run.flags import Parser
 
 BEHAVIOURS: dict[str, Behaviour] = {
     "dreamer_lag": dreamer.priced,
@@ -90,7 +91,7 @@ def explained(predicted: np.ndarray, paid: np.ndarray) -> float:
 
 
 def command() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = Parser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("run", metavar="RUN")
     parser.add_argument("--episodes", type=int, default=40)
     parser.add_argument("--depth", type=int, default=15)

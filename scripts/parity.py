@@ -4,7 +4,6 @@ Prints the errors of each component on well-conditioned steps and on all, the ev
 'pass' or what is past its tolerance. Exit status: 0 all pass, 1 some do not, 2 bad input.
 """
 
-import argparse
 import platform
 import sys
 from importlib.metadata import version
@@ -19,6 +18,7 @@ with leaving_at_ctrl_c():
     from jaxsafe.commands.guard import guarded
     from jaxsafe.config import ConfigError
     from jaxsafe.envs.safety_gym.recording import Comparison, Recording, compare
+    from jaxsafe.run.flags import Parser
 
 FORCES = ("accelerometer", "touch")
 BODIES = ("robot pose", "robot velocity", "object pose", "object velocity", "reward")
@@ -114,7 +114,7 @@ def table(comparisons: list[Comparison]) -> str:
 
 
 def command(argv: list[str] | None) -> int:
-    parser = argparse.ArgumentParser(description="Replay recordings of the original engine.")
+    parser = Parser(description="Replay recordings of the original engine.")
     parser.add_argument("recordings", nargs="+", type=Path, metavar="RECORDING", help=".npz files")
     parser.add_argument("--engine", default="auto", help="auto (default), c, warp or jax")
     parser.add_argument("--awake", type=int, metavar="K", help="vases, and gremlins, simulated at once")

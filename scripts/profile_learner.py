@@ -33,6 +33,7 @@ with leaving_at_ctrl_c():
     from jaxsafe.commands.guard import guarded
     from jaxsafe.config import ConfigError, nearest
     from jaxsafe.learn.offline import DataSet, OfflineConfig, data_set
+    from jaxsafe.run.flags import Parser
     from jaxsafe.types import State
 
 
@@ -147,7 +148,7 @@ def show(kernels: list[Kernel], most: int) -> None:
 
 
 def command() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = Parser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("algo", metavar="ALGO")
     parser.add_argument("options", nargs="*", metavar="key=value")
     parser.add_argument("--seeds", type=int, default=1)
@@ -156,7 +157,7 @@ def command() -> int:
     parser.add_argument("--vision", type=int, nargs=2, metavar=("WIDTH", "HEIGHT"))
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--kernels", type=int, default=0, help="list so many of the slowest kernels")
-    args = parser.parse_intermixed_args()
+    args = parser.parse_args()
     if args.kernels:  # read when JAX first looks for a device
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_gpu_enable_command_buffer="
     if args.algo not in algos.ALGOS:

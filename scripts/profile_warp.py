@@ -29,6 +29,7 @@ with leaving_at_ctrl_c():
     from jaxsafe.envs.safety_gym import scene as scenes
     from jaxsafe.envs.safety_gym import sleeping
     from jaxsafe.envs.velocity.task import Velocity
+    from jaxsafe.run.flags import Parser
 
 VARIANTS = {  # name -> options of the model, factors on the room for contacts and for rows
     "as it is": ({}, 1.0, 1.0),
@@ -73,7 +74,7 @@ def simulated(env: envs.SafetyGym | Velocity, state) -> tuple[Simulation, dict[s
 
 
 def command() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = Parser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("env", metavar="ENV")
     parser.add_argument("--num-envs", type=int, default=16384)
     parser.add_argument("--top", type=int, default=22, help="kernels to list")

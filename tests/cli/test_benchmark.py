@@ -233,3 +233,13 @@ def test_the_products_of_a_program_are_counted_in_loops_branches_and_gradients()
     assert count(once) == 2 * 3 * 6 * 4
     assert count(often) == count(jax.jit(often)) == 5 * count(once)
     assert count(jax.grad(once)) == 2 * count(once)  # forward, and back to the weights
+
+
+@pytest.mark.parametrize(
+    "name", ["closed_loop", "foresight", "parity", "profile_learner", "profile_warp"]
+)
+def test_a_script_refuses_what_it_cannot_read_in_one_line(name, monkeypatch, capsys):
+    script = runpy.run_path(str(SCRIPTS / f"{name}.py"))
+    monkeypatch.setattr(sys, "argv", [f"{name}.py", "x", "--nothing"])
+    assert script["main"]() == 2
+    assert capsys.readouterr().err == "error: unrecognized arguments: --nothing\n"
