@@ -10,11 +10,9 @@ algorithm may be left out, as it can be large; a run that is resumed without it 
 """
 
 import contextlib
-import hashlib
 import json
 import logging
 import math
-import os
 import re
 import shutil
 import sys
@@ -173,16 +171,16 @@ def save(folder: Path, ts: PyTree, at: Progress, since: int = 0, replay: bool = 
         manifest = {
             **at._asdict(),
             "since": since,
-            "files": {name: digest(part / name) for name in files.below(part)},
+            "files": {name: files.digest(part / name) for name in files.below(part)},
             "leaves": kinds(arrays),
         }
         files.write(part / "manifest.json", json.dumps(manifest, indent=1))
         for name in files.below(part):
-            sync(part / name)
+            files.sync(part / name)
         if target.exists():
             shutil.rmtree(target)
         part.rename(target)
-        sync(folder)
+        files.sync(folder)
     except Exception as error:  # Orbax and TensorStore raise many kinds
         shutil.rmtree(part, ignore_errors=True)
         last = checkpoints(folder)
@@ -319,7 +317,7 @@ def verify(path: Path, manifest: Manifest) -> None:
     if (found := sum((path / name).lstat().st_size for name in present)) > 2 * size + OVERHEAD:
         raise CheckpointError(f"its files have {found:,} bytes, its arrays {size:,}")
     for name, expected in manifest.files.items():
-        if digest(path / name) != expected:
+        if files.digest(path / name) != expected:
             raise CheckpointError(f"checksum of {name} differs")
 
 
@@ -381,20 +379,6 @@ def checkpoints(folder: Path) -> list[Path]:
     found = folder.glob("[0-9]" * 8) if folder.is_dir() else ()
     found = (files.inside(folder, path.name) for path in found)
     return sorted((p for p in found if files.there(p / "manifest.json")), reverse=True)
-
-
-def digest(path: Path) -> str:
-    """The SHA-256 of a plain file."""
-    with files.opened(path) as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def sync(path: Path) -> None:
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 def leaf_in_words(leaf: Kind | None) -> str:

@@ -44,7 +44,7 @@ from jaxsafe.config import ConfigError, flat, nearest, one_line
 from jaxsafe.envs.registry import OF_ENGINE
 from jaxsafe.learn.observations import vector_of
 from jaxsafe.learn.offline import DataSet, data_set
-from jaxsafe.run import checkpoint, files
+from jaxsafe.run import files
 from jaxsafe.run.plain import as_text
 
 # name in the file -> the field that it is, and how many axes it has
@@ -425,7 +425,7 @@ def sha256(path: str) -> str:
     Raises:
         ConfigError: there is no such file.
     """
-    return checkpoint.digest(found(path))
+    return files.digest(found(path))
 
 
 def found(path: str) -> Path:

@@ -11,6 +11,7 @@ import contextlib
 import csv
 import errno
 import fcntl
+import hashlib
 import io
 import json
 import lzma
@@ -188,6 +189,12 @@ def opened(path: Path) -> io.BufferedReader:
     return os.fdopen(handle, "rb")
 
 
+def digest(path: Path) -> str:
+    """The SHA-256 of a plain file."""
+    with opened(path) as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
 def read(path: Path) -> bytes:
     """A whole file, within the limit of its name.
 
@@ -348,6 +355,15 @@ def appending(path: Path) -> io.TextIOWrapper:
         os.close(handle)
         raise ConfigError(f"{path} is {kind_of(path)}; expected a plain file of one name")
     return os.fdopen(handle, "a", newline="")
+
+
+def sync(path: Path) -> None:
+    """Put a file or the entries of a folder on the disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 def kind_of(path: Path) -> str:
