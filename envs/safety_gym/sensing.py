@@ -88,7 +88,7 @@ class Shapes:
 
 
 def natural_lidar(
-    shapes: Shapes, position: jax.Array, rotation: jax.Array, bins: int, group: int, slack: float = 0.0
+    shapes: Shapes, position: jax.Array, rotation: jax.Array, bins: int, group: int, slack: float
 ) -> jax.Array:
     """exp(-distance) at which `bins` level rays from the robot's centre meet geoms of a group.
 

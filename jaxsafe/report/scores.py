@@ -76,7 +76,7 @@ def normalized_return(env: str, ret):
     return ret / CHARACTERISTIC[env].ret
 
 
-def normalized_violation(env: str, cost, cost_limit: float = 25.0):
+def normalized_violation(env: str, cost, cost_limit: float):
     """0 within the limit, 1 where unconstrained PPO is; `cost` a float or an array."""
     return np.maximum(cost - cost_limit, 0.0) / max(1e-6, CHARACTERISTIC[env].cost - cost_limit)
 

@@ -228,7 +228,7 @@ def settings_from_config(config: dict[str, Any], extras: Extras = NO_EXTRAS) -> 
     return Settings(env_name, entry, options, algo_name, row, configs, train)
 
 
-def settings_of_run(config: dict[str, Any], extras: Extras = NO_EXTRAS) -> Settings:
+def settings_of_run(config: dict[str, Any], extras: Extras) -> Settings:
     """`settings_from_config` of what `run_folder.read_config` finds in a run folder.
 
     Raises:
@@ -299,10 +299,7 @@ def defaults_of(
 
 
 def resumed(
-    folder: Path,
-    names: Mapping[str, str | None],
-    extras: Extras = NO_EXTRAS,
-    given: Collection[str] = (),
+    folder: Path, names: Mapping[str, str | None], extras: Extras, given: Collection[str]
 ) -> dict[str, Any]:
     """Every option of the run in `folder`, which must be of this environment and algorithm."""
     saved = settings_of_run(run_folder.read_config(folder), extras)

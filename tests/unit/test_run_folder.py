@@ -187,8 +187,8 @@ def test_cost_rate_is_total_cost_over_total_steps_of_each_seed():
 def test_unconstrained_ppo_scores_one_and_a_safe_policy_violates_by_zero():
     for env, ppo in scores.CHARACTERISTIC.items():
         assert scores.normalized_return(env, ppo.ret) == 1
-        assert scores.normalized_violation(env, ppo.cost) == pytest.approx(1)
-        assert str(scores.normalized_violation(env, 3.0)) == "0.0"
+        assert scores.normalized_violation(env, ppo.cost, 25.0) == pytest.approx(1)
+        assert str(scores.normalized_violation(env, 3.0, 25.0)) == "0.0"
     assert len(scores.CHARACTERISTIC) == 18
 
 
