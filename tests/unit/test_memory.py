@@ -1,5 +1,7 @@
 """Whether a run fits: what a program takes, by the four numbers of XLA, and what is advised."""
 
+from functools import cache
+
 import jax
 import numpy as np
 import pytest
@@ -18,6 +20,7 @@ SAC = (
 COUNTERS = 8  # bytes of the two numbers that the loop hands to an update
 
 
+@cache
 def compiled(*texts):
     """A program with its data set in place, its compiled update and its train state."""
     _, program = session.prepare(compose([*texts]))
@@ -120,9 +123,17 @@ def test_in_a_container_this_process_has_taken_some_of_its_limit(monkeypatch):
     assert checkpoint.host_memory() == float("inf")
 
 
-def test_any_command_that_runs_out_of_memory_ends_with_one_line(capsys):
+@pytest.mark.parametrize(
+    "said",
+    [
+        "RESOURCE_EXHAUSTED: Out of memory while trying to allocate 64424509440 bytes.",
+        "INTERNAL: Error dispatching computation: Out of memory allocating 4800000000 bytes.",
+        "INTERNAL: Failed to allocate: CUDA_ERROR_OUT_OF_MEMORY: out of memory",
+    ],
+)
+def test_any_command_that_runs_out_of_memory_ends_with_one_line(said, capsys):
     def evaluate():
-        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 64 bytes.")
+        raise jax.errors.JaxRuntimeError(said)
 
     assert guarded(evaluate) == 1
     line = "error: out of memory; use fewer environments, seeds or episodes\n"
