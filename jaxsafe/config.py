@@ -255,7 +255,7 @@ def kind_in_words(kind: Any) -> str:
     if origin in (typing.Union, types.UnionType):
         return " or ".join("null" if a is type(None) else kind_in_words(a) for a in args)
     if origin is tuple and args[-1] is Ellipsis:
-        return f"a list of {kind_in_words(args[0])}"
+        return f"a list, of which each is {kind_in_words(args[0])}"
     if origin is dict:
         return f"names with {kind_in_words(args[1])} each, as in {{name: 5}}"
     if origin is tuple:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 from jaxsafe.config import ConfigError, Index, Seed
 from jaxsafe.run.devices import use_compilation_cache
 from jaxsafe.run.flags import Parser, number
-from jaxsafe.run.policies import CODE, ROBOT, RunPolicy, open_run
+from jaxsafe.run.policies import ONLY_CODE, ROBOT, RunPolicy, open_run
 
 
 class Targets(NamedTuple):
@@ -42,10 +42,7 @@ def parse(parser: argparse.ArgumentParser) -> tuple[argparse.Namespace, Targets]
     folders = [Path(text).expanduser() for text in args.what if text not in options]
     for text in options if folders else ():
         if not text.startswith(("env=", "algo=", f"{ROBOT}=")):
-            raise ConfigError(
-                f"{text}: with a run, expected {' or '.join(CODE)}, if its environment, algorithm or "
-                "robot is yours"
-            )
+            raise ConfigError(f"{text}: {ONLY_CODE}")
     return args, Targets(folders, options)
 
 

@@ -32,6 +32,7 @@ from jaxsafe.types import Algorithm, Env, PyTree, Shared
 
 ROBOT = "env.robot_base"
 CODE = ("env=MODULE:NAME", "algo=MODULE:NAME", f"{ROBOT}=PATH")  # what a user gives beside a run folder
+ONLY_CODE = f"with a run, expected {' or '.join(CODE)}, if its environment, algorithm or robot is yours"
 POLICY = ("params", "normaliser")  # what another run can start from, of all that is learned
 
 
@@ -56,7 +57,8 @@ class RunPolicies(NamedTuple):
         """
         count = self.settings.num_members
         if not 0 <= index < count:
-            raise ConfigError(f"index {index}: the run has {count} policies, from 0, in {self.folder}")
+            have = f"{count} policies, from 0" if count > 1 else "one policy, 0"
+            raise ConfigError(f"index {index}: the run has {have}, in {self.folder}")
         learned = jax.tree.map(lambda x: x[index], self.learned)
         return RunPolicy(self.settings, self.env, self.algo, learned)
 
@@ -80,7 +82,7 @@ def open_run(folder: Path, code: Sequence[str] = (), extras: Extras = NO_EXTRAS)
     given = dict(text.split("=", 1) for text in code)
     for kind, name in given.items():
         if kind not in (*DEFAULT, ROBOT):
-            raise ConfigError(f"{kind}={name}: expected {' or '.join(CODE)}")
+            raise ConfigError(f"{kind}={name}: {ONLY_CODE}")
         there = flat(saved).get(kind if kind == ROBOT else f"{kind}.name")
         if name != there:
             raise ConfigError(f"{kind}={name}: {folder} was trained with {kind}={there}")

@@ -441,6 +441,8 @@ def test_evaluate_takes_one_run(tmp_path, capsys):
     assert typed("evaluate", str(run), "runs/b") == 2
     said = capsys.readouterr().err
     assert said.startswith("error: runs/b: expected one run folder, and") and said.count("\n") == 1
+    assert typed("evaluate", str(run), "env.observe_vision=true") == 2
+    assert "vision=true: with a run, expected env=MODULE:NAME or" in capsys.readouterr().err
     assert typed("evaluate") == 2
     assert capsys.readouterr().err == "error: the following arguments are required: RUN\n"
 

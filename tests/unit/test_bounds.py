@@ -130,6 +130,8 @@ def test_infinity_is_taken_only_where_it_means_something():
 
 def test_numbers_inside_lists_names_and_what_may_be_null_have_their_bounds():
     assert convert([0, 1], tuple[Share, ...], "x") == (0.0, 1.0)
+    with pytest.raises(ConfigError, match="x='a': expected a list, of which each is a string"):
+        convert("a", tuple[str, ...], "x")
     for value, kind, says in (
         ([0, 2], tuple[Share, ...], r"x\[1\]=2: expected a number between 0 and 1"),
         ({"a": -1}, dict[str, Share] | None, r"x\.a=-1: expected a number between 0 and 1"),
