@@ -20,6 +20,7 @@ from jaxsafe import envs
 from jaxsafe.config import ConfigError, EpisodeCount, Index, Seed, convert, flat
 from jaxsafe.envs import SafetyGymConfig, VelocityConfig
 from jaxsafe.learn.acting import Player, first_actions
+from jaxsafe.learn.observations import check_fits, observation_like
 from jaxsafe.report import evaluation, film, sweep_summary
 from jaxsafe.report.evaluation import Scores
 from jaxsafe.report.finish import finish
@@ -150,7 +151,8 @@ class Run:
             float [..., action_size]; environments clip it to [-1, 1].
 
         Raises:
-            ConfigError: no such policy, no checkpoint yet, or a policy that plans in the simulator.
+            ConfigError: no such policy, no checkpoint yet, an observation of another environment, or a
+                policy that plans in the simulator.
         """
         player = self._opened.one(index).player
         if player.policy.privileged(player.learned):
@@ -158,6 +160,7 @@ class Run:
                 f"{self.folder}: this policy plans in the simulator, so an observation is not enough; "
                 "player(index) takes a state"
             )
+        check_fits(obs, self._observed)
         return self._act(self._opened.learned, index, obs, key)
 
     def player(self, index: int = 0) -> Player:
@@ -196,6 +199,10 @@ class Run:
         saved = flat(self.settings.plain())
         code = [f"{ROBOT}={saved[ROBOT]}"] if ROBOT in self._given else []
         return open_run(self.folder, code, self._extras)
+
+    @functools.cached_property
+    def _observed(self) -> PyTree:
+        return observation_like(self.env())
 
     @functools.cached_property
     def _act(self) -> Any:

@@ -7,6 +7,7 @@ from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxsafe.config import ConfigError, config
 from jaxsafe.nn.cnn import FEATURES, encoded, init_encoder
@@ -81,3 +82,31 @@ def check_observation(like: PyTree, cfg: Any) -> None:
         pictures = "env.observe_vision=true"
         expected = f"cnn for {pictures}" if shows else f"none, or {pictures} for pictures"
         raise ConfigError(f"algo.encoder={cfg.encoder}: expected {expected}")
+
+
+def check_fits(obs: Any, like: PyTree) -> None:
+    """Refuse `obs` unless it is such an observation as `like`, or a batch [...] of them.
+
+    Raises:
+        ConfigError: other parts or sizes, or something that is no observation.
+    """
+    found, wanted = (x if isinstance(x, dict) else {"": x} for x in (obs, like))
+    arrays = all(isinstance(x, jax.Array | np.ndarray) for x in found.values())
+    fits = arrays and found.keys() == wanted.keys()
+    if fits:
+        batches = {name: found[name].ndim - x.ndim for name, x in wanted.items()}
+        fits = all(found[name].shape[max(0, batches[name]) :] == x.shape for name, x in wanted.items())
+        fits = fits and len({found[name].shape[:batch] for name, batch in batches.items()}) == 1
+    if not fits:
+        raise ConfigError(
+            f"the observation is {parts_in_words(obs)}, expected {parts_in_words(like)} or a batch of "
+            "them, as run.env() observes"
+        )
+
+
+def parts_in_words(obs: Any) -> str:
+    """'vector [60], vision [64, 64, 3]': the parts of an observation, by their shapes."""
+    if isinstance(obs, dict):
+        return ", ".join(f"{name} {parts_in_words(x)}" for name, x in sorted(obs.items()))
+    shaped = isinstance(obs, jax.Array | np.ndarray | jax.ShapeDtypeStruct)
+    return str([*obs.shape]) if shaped else f"a {type(obs).__name__}"

@@ -229,6 +229,23 @@ def test_a_policy_acts_on_what_its_environment_shows(run):
         run.policy(obs, index=2)
 
 
+def test_a_policy_refuses_the_observations_of_another_environment(run):
+    state = Corridor().reset(jax.random.key(0))
+    for given, found in (
+        (state.obs, r"\[4\]"),
+        (jnp.zeros((3, 4)), r"\[3, 4\]"),
+        (state, "a State"),
+        ([0.0] * 5, "a list"),
+        ({"vector": jnp.zeros(5)}, r"vector \[5\]"),
+    ):
+        with pytest.raises(jaxsafe.ConfigError, match=rf"is {found}, expected \[5\] or a batch"):
+            run.policy(given)
+        if given is not state:  # which is no array: jit would take it apart
+            with pytest.raises(jaxsafe.ConfigError, match=r"expected \[5\]"):
+                jax.jit(run.policy)(given)
+    assert run.policy(np.zeros((2, 3, 5), np.float32)).shape == (2, 3, 2)
+
+
 def test_a_policy_that_plans_in_the_simulator_acts_on_a_state_alone(tmp_path):
     plans = {"true_model": True, "learning_starts": 0, "plans": 8, "elites": 3, "plan_steps": 3}
     run = jaxsafe.train(
@@ -242,6 +259,8 @@ def test_a_policy_that_plans_in_the_simulator_acts_on_a_state_alone(tmp_path):
     assert plan.step == 1
     with pytest.raises(jaxsafe.ConfigError, match="this policy plans in the simulator"):
         run.policy(jnp.zeros(4))
+    with pytest.raises(jaxsafe.ConfigError, match="index 1: the run has one policy, 0, in"):
+        run.player(1)
 
 
 def test_evaluation_is_that_of_the_script(run):

@@ -20,6 +20,7 @@ from jaxsafe.learn.acting import first_actions
 from jaxsafe.learn.observations import (
     EncoderConfig,
     blank,
+    check_fits,
     check_observation,
     features,
     observation_like,
@@ -86,6 +87,31 @@ def test_a_policy_acts_on_batches_of_pictures():
     np.testing.assert_array_equal(first_actions(policy, (), obs, None), expected)
     alone = jax.tree.map(lambda x: x[1, 2], obs)
     np.testing.assert_array_equal(first_actions(policy, (), alone, None), expected[1, 2])
+
+
+def test_only_observations_with_the_same_parts_and_sizes_fit():
+    like = {
+        "vector": jax.ShapeDtypeStruct((5,), jnp.float32),
+        "vision": jax.ShapeDtypeStruct((8, 6, 3), jnp.uint8),
+    }
+
+    def obs(*, vector, vision):
+        return {"vector": np.zeros(vector), "vision": np.zeros(vision, np.uint8)}
+
+    for batch in ((), (4,), (2, 4)):
+        check_fits(obs(vector=(*batch, 5), vision=(*batch, 8, 6, 3)), like)
+    for bad in (
+        np.zeros(5),
+        {"vector": np.zeros(5)},
+        obs(vector=(5,), vision=(6, 8, 3)),
+        obs(vector=(4, 5), vision=(8, 6, 3)),
+        obs(vector=(), vision=(8, 6, 3)),
+        obs(vector=(5,), vision=(6, 3)),
+    ):
+        with pytest.raises(
+            ConfigError, match=r"expected vector \[5\], vision \[8, 6, 3\] or a batch of them"
+        ):
+            check_fits(bad, like)
 
 
 ON_POLICY = [("ppo_lag", {"trunk": "shared"}), ("cpo", {}), ("trpo_lag", {}), ("focops", {})]
