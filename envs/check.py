@@ -1,4 +1,4 @@
-"""Whether an environment that someone else wrote is an `Env` that learners can use."""
+"""Whether an environment that someone else wrote is an `Env`, and whether an action fits one."""
 
 from typing import Any
 
@@ -49,6 +49,17 @@ def check_env(env: Any, name: str) -> Env:
     for member, dtype in TOLD.items():
         check_told(env, member, dtype, name)
     return env
+
+
+def check_action(action: Any, size: int) -> None:
+    """Refuse, as a step is traced, an action that is not [size]. One of [1] would drive every motor.
+
+    Raises:
+        ConfigError: it has another shape.
+    """
+    if (shape := jnp.shape(action)) != (size,):
+        several = "; step takes one environment, and jax.vmap(env.step) several" * (len(shape) > 1)
+        raise ConfigError(f"the action is {list(shape)}, expected [{size}]{several}")
 
 
 def check_told(env: Env, member: str, dtype: Any, name: str) -> None:

@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxsafe.config import Amount, Bounds, Weight
+from jaxsafe.envs.check import check_action
 from jaxsafe.envs.without_model import WithoutModel
 from jaxsafe.learn.certificate import interval_barrier
 from jaxsafe.types import State
@@ -53,6 +54,7 @@ class Pendulum(WithoutModel):
         return arrived(jnp.array([0.3, -0.9]), jnp.zeros(()), jnp.zeros(()))
 
     def step(self, state: State, action: jax.Array) -> State:
+        check_action(action, self.action_size)
         angle, velocity = state.physics
         # rad/s^2: 3 g / (2 l) and 3 u / (m l^2), with g = 10 m/s^2, l = 1 m, m = 1 kg
         push = 15.0 * jnp.sin(angle) + 6.0 * jnp.clip(action[0], -1.0, 1.0)
@@ -92,6 +94,7 @@ class CartPendulum(WithoutModel):
         return arrived(jnp.zeros(4), jnp.zeros(()), jnp.zeros(()))
 
     def step(self, state: State, action: jax.Array) -> State:
+        check_action(action, self.action_size)
         force = 100.0 * jnp.clip(action[0], -1.0, 1.0)
         x = runge_kutta(partial(cart_motion, force=force), state.physics, DT)
         x = runge_kutta(partial(cart_motion, force=force), x, DT)

@@ -22,6 +22,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxsafe.config import Amount, Bounds, Pixels
+from jaxsafe.envs.check import check_action
 from jaxsafe.envs.racing.car import DT, OFF_ROAD, Car, drive, length, parked, rolling, rotated, wheels
 from jaxsafe.envs.racing.obstacles import Obstacles, centre, touching
 from jaxsafe.envs.racing.picture import picture
@@ -108,6 +109,7 @@ class CarRacing(WithoutModel):
         return state.replace(reward=zero, info={name: zero for name in state.info})
 
     def step(self, state: State, action: jax.Array) -> State:
+        check_action(action, self.action_size)
         world = state.physics
         steer, gas, brake = jnp.clip(action, -1.0, 1.0)
         grip = jnp.where(world.on_road, 1.0, OFF_ROAD).reshape(2, 2).mean(1)  # of each axle

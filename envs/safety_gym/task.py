@@ -22,6 +22,7 @@ import numpy as np
 
 from jaxsafe.config import ConfigError
 from jaxsafe.envs import engines
+from jaxsafe.envs.check import check_action
 from jaxsafe.envs.engines import Physics, Readings
 from jaxsafe.envs.safety_gym import costs as constraints
 from jaxsafe.envs.safety_gym import layout as layouts
@@ -187,6 +188,7 @@ class SafetyGym:
 
     def drive(self, world: World, action: jax.Array) -> Drive:
         """What comes before the physics of a step."""
+        check_action(action, self.action_size)
         cfg = self.config
         key, noise_key, skip_key, goal_key = jax.random.split(world.key, 4)
         low, high = self.scene.model.actuator_ctrlrange.T

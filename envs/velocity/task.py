@@ -25,6 +25,7 @@ import jax.numpy as jnp
 import mujoco
 
 from jaxsafe.envs import engines
+from jaxsafe.envs.check import check_action
 from jaxsafe.envs.engines import Physics, Readings, Room, Simulation
 from jaxsafe.envs.velocity.config import ROBOTS, VelocityConfig
 from jaxsafe.types import State
@@ -150,6 +151,7 @@ class Velocity:
         )
 
     def step(self, state: State, action: jax.Array) -> State:
+        check_action(action, self.action_size)
         ctrl = action * jnp.asarray(self.model.actuator_ctrlrange[:, 1], jnp.float32)
         return self.judge(state, ctrl, *self._engine.run(state.physics.physics, ctrl))
 

@@ -316,6 +316,20 @@ def test_a_wrong_option_is_refused_in_a_line_that_helps(options, says):
     assert says in str(error.value) and "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize(
+    "name", ["point_goal0", "halfcheetah_velocity", "car_racing0", "pendulum_tilt", "pendulum_swing"]
+)
+def test_an_action_of_another_size_is_refused_and_not_spread_over_the_motors(name):
+    env = envs.make(name)
+    state, size = jax.eval_shape(env.reset, jax.random.key(0)), env.action_size
+    assert jax.eval_shape(env.step, state, jnp.zeros(size)).reward.shape == ()
+    for shape in ((), (size + 1,), (size - 1,), (4, size)):
+        with pytest.raises(ConfigError) as error:
+            jax.eval_shape(env.step, state, jnp.zeros(shape))
+        assert f"the action is {[*shape]}, expected [{size}]" in str(error.value)
+        assert ("jax.vmap" in str(error.value)) == (len(shape) == 2)
+
+
 def test_a_robot_whose_actions_have_no_bounds_is_refused(tmp_path):
     bounded = 'ctrlrange="-1 1" ctrllimited="true"'
     path = built_in("point")
