@@ -14,7 +14,7 @@ import scipy
 
 from jaxsafe.algos import dreamer
 from jaxsafe.config import Bounds, ConfigError, Iterations, Share, Weight, config
-from jaxsafe.learn.acting import Learned, Player, Playing
+from jaxsafe.learn.acting import Course, Learned, Player, course
 from jaxsafe.learn.constraints import Costs, check_cost_names, signal
 from jaxsafe.learn.dreaming import (
     Behaviour,
@@ -119,8 +119,9 @@ class AMBSConfig(dreamer.ForesightConfig):
     # Costs of the environment that are violations where they are above 0. []: `cost`.
     labels: tuple[str, ...] = ()
     violation_cost: Annotated[float, Bounds(1e-3, 1e6)] = 10.0  # C, as in the paper.
-    # Where the shield looks ahead: in the model's dreams, or in copies of the simulator.
-    shield: Literal["dreams", "true_dynamics"] = "dreams"
+    # Where the shield looks ahead: in the model's dreams, or in copies of the simulator. none: nothing
+    # overrules pi, and A_pen alone keeps it from violations.
+    shield: Literal["dreams", "true_dynamics", "none"] = "dreams"
     # By which bound it decides. hoeffding: as in the paper. binomial: exact, so fewer dreams do.
     rule: Literal["hoeffding", "binomial"] = "binomial"
     # m, dreams of the shield at each step. The paper has 512. More than 65,536 are beyond what 32 bits
@@ -403,6 +404,8 @@ def shielded(env: Env, policy: Policy) -> Policy:
         learned: Learned, carry: Memory, obs: Any, key: jax.Array | None
     ) -> tuple[jax.Array, Memory, dict[str, Any]]:
         act_key, backup_key, dream_key = keys_of(key)
+        if learned.config.shield == "none":
+            return policy.act(learned, carry, obs, act_key)
         in_simulator = privileged(learned)
         proposed, after, said = policy.act(learned, carry, obs.obs if in_simulator else obs, act_key)
         if in_simulator:
@@ -456,6 +459,8 @@ def overruled_from(cfg: Any) -> int:
 def check(cfg: Any, env: Env, data: Any = ()) -> None:
     """Raise ConfigError for unknown labels, and for a shield that would always act, or never."""
     check_cost_names("labels", cfg.labels, env)
+    if cfg.shield == "none":
+        return
     if cfg.shield == "dreams" and cfg.verdict == "summed" and cfg.discount == 1:
         raise ConfigError(
             "discount=1: expected less, as verdict=summed tells steps within shield_horizon by it"
@@ -489,7 +494,9 @@ def acceptable(cfg: Any) -> str:
 
 
 def note(cfg: Any) -> str:
-    """What the shield guarantees with these settings, in one line."""
+    """What the shield guarantees with these settings, in one line; '' without one."""
+    if cfg.shield == "none":
+        return ""
     m, eps, confidence = cfg.shield_rollouts, float(cfg.eps), float(cfg.confidence)
     what = "dreams" if cfg.shield == "dreams" else "copies of the simulator"
     least = overruled_from(cfg)
@@ -518,41 +525,17 @@ def note(cfg: Any) -> str:
 # ---- evaluation --------------------------------------------------------------------------------
 
 
-class Course(NamedTuple):
-    """An episode of T steps, [T] each: whether it still runs; p, and whether the shield overruled; the
-    reward, and whether the step had a violation; whether the episode failed with it."""
+class Foreseen(NamedTuple):
+    """T steps of an episode, [T] each: whether it still runs, p, whether the step had a violation, and
+    whether the episode failed with it."""
 
     alive: jax.Array
     risk: jax.Array
-    overruled: jax.Array
-    reward: jax.Array
     violation: jax.Array
     failed: jax.Array
 
 
-def course(player: Player, key: jax.Array, sampled: bool) -> Course:
-    """An episode of mean or of `sampled` actions, the one that evaluation plays with this key."""
-    reset_key, act_key = jax.random.split(key)
-    env, cfg = player.task, player.learned.config
-
-    def step(now: Playing, t: jax.Array) -> tuple[Playing, Course]:
-        sample_key = jax.random.fold_in(act_key, t) if sampled else None
-        action, carry, said = player.decide(now.carry, now.state, sample_key)
-        state = env.step(now.state, action)
-        found = Course(
-            now.alive,
-            said["risk"],
-            said["overruled"] & now.alive,
-            jnp.where(now.alive, state.reward, 0.0),
-            violated(env, state, cfg) & now.alive,
-            state.terminated & now.alive,
-        )
-        return Playing(state, carry, now.alive & ~state.ended), found
-
-    return jax.lax.scan(step, player.start(reset_key), jnp.arange(env.episode_length))[1]
-
-
-def came_true(found: Course, horizon: int) -> tuple[jax.Array, jax.Array]:
+def came_true(found: Foreseen, horizon: int) -> tuple[jax.Array, jax.Array]:
     """Of each step whether one of the next `horizon` steps had a violation, and whether that is known,
     bool [T] each. It is not where fewer than `horizon` steps were left of an episode that did not fail:
     to count those of them that had a violation would choose steps by what came."""
@@ -572,7 +555,7 @@ def came_true(found: Course, horizon: int) -> tuple[jax.Array, jax.Array]:
     return until <= horizon, found.alive & (known >= horizon)
 
 
-def brier_score(found: Course, horizon: int) -> jax.Array:
+def brier_score(found: Foreseen, horizon: int) -> jax.Array:
     """The mean of (p_t - e_t)^2 over steps of which e_t is known, float []; NaN if there are none.
 
     e_t is 1 if one of the next `horizon` steps had a violation, and 0 if none had.
@@ -582,7 +565,7 @@ def brier_score(found: Course, horizon: int) -> jax.Array:
     return jnp.where(counts.any(), total / jnp.maximum(counts.sum(), 1), jnp.nan)
 
 
-def calibration(found: Course, horizon: int) -> jax.Array:
+def calibration(found: Foreseen, horizon: int) -> jax.Array:
     """Of the steps with p in each of `PARTS` equal parts of [0, 1], float [3, PARTS]: how many there
     are, the sum of their p, and how many had a violation within `horizon` steps.
 
@@ -594,47 +577,46 @@ def calibration(found: Course, horizon: int) -> jax.Array:
     return summed @ jax.nn.one_hot(part, PARTS)
 
 
-def examine(algo: Algorithm, learned: PyTree, keys: jax.Array, sampled: bool) -> Examined:
-    """What the shield does, and what episodes are without it, in the episodes of `keys` [S, N].
+def compared(found: Foreseen, horizon: int) -> tuple[jax.Array, jax.Array]:
+    return brier_score(found, horizon), calibration(found, horizon)
 
-    They are those of the S policies in `learned`, with mean or with `sampled` actions.
+
+def examine(
+    algo: Algorithm, learned: PyTree, shielded: Course, keys: jax.Array, sampled: bool
+) -> Examined:
+    """What the shield does in the `shielded` episodes of `keys` [S, N], of mean or of `sampled` actions
+    by the S policies in `learned`; and what the same episodes are without it.
 
     The Brier score and the calibration are always of sampled actions without the shield: the shield
     dreams of those.
     """
-    horizon = learned.config.shield_horizon
-    delta, never = learned.config.delta, jnp.full_like(learned.config.delta, jnp.inf)
+    env, cfg = algo.task(jax.tree.map(lambda x: x[0], learned)), learned.config
+    violations = violated(env, shielded, cfg) & shielded.alive
+    measures = {"violations": violations.sum(2).astype(jnp.float32)}
+    if cfg.shield == "none":
+        return Examined(jax.tree.map(np.asarray, measures))
 
-    def of_one(
-        learned: PyTree, keys: jax.Array, delta: jax.Array, sampled: bool
-    ) -> dict[str, jax.Array]:
-        learned = dataclasses.replace(learned, config=dataclasses.replace(learned.config, delta=delta))
-        player = Player(algo.policy, learned, algo.task(learned))
-        found = jax.vmap(lambda key: course(player, key, sampled))(keys)
-        steps = jnp.maximum(found.alive.sum(1), 1)
-        return {
-            "override rate": found.overruled.sum(1) / steps,
-            "violations": found.violation.sum(1).astype(jnp.float32),
-            "return": found.reward.sum(1),
-            "Brier score": jax.vmap(lambda x: brier_score(x, horizon))(found),
-            "calibration": jax.vmap(lambda x: calibration(x, horizon))(found),
-        }
+    def play(sampled: bool, **settings: Any) -> Course:
+        def of_one(learned: PyTree, keys: jax.Array) -> Course:
+            player = Player(algo.policy, learned, algo.task(learned))
+            return jax.vmap(lambda key: course(player, key, sampled))(keys)
 
-    def play(delta: jax.Array, sampled: bool) -> dict[str, np.ndarray]:
-        found = programs[sampled](learned, keys, delta)
-        return {name: np.asarray(x) for name, x in found.items()}
+        bare = dataclasses.replace(learned, config=dataclasses.replace(cfg, **settings))
+        return jax.jit(jax.vmap(of_one))(bare, keys)
 
-    programs = {x: jax.jit(jax.vmap(partial(of_one, sampled=x))) for x in (False, True)}
-    shielded, bare = play(delta, sampled), play(never, sampled)
-    drawn = bare if sampled else play(never, True)
-    measures = {
-        "override rate": shielded["override rate"],
-        "violations": shielded["violations"],
-        "violations, no shield": bare["violations"],
-        "return, no shield": bare["return"],
-        "Brier score": drawn["Brier score"],
+    drawn = play(True, delta=jnp.full_like(cfg.delta, jnp.inf))  # it dreams, and never acts
+    bare = drawn if sampled else play(False, shield="none")
+    horizon, runs = cfg.shield_horizon, drawn.alive
+    found = Foreseen(runs, drawn.said["risk"], violated(env, drawn, cfg) & runs, drawn.terminated)
+    scores, parts = jax.jit(jax.vmap(jax.vmap(partial(compared, horizon=horizon))))(found)
+    acts = (shielded.said["overruled"] & shielded.alive).sum(2)
+    measures |= {
+        "override rate": acts / jnp.maximum(shielded.alive.sum(2), 1),
+        "violations, no shield": (violated(env, bare, cfg) & bare.alive).sum(2).astype(jnp.float32),
+        "return, no shield": bare.reward.sum(2),
+        "Brier score": scores,
     }
-    return Examined(measures, drawn["calibration"].sum(1))
+    return Examined(jax.tree.map(np.asarray, measures), np.asarray(parts.sum(1)))
 
 
 # ---- rows --------------------------------------------------------------------------------------

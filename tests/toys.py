@@ -45,7 +45,7 @@ def run_episodes(
     Actions are the mean ones, or `sampled`.
     """
     keys = keys_of_episodes(seed, num_episodes, range(len(jax.tree.leaves(learned)[0])))
-    return make_evaluation(algo, keys, sampled)(learned)
+    return make_evaluation(algo, keys, sampled)(learned)[0]
 
 
 def momentum(nets: Trainable, name: str) -> PyTree:

@@ -82,6 +82,43 @@ class Player(NamedTuple):
         return action, carry, jax.tree.map(jnp.float32, said)
 
 
+class Course(NamedTuple):
+    """T steps of an episode, [T, ...]. Those after its end are not `alive`: they earn and cost 0.
+
+    alive, terminated: bool. reward, cost: float, and costs: [T, K], of the environment's `cost_names`.
+    goal_met: float, NaN where the environment counts no goals. said: by name, what the policy reports
+    beside its action.
+    """
+
+    alive: jax.Array
+    reward: jax.Array
+    cost: jax.Array
+    costs: jax.Array
+    terminated: jax.Array
+    goal_met: jax.Array
+    said: dict[str, jax.Array]
+
+
+def course(player: Player, key: jax.Array, sampled: bool = False) -> Course:
+    """A whole episode, pure, of mean or of `sampled` actions; both begin with the same reset."""
+    reset_key, act_key = jax.random.split(key)
+    env = player.task
+
+    def step(now: Playing, t: jax.Array) -> tuple[Playing, Course]:
+        sample_key = jax.random.fold_in(act_key, t) if sampled else None
+        action, carry, said = player.decide(now.carry, now.state, sample_key)
+        state = env.step(now.state, action)
+        # what comes after the end may be anything, NaN included
+        reward, cost, costs, goal_met = (
+            jnp.where(now.alive, x, 0.0)
+            for x in (state.reward, state.cost, state.costs, state.info.get("goal_met", jnp.nan))
+        )
+        found = Course(now.alive, reward, cost, costs, state.terminated & now.alive, goal_met, said)
+        return Playing(state, carry, now.alive & ~state.ended), found
+
+    return jax.lax.scan(step, player.start(reset_key), jnp.arange(env.episode_length))[1]
+
+
 def first_carries(policy: Policy, learned: PyTree, num_envs: int) -> PyTree:
     """The carries [N, ...] at the start of N episodes."""
     return jax.tree.map(lambda x: jnp.broadcast_to(x, (num_envs, *x.shape)), policy.init(learned))

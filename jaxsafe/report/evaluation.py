@@ -47,8 +47,8 @@ def evaluate(
     settings = run.settings
     keys = keys_of_episodes(seed, num, settings.train.seeds, len(settings.configs))
     memory.check_episodes(run.env, num, len(keys))
-    episodes = make_evaluation(run.algo, keys, sampled)(run.learned)
-    examined = settings.row.examine(run.algo, run.learned, keys, sampled)
+    episodes, course = make_evaluation(run.algo, keys, sampled)(run.learned)
+    examined = settings.row.examine(run.algo, run.learned, course, keys, sampled)
     tables = list(run_folder.by_setting(run_folder.read_metrics(run.folder)).values())
     cost_names = run.algo.task(jax.tree.map(lambda x: x[0], run.learned)).cost_names
     seeds, by_setting, lost = settings.train.num_seeds, [], read_lost(run.folder)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsafe.learn.acting import Player, Playing
+from jaxsafe.learn.acting import Course, Player, course
 from jaxsafe.types import Algorithm, PyTree
 
 # the seed of the episodes that training plays, on the way and at its end: the same of every run
@@ -29,37 +29,22 @@ class Episodes(NamedTuple):
     goals: np.ndarray
 
 
-def episode(
-    player: Player,
-    key: jax.Array,
-    discount: jax.Array | float = 1.0,
-    cost_discount: jax.Array | float = 1.0,
-    sampled: bool = False,
+def totals(
+    steps: Course, discount: jax.Array | float = 1.0, cost_discount: jax.Array | float = 1.0
 ) -> Episodes:
-    """One whole episode, pure: rewards and costs count until termination or the limit.
-
-    Actions are the mean ones, or `sampled`; both begin with the same reset. The discounted sums,
-    sum_t discount^t r_t and likewise of costs, begin with the first step.
-    """
-    reset_key, act_key = jax.random.split(key)
-    env = player.task
+    """The sums of one episode. The discounted ones, sum_t discount^t r_t and likewise of costs, begin
+    with the first step."""
+    t = jnp.arange(len(steps.alive))
     summed: Any = Episodes  # of jax.Array while it is traced
-
-    def step(now: Playing, t: jax.Array) -> tuple[Playing, Episodes]:
-        sample_key = jax.random.fold_in(act_key, t) if sampled else None
-        action, carry = player.act(now.carry, now.state, sample_key)
-        state = env.step(now.state, action)
-        # what comes after the end may be anything, NaN included
-        reward, cost, costs = (
-            jnp.where(now.alive, x, 0.0) for x in (state.reward, state.cost, state.costs)
-        )
-        later = discount**t * reward, cost_discount**t * cost
-        goals = jnp.where(now.alive, state.info.get("goal_met", jnp.nan), 0.0)
-        sums = summed(reward, cost, costs, jnp.float32(now.alive), *later, goals)
-        return Playing(state, carry, now.alive & ~state.ended), sums
-
-    _, sums = jax.lax.scan(step, player.start(reset_key), jnp.arange(env.episode_length))
-    return jax.tree.map(lambda x: x.sum(0), sums)
+    return summed(
+        ret=steps.reward.sum(),
+        cost=steps.cost.sum(),
+        costs=steps.costs.sum(0),
+        length=jnp.float32(steps.alive).sum(),
+        discounted_ret=(discount**t * steps.reward).sum(),
+        discounted_cost=(cost_discount**t * steps.cost).sum(),
+        goals=steps.goal_met.sum(),
+    )
 
 
 def keys_of_episodes(
@@ -84,19 +69,26 @@ def keys_of_episodes(
 
 def make_evaluation(
     algo: Algorithm, keys: jax.Array, sampled: bool = False
-) -> Callable[[PyTree], Episodes]:
-    """What plays the episodes of `keys` [S, N] with S policies: learned [S, ...] -> Episodes.
+) -> Callable[[PyTree], tuple[Episodes, Course]]:
+    """What plays the episodes of `keys` [S, N] with S policies: learned [S, ...] -> their sums, and
+    their steps, [S, N, T, ...], on the device.
 
-    It compiles once.
+    Actions are the mean ones, or `sampled`. It compiles once.
     """
 
-    def one_seed(learned: PyTree, keys: jax.Array) -> Episodes:
+    def one_seed(learned: PyTree, keys: jax.Array) -> tuple[Episodes, Course]:
         player = Player(algo.policy, learned, algo.task(learned))
         discounts = learned.config.discount, learned.config.cost_discount
-        return jax.vmap(lambda key: episode(player, key, *discounts, sampled))(keys)
+        played = jax.vmap(lambda key: course(player, key, sampled))(keys)
+        return jax.vmap(lambda x: totals(x, *discounts))(played), played
 
     play = jax.jit(jax.vmap(one_seed))
-    return lambda learned: jax.tree.map(np.asarray, play(learned, keys))
+
+    def evaluate(learned: PyTree) -> tuple[Episodes, Course]:
+        episodes, played = play(learned, keys)
+        return jax.tree.map(np.asarray, episodes), played
+
+    return evaluate
 
 
 def make_training_evaluation(
@@ -111,7 +103,7 @@ def make_training_evaluation(
     players = [make_evaluation(algo, keys, sampled) for sampled in (False, True)]
 
     def evaluate(learned: PyTree) -> dict[str, np.ndarray]:
-        played = [play(learned) for play in players]
+        played = [play(learned)[0] for play in players]
         means = [x.mean(1) for episodes in played for x in (episodes.ret, episodes.cost)]
         return dict(zip(COLUMNS, means, strict=True))
 

@@ -19,6 +19,7 @@ import jaxsafe
 from jaxsafe import algos, api
 from jaxsafe.algos.ppo import PPOConfig
 from jaxsafe.config import config
+from jaxsafe.learn.acting import course
 from jaxsafe.learn.on_policy import on_policy
 from jaxsafe.learn.steps import adam_epochs
 from jaxsafe.learn.surrogates import clipped
@@ -28,7 +29,7 @@ from jaxsafe.report.evaluation import evaluate
 from jaxsafe.report.read import read
 from jaxsafe.run import checkpoint, programs, progress, run_folder
 from jaxsafe.run.arguments import compose
-from jaxsafe.run.evaluate import episode
+from jaxsafe.run.evaluate import totals
 from jaxsafe.run.plain import to_plain
 from jaxsafe.run.settings import Settings, nested, settings_from_options
 from jaxsafe.run.sweep_plan import Sweep, plan
@@ -289,7 +290,7 @@ def test_a_run_films_its_episode_of_the_median_return_or_that_of_its_seed(
     if episodes:
         (ret,) = run_episodes(made._opened.algo, made._opened.learned, episodes, seed=0).ret
         assert len({*ret.tolist()}) == episodes
-        assert np.argmin(abs(ret - episode(policy.player, key).ret)) == np.argsort(ret)[2]
+        assert np.argmin(abs(ret - totals(course(policy.player, key)).ret)) == np.argsort(ret)[2]
     else:
         assert (key == film.key_of(0)).all()
 

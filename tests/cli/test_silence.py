@@ -17,6 +17,7 @@ from tensorboard_events import tags
 from toys import Ticker, reflex
 
 from jaxsafe.learn import steps
+from jaxsafe.learn.acting import course
 from jaxsafe.report import plots
 from jaxsafe.report.group import group
 from jaxsafe.report.read import read
@@ -135,7 +136,7 @@ class Broken(Ticker):
 
 def test_what_comes_after_the_end_of_an_episode_does_not_count():
     player = reflex(lambda obs: obs[:1], Broken(episode_length=9, lives=(3, 3)))
-    found = evaluate.episode(player, jax.random.key(0))
+    found = evaluate.totals(course(player, jax.random.key(0)))
     assert (found.ret, found.cost, found.length) == (3, 6, 3)
 
 

@@ -20,7 +20,7 @@ from jaxsafe import envs
 from jaxsafe.algos import ALGOS, ambs, dreamer
 from jaxsafe.config import ConfigError
 from jaxsafe.learn import dreaming
-from jaxsafe.learn.acting import Learned, Player
+from jaxsafe.learn.acting import Learned, Player, course
 from jaxsafe.learn.dreaming import Judged, Range, Scene, no_range
 from jaxsafe.learn.next_step_rollout import collect_records, started
 from jaxsafe.learn.replay import Record
@@ -30,7 +30,7 @@ from jaxsafe.learn.world_model import Dreams, dream, dream_returns, world_of
 from jaxsafe.nn.gaussian import Gaussian
 from jaxsafe.nn.rssm import Latent
 from jaxsafe.report import evaluation
-from jaxsafe.run.evaluate import episode
+from jaxsafe.run.evaluate import make_evaluation
 from jaxsafe.types import Algorithm, Policy
 
 CFG = ambs.AMBSConfig(discount=1 - 1 / 333, rule="hoeffding", shield_rollouts=512, delta=0.1)
@@ -967,31 +967,54 @@ def test_a_shield_in_the_simulator_of_a_real_task_leaves_the_world_as_it_was():
 
 
 @pytest.mark.parametrize("sampled", [False, True])
-def test_the_shield_is_examined_in_the_episodes_of_evaluation(sampled):
+def test_without_a_shield_the_same_policy_plays_the_same_episodes(sampled):
+    """A shield that dreams and never acts changes nothing, and one that acts does."""
     algo, learned = newborn()
-    player = Player(algo.policy, learned, algo.task(learned))
     keys = jax.random.split(jax.random.key(3), 3)
 
-    @partial(jax.jit, compiler_options=FAST)
-    def both(keys):
-        examined = jax.vmap(lambda key: ambs.course(player, key, sampled))(keys)
-        return examined, jax.vmap(lambda key: episode(player, key, sampled=sampled))(keys)
+    def play(**settings: Any) -> Any:
+        changed = dataclasses.replace(learned.config, **settings)
+        player = Player(algo.policy, dataclasses.replace(learned, config=changed), algo.task(learned))
+        played = jax.vmap(lambda key: course(player, key, sampled))
+        return jax.jit(played, compiler_options=FAST)(keys)
 
-    examined, evaluated = both(keys)
-    np.testing.assert_allclose(examined.reward.sum(1), evaluated.ret, atol=1e-5)
-    np.testing.assert_array_equal(examined.alive.sum(1), evaluated.length)
-    assert len({*evaluated.ret.tolist()}) > 1
+    none, idle = play(shield="none"), play(delta=jnp.float32(jnp.inf))
+    acting = play(rule="hoeffding", delta=jnp.float32(0))
+    assert not idle.said["overruled"].any() and "overruled" not in none.said
+    assert (acting.said["overruled"] & acting.alive).any()
+    np.testing.assert_allclose(none.reward, idle.reward, atol=1e-5)
+    assert np.abs(none.reward - acting.reward).max() > 1e-3
+    assert len({*none.reward.sum(1).tolist()}) > 1
 
 
 def test_nothing_counts_after_the_end_of_an_episode():
-    """It fails with its second step. Each step earns 1 and is a violation, and the shield overrules."""
+    """It fails with its second step of five. Each step is a violation, and the shield overrules."""
     said = {"risk": jnp.float32(1), "overruled": jnp.bool_(True)}
     policy = Policy(lambda learned: (), lambda learned, carry, obs, key: (jnp.zeros(1), carry, said))
-    player = Player(policy, Learned(CFG, {}, (), ()), Ticker(lives=(2, 2)))
-    found = ambs.course(player, jax.random.key(0), sampled=False)
-    for x in (found.alive, found.overruled, found.reward, found.violation):
-        np.testing.assert_array_equal(x, [1, 1, 0, 0, 0])
-    np.testing.assert_array_equal(found.failed, [0, 1, 0, 0, 0])
+    algo: Any = SimpleNamespace(policy=policy, task=lambda learned: Ticker(lives=(2, 2)))
+    learned = Learned(jax.tree.map(lambda x: jnp.full(1, x), CFG), {}, (), ())
+    keys = jax.random.split(jax.random.key(0), (1, 1))
+    _, shielded = make_evaluation(algo, keys)(learned)
+    np.testing.assert_array_equal(shielded.alive, [[[1, 1, 0, 0, 0]]])
+    np.testing.assert_array_equal(shielded.terminated, [[[0, 1, 0, 0, 0]]])
+    found = ambs.examine(algo, learned, shielded, keys, False)
+    assert {k: x.item() for k, x in found.measures.items()} == {
+        "violations": 2, "override rate": 1, "violations, no shield": 2, "return, no shield": 2,
+        "Brier score": 0,
+    }  # fmt: skip
+    np.testing.assert_array_equal(np.asarray(found.calibration)[0, :, -1], 2)
+
+
+def test_without_a_shield_evaluation_counts_violations_alone():
+    algo, learned = newborn()
+    learned = jax.tree.map(lambda x: jnp.asarray(x)[None], learned)
+    bare = dataclasses.replace(learned, config=dataclasses.replace(learned.config, shield="none"))
+    keys = jax.random.split(jax.random.key(0), (1, 2))
+    _, played = make_evaluation(algo, keys)(bare)
+    found = ambs.examine(algo, bare, played, keys, False)
+    assert found.calibration is None and [*found.measures] == ["violations"]
+    assert ambs.note(bare.config) == ""
+    ambs.check(dataclasses.replace(CFG, shield="none", delta=0.0), Corridor())  # it has no bound
 
 
 @pytest.mark.parametrize("sampled, violations", [(False, 0), (True, 9)])
@@ -1001,16 +1024,20 @@ def test_the_risk_is_scored_by_sampled_actions_without_the_shield(sampled, viola
     alone."""
 
     def act(learned, carry, obs, key):
+        proposed = jnp.full(1, 0.0 if key is None else 1.0)
+        if learned.config.shield == "none":
+            return proposed, carry, {}
         overruled = (learned.config.delta < 1) & (key is not None)
-        proposed = 0.0 if key is None else 1.0
-        action = jnp.where(overruled, -1.0, proposed)[None]
+        action = jnp.where(overruled, -1.0, proposed)
         return action, carry, {"risk": jnp.float32(1), "overruled": overruled}
 
     policy = Policy(lambda learned: (), act)
     algo: Any = SimpleNamespace(policy=policy, task=lambda learned: Ledge())
     cfg = jax.tree.map(lambda x: jnp.full(1, x), dataclasses.replace(CFG, shield_horizon=4))
     keys = jax.random.split(jax.random.key(0), (1, 2))
-    found = ambs.examine(algo, Learned(cfg, {}, (), ()), keys, sampled)
+    learned = Learned(cfg, {}, (), ())
+    _, shielded = make_evaluation(algo, keys, sampled)(learned)
+    found = ambs.examine(algo, learned, shielded, keys, sampled)
     measures = found.measures
     assert (measures["Brier score"] == 0).all()
     assert (measures["violations, no shield"] == violations).all()
@@ -1026,7 +1053,7 @@ def test_the_brier_score_by_hand():
     yes, no = jnp.ones(6, bool), jnp.zeros(6, bool)
     violation = no.at[3].set(True)
     risk = jnp.array([0.0, 0.5, 1.0, 0.5, 0.2, 0.9])
-    found = ambs.Course(yes, risk, no, risk, violation, no)
+    found = ambs.Foreseen(yes, risk, violation, no)
     errors = [0.0, 0.25, 0.0, 0.25, 0.04]
     np.testing.assert_allclose(ambs.brier_score(found, 2), np.mean(errors), rtol=1e-6)
     failed = found._replace(failed=no.at[5].set(True))  # then it is known that no violation follows
@@ -1040,7 +1067,7 @@ def test_the_risk_is_compared_with_what_came_part_by_part():
     """The steps of the test above: risks of 0, 0.5, 1, 0.5 and 0.2, after which 0 0 1 1 0 came."""
     yes, no = jnp.ones(6, bool), jnp.zeros(6, bool)
     risk = jnp.array([0.0, 0.5, 1.0, 0.5, 0.2, 0.9])
-    counts = ambs.calibration(ambs.Course(yes, risk, no, risk, no.at[3].set(True), no), 2)
+    counts = ambs.calibration(ambs.Foreseen(yes, risk, no.at[3].set(True), no), 2)
     expected = np.zeros((3, ambs.PARTS))
     for part, of in {0: (1, 0, 0), 2: (1, 0.2, 0), 5: (2, 1, 1), 9: (1, 1, 1)}.items():
         expected[:, part] = of

@@ -41,6 +41,6 @@ def test_each_policy_s_rewards_and_costs_are_discounted_as_in_its_training():
     algo: Any = SimpleNamespace(policy=policy, task=lambda learned: env)
     cfgs = BCConfig(discount=0.5, cost_discount=0.25), BCConfig(discount=1.0, cost_discount=0.0)
     cfg = jax.tree.map(lambda *x: jnp.array(x), *cfgs)
-    found = make_evaluation(algo, keys_of_episodes(0, 1, range(2)))(Learned(cfg, {}, (), ()))
+    found, _ = make_evaluation(algo, keys_of_episodes(0, 1, range(2)))(Learned(cfg, {}, (), ()))
     np.testing.assert_array_equal(found.discounted_ret, [[1.5], [2]])
     np.testing.assert_array_equal(found.discounted_cost, [[2.5], [2]])

@@ -13,6 +13,7 @@ from disk import full_beyond
 from toys import Ticker, reflex
 
 from jaxsafe.config import ConfigError
+from jaxsafe.learn.acting import course
 from jaxsafe.report import evaluation, plots, scores, stats
 from jaxsafe.run import checkpoint, evaluate, files, run_folder
 from jaxsafe.run.checkpoint import Progress
@@ -143,7 +144,7 @@ def test_an_interval_is_over_seeds_and_of_one_seed_over_its_episodes():
 
 def test_discounted_sums_and_named_costs_of_an_episode_by_hand():
     player = reflex(lambda obs: obs[:1], Ticker(lives=(3, 3)))
-    three = evaluate.episode(player, jax.random.key(0), 0.5, 0.1)
+    three = evaluate.totals(course(player, jax.random.key(0)), 0.5, 0.1)
     assert (three.ret, three.length) == (3, 3) and three.cost == 6  # 1 and 2 a step
     np.testing.assert_allclose(three.discounted_ret, 1 + 0.5 + 0.25)
     np.testing.assert_allclose(three.discounted_cost, 2 * (1 + 0.1 + 0.01), rtol=1e-6)
@@ -172,7 +173,7 @@ def test_goals_of_an_episode_are_counted_until_its_end():
             return dataclasses.replace(after, info={"goal_met": jnp.float32(after.obs[1] != 2)})
 
     player = reflex(lambda obs: obs[:1], Scoring(episode_length=9, lives=(4, 4)))
-    four = evaluate.episode(player, jax.random.key(0))
+    four = evaluate.totals(course(player, jax.random.key(0)))
     own = evaluate.Episodes(*(np.asarray(x)[None, None] for x in four))
     assert evaluate.measures(own, ("a", "b"), {"": 9.0})["goals"].item() == 3
 
