@@ -5,7 +5,7 @@ import itertools
 import math
 import operator
 from functools import partial
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -99,6 +99,11 @@ class AMBSConfig(dreamer.ForesightConfig):
     discounted sooner, and the shield lets more through, by the exact bound. `preset=plpg`, `penl` and
     `copt` are the authors'.
     """
+
+    ACTS_BY: ClassVar = (
+        "shield", "rule", "shield_rollouts", "shield_horizon", "shield_steps", "delta", "eps",
+        "confidence", "verdict", "verify_action",
+    )  # fmt: skip
 
     # The discount of what both policies avoid, and of costs in evaluations: 33 steps ahead. V_i and the
     # shield have `discount`, and so has everything in AMBS's code.

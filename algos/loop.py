@@ -54,6 +54,7 @@ class LOOPConfig(ModelBasedConfig, sac.SACConfig):
     action.
     """
 
+    ACTS_BY: ClassVar = ("actor_plans", "temperature")
     TAKES_PICTURES: ClassVar = False
 
     encoder: Literal["none"] = "none"  # There are no pictures: the model learns vectors.
@@ -107,6 +108,8 @@ class SafeLOOPConfig(LOOPConfig):
     for safety by constraints on plans; the weights are OmniSafe's.
     Differs from OmniSafe: as LOOP, and there C is the cost of 1000 steps of the planner.
     """
+
+    ACTS_BY: ClassVar = ("elites", "cost_temperature", "cost_limit")
 
     # The least number of feasible plans; with fewer, the cost alone decides. As in OmniSafe.
     elites: Amount = 20

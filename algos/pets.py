@@ -50,6 +50,8 @@ class PETSConfig(ModelBasedConfig, ReplayConfig):
     many environments, and a fixed number of large steps at each refit.
     """
 
+    ACTS_BY: ClassVar = ("elites",)
+
     # Environments side by side, of all devices together. OmniSafe has 1.
     num_envs: Amount = 64
     horizon: Amount = 10  # Steps of each environment in an update. Two updates have those of a refit.
@@ -85,6 +87,8 @@ class CCEConfig(PETSConfig):
     Differs from OmniSafe: there C is the cost of 1000 steps of the planner, whatever an episode has.
     """
 
+    ACTS_BY: ClassVar = ("cost_limit",)
+
 
 @config
 class RCEConfig(PETSConfig):
@@ -99,6 +103,8 @@ class RCEConfig(PETSConfig):
     Method", arXiv:2010.07968.
     Differs from OmniSafe: there C is the cost of 1000 steps of the planner, whatever an episode has.
     """
+
+    ACTS_BY: ClassVar = ("cost_limit",)
 
 
 @config
@@ -125,6 +131,7 @@ class CAPConfig(PriceClockConfig, PETSConfig):
     (`preset=published`), and falls by at most 0.1 a move.
     """
 
+    ACTS_BY: ClassVar = ("cost_limit",)
     CONVENTIONS: ClassVar = (
         Convention(
             {"uncertainty": "mixed"},

@@ -1,7 +1,7 @@
 """SafeDreamer, which plans in the dreams of a world model, among plans of a low cost."""
 
 from functools import partial
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -51,6 +51,8 @@ class OSRPConfig(PlanConfig, dreamer.DreamerConfig):
     the authors observe positions in place of lidars, weigh the loss of vectors by 5, and compute costs
     from decoded positions.
     """
+
+    ACTS_BY: ClassVar = ("elites", "cost_limit")
 
     # The undiscounted cost that an episode may have, as in the authors' code.
     cost_limit: Weight = 2.0

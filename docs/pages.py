@@ -41,7 +41,7 @@ from jaxsafe.report.published import read_published
 from jaxsafe.report.read import SettingRun, read
 from jaxsafe.run import compat, help
 from jaxsafe.run.plain import as_text
-from jaxsafe.run.settings import first_published, preset_for
+from jaxsafe.run.settings import acts_by, first_published, preset_for
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
@@ -457,8 +457,14 @@ def folded_settings(config: type) -> str:
 
 
 def published(row: Row) -> str:
-    """What `preset=published` and `compat=omnisafe` change."""
+    """What may be changed after training, and what `preset=published` and `compat=omnisafe` change."""
     lines = []
+    if names := acts_by(row):
+        of = ", ".join(f"`algo.{name}`" for name in names)
+        lines.append(
+            f"A trained policy acts by {of}. It is [evaluated and filmed](../howto/evaluate.md"
+            "#with-other-plans-or-another-shield) with other values of these, too."
+        )
     for origin, options in row.published.items():
         changed = ", ".join(f"`{name}={value}`" for name, value in options.items())
         preset = (

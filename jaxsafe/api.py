@@ -36,7 +36,7 @@ from jaxsafe.run.plain import to_plain
 from jaxsafe.run.policies import ROBOT, RunPolicies, open_run
 from jaxsafe.run.progress import Reporter
 from jaxsafe.run.session import Session
-from jaxsafe.run.settings import load, nested, settings_from_options, settings_of_run, yours
+from jaxsafe.run.settings import acting, load, nested, settings_from_options, settings_of_run, yours
 from jaxsafe.run.sweep_plan import plan
 from jaxsafe.types import Env, PyTree
 
@@ -84,20 +84,25 @@ class Run:
         folder: the run folder.
         env: the environment, where the run was trained with an object of yours or 'module:name'.
         algo: the algorithm, likewise.
+        acts_by: other values of settings that a planner or a shield acts by: `delta=0.5`.
 
     Attributes:
         folder: Path.
         settings: everything the run is made of, checked; `settings.algo.cost_limit`, for one.
 
     Raises:
-        ConfigError: no run folder, or one of settings that this version does not have.
+        ConfigError: no run folder, one of settings that this version does not have, or a setting by
+            which a trained policy does not act.
     """
 
-    def __init__(self, folder: str | Path, env: str | Env | None = None, algo: Any = None):
+    def __init__(
+        self, folder: str | Path, env: str | Env | None = None, algo: Any = None, **acts_by: Any
+    ):
         choice = chosen(env, algo)
         self._extras, self._given = choice.extras, {*flat(nested(choice.given))}
-        self.folder = Path(folder).expanduser()
-        self.settings = settings_of_run(run_folder.read_config(self.folder), self._extras)
+        self.folder, self._acts_by = Path(folder).expanduser(), to_plain(acts_by)
+        saved = settings_of_run(run_folder.read_config(self.folder), self._extras)
+        self.settings = acting(saved, self._acts_by) if acts_by else saved
 
     def __repr__(self) -> str:
         s = self.settings
@@ -198,7 +203,7 @@ class Run:
         use_compilation_cache()
         saved = flat(self.settings.plain())
         code = [f"{ROBOT}={saved[ROBOT]}"] if ROBOT in self._given else []
-        return open_run(self.folder, code, self._extras)
+        return open_run(self.folder, code, self._extras, self._acts_by)
 
     @functools.cached_property
     def _observed(self) -> PyTree:

@@ -7,6 +7,7 @@ from jaxsafe.commands.guard import guarded
 from jaxsafe.config import EpisodeCount, Seed
 from jaxsafe.learn.constraints import limits_in_words, limits_of
 from jaxsafe.report.evaluation import evaluate
+from jaxsafe.run.arguments import beside_a_run
 from jaxsafe.run.devices import use_compilation_cache
 from jaxsafe.run.flags import Parser, number
 from jaxsafe.run.interrupts import Interrupts
@@ -27,8 +28,9 @@ def command() -> int:
         "code",
         nargs="*",
         default=(),  # without one argparse says that it is required
-        metavar=", ".join(CODE),
-        help="your own environment, algorithm or robot, if the run has one",
+        metavar=", ".join((*CODE, "algo.NAME=VALUE")),
+        help="your own environment, algorithm or robot, if the run has one; "
+        "other settings that a planner or a shield acts by",
     )
     parser.add_argument("--seed", type=number(Seed), default=1, help="seed of the episodes (default 1)")
     parser.add_argument(
@@ -42,14 +44,16 @@ def command() -> int:
     )
     args = parser.parse_args()
     use_compilation_cache()
-    run = open_run(args.run.expanduser(), args.code)
+    code, acts_by = beside_a_run(args.code)
+    run = open_run(args.run.expanduser(), code, acts_by=acts_by)
     settings = run.settings
     alone = len(settings.configs) == 1
     limit = f" | cost limit {limits_in_words(limits_of(settings.algo))}" if alone else ""
     print(
         f"{settings.env_name} | {settings.algo_name} | "
         f"{settings.num_members} x {args.episodes} episodes, "
-        f"{'sampled' if args.sampled else 'mean'} actions{limit}",
+        f"{'sampled' if args.sampled else 'mean'} actions{limit}"
+        + "".join(f" | {text}" for text in args.code if text not in code),
         flush=True,
     )
     with Interrupts(functools.partial(print, flush=True)) as stop:

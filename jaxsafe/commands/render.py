@@ -19,7 +19,8 @@ def command() -> int:
     parser = viewing.parser_of(
         "Film one episode of the policy of a run, or of several runs side by side in one layout.",
         "RUN",
-        f"run folders, and your own environment, algorithm or robot: {', '.join(CODE)}",
+        f"run folders, and your own environment, algorithm or robot: {', '.join(CODE)}; other settings "
+        "that a planner or a shield acts by: algo.NAME=VALUE",
     )
     parser.add_argument(
         "--out",

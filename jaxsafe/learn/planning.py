@@ -19,7 +19,7 @@ Differs from it: there and in OmniSafe the variance of n elites is divided by n 
 import itertools
 import math
 from collections.abc import Callable
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -37,6 +37,11 @@ HIGHEST = jax.lax.Precision.HIGHEST
 @config
 class PlanConfig:
     """For algorithms that plan."""
+
+    ACTS_BY: ClassVar = (
+        "plan_steps", "cem_iterations", "plans", "particles", "plan_var", "mean_momentum",
+        "var_momentum", "var_stop",
+    )  # fmt: skip
 
     plan_steps: Iterations = 7  # H, steps that are planned ahead, as in OmniSafe.
     cem_iterations: Iterations = 5  # Times that the plans are improved, as in OmniSafe.

@@ -34,7 +34,8 @@ class Row(NamedTuple):
     summary: what it does, in a few words.
     published: setting -> options of the config that reproduce it; `preset=published` is the
         first of them. `cpu`, which is ours, does not count.
-        A class of the config may name in `SUITS` the tasks whose default one of them is.
+        A class of the config may name in `SUITS` the tasks whose default one of them is, and in
+        `ACTS_BY` settings that a trained policy acts by, of which it may have other values.
     omnisafe: OmniSafe's name for it, from which scripts/migrate.py translates; '' if it has none.
     total_steps: environment steps of a run that does not say how many.
     holds: what keeps to the cost limit: the cost of the average episode, the cost of every episode,

@@ -54,6 +54,16 @@ def read_values(texts: list[str]) -> Given:
     return Given(resolved, several)
 
 
+def beside_a_run(texts: list[str]) -> tuple[list[str], dict[str, Any]]:
+    """What stands beside a run folder: the user's own code, and other values of settings that its
+    policies act by, as algo.delta=0.5, by name."""
+    settings = [text for text in texts if text.startswith("algo.")]
+    given = read_values(settings)
+    for name in given.several:
+        raise ConfigError(f"{name}: expected one value")
+    return [text for text in texts if text not in settings], given.options.get("algo", {})
+
+
 def parse(text: str) -> Override:
     try:
         return OverridesParser.create().parse_override(text)

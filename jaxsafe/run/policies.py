@@ -4,7 +4,7 @@ A policy is networks, a normaliser and a config. It has a file of its own beside
 Nothing in the folder is executed.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +16,7 @@ from jaxsafe.config import ConfigError, flat
 from jaxsafe.envs.registry import OF_ENGINE
 from jaxsafe.learn.acting import Player
 from jaxsafe.learn.offline import data_set_like
+from jaxsafe.learn.row import NOTHING
 from jaxsafe.run import checkpoint, files, run_folder
 from jaxsafe.run.programs import Program, members
 from jaxsafe.run.settings import (
@@ -23,6 +24,7 @@ from jaxsafe.run.settings import (
     NO_EXTRAS,
     Extras,
     Settings,
+    acting,
     check_read_from,
     load,
     make_env,
@@ -63,7 +65,12 @@ class RunPolicies(NamedTuple):
         return RunPolicy(self.settings, self.env, self.algo, learned)
 
 
-def open_run(folder: Path, code: Sequence[str] = (), extras: Extras = NO_EXTRAS) -> RunPolicies:
+def open_run(
+    folder: Path,
+    code: Sequence[str] = (),
+    extras: Extras = NO_EXTRAS,
+    acts_by: Mapping[str, Any] = NOTHING,
+) -> RunPolicies:
     """The newest policies of a run folder. Executes nothing from it.
 
     Args:
@@ -71,9 +78,10 @@ def open_run(folder: Path, code: Sequence[str] = (), extras: Extras = NO_EXTRAS)
         code: 'env=module:name' and 'algo=module:name', where the run was trained with the user's code.
             They are imported. 'env.robot_base=path', where it was trained with the user's robot.
         extras: the caller's environment and algorithm, where the run was trained with objects.
+        acts_by: other values of settings that the policies act by, as of `settings.acting`.
     Raises:
-        ConfigError: no run folder, one without a checkpoint, one of another environment, or a word of
-            `code` that is something else.
+        ConfigError: no run folder, one without a checkpoint, one of another environment, a word of
+            `code` that is something else, or a setting that cannot be another.
     """
     saved = run_folder.read_config(folder)
     for text in code:
@@ -93,6 +101,10 @@ def open_run(folder: Path, code: Sequence[str] = (), extras: Extras = NO_EXTRAS)
     if not checkpoint.checkpoints(policy_folder(folder)):
         raise ConfigError(f"{folder} holds no checkpoint")
     env = make_env(settings)
+    if acts_by:
+        settings = acting(settings, acts_by)
+        for cfg in settings.configs:
+            settings.row.check(cfg, env, ())
     return RunPolicies(folder, settings, env, *member_policies(settings, env, folder))
 
 

@@ -321,6 +321,36 @@ def resumed(
     return options
 
 
+def acts_by(row: Row) -> list[str]:
+    """The settings that a trained policy acts by, of which it may have other values."""
+    return [name for cls in row.config.__mro__ for name in vars(cls).get("ACTS_BY", ())]
+
+
+def acting(settings: Settings, given: Mapping[str, Any]) -> Settings:
+    """Settings of a run, with other values of those that its policies act by.
+
+    Args:
+        given: by name, without 'algo.'.
+    Raises:
+        ConfigError: a setting by which they do not act, one in which the run's settings differ, or a
+            wrong value.
+    """
+    known = acts_by(settings.row)
+    for name in given:
+        if not known:
+            raise ConfigError(
+                f"algo.{name}: a trained policy of {settings.algo_name} acts by no setting"
+            )
+        if name not in known:
+            raise ConfigError(
+                f"algo.{name}: expected a setting that a trained policy of {settings.algo_name} acts "
+                f"by{nearest(name, known)}"
+            )
+        if len({getattr(cfg, name) for cfg in settings.configs}) > 1:
+            raise ConfigError(f"algo.{name}: the run has several; expected a run of one")
+    return settings_from_config(merged(settings.plain(), {"algo": {**given}}), settings.extras)
+
+
 def check_read_from(saved: Settings, folder: Path, given: Collection[str]) -> None:
     """Raise ConfigError where the config of a run folder names a file or folder to read. It is read
     only if the user gives the option, too.

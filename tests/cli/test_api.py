@@ -262,6 +262,17 @@ def test_a_policy_that_plans_in_the_simulator_acts_on_a_state_alone(tmp_path):
         run.policy(jnp.zeros(4))
     with pytest.raises(jaxsafe.ConfigError, match="index 1: the run has one policy, 0, in"):
         run.player(1)
+    other = jaxsafe.Run(run.folder, Corridor(), plan_steps=2, cost_limit=7)  # without training again
+    player = other.player()
+    _, plan = player.act(player.begin(), player.task.reset(jax.random.key(0)))
+    assert plan.mean.shape == (2, 2) and player.learned.config.cost_limit == 7
+    with pytest.raises(jaxsafe.ConfigError, match=r"algo\.horizon: expected a setting that a trained"):
+        jaxsafe.Run(run.folder, Corridor(), horizon=3)
+
+
+def test_most_trained_policies_act_by_no_setting(run):
+    with pytest.raises(jaxsafe.ConfigError, match=r"algo\.cost_limit: .* ppo_saute acts by no setting"):
+        jaxsafe.Run(run.folder, Corridor(), cost_limit=3)
 
 
 def test_evaluation_is_that_of_the_script(run):

@@ -12,13 +12,14 @@ from shell import SCRIPTS, TOY, assert_same_run, typed
 from toys import START
 
 from jaxsafe.algos import ambs
+from jaxsafe.config import ConfigError
 from jaxsafe.envs.view import render
 from jaxsafe.report.dreams import play
 from jaxsafe.run import checkpoint, run_folder
-from jaxsafe.run.arguments import compose
+from jaxsafe.run.arguments import beside_a_run, compose
 from jaxsafe.run.policies import open_run
 from jaxsafe.run.session import about_cpu
-from jaxsafe.run.settings import load, make_env
+from jaxsafe.run.settings import acting, load, make_env, nested, settings_from_options
 
 TINY = (
     "num_envs=4", "algo.horizon=8", "algo.learn_every=8", "algo.batch_size=32", "algo.replay_ratio=2",
@@ -67,6 +68,31 @@ def test_evaluation_says_what_the_shield_does_and_a_film_has_where(trained):
     run = open_run(trained, (TOY,))
     states, said = render.run_episode(run.one(0).player, jax.random.key(0), 20)
     assert np.isfinite(states.obs).all() and said["overruled"].shape == (20,)
+
+
+@pytest.mark.slow
+def test_another_shield_is_tried_without_training_again(trained, capsys):
+    assert typed("evaluate", str(trained), TOY, "--episodes", "2", "algo.shield=none") == 0
+    said = capsys.readouterr().out
+    assert said.splitlines()[0].endswith("cost limit 0 | algo.shield=none")
+    assert "violations " in said and "override rate" not in said
+    always = ("evaluate", str(trained), TOY, "algo.delta=0.01")
+    assert typed(*always) == 2 and "delta=0.01: expected at least" in capsys.readouterr().err
+    player = open_run(trained, (TOY,), acts_by={"delta": 0.5}).one(0).player
+    assert player.learned.config.delta == 0.5
+
+
+def test_a_setting_in_which_a_run_s_policies_differ_is_not_replaced():
+    swept = settings_from_options(nested({"algo": "ambs", "algo.delta": [0.2, 0.4], "video": False}))
+    assert [cfg.confidence for cfg in acting(swept, {"confidence": 0.05}).configs] == [0.05, 0.05]
+    assert [cfg.delta for cfg in acting(swept, {"confidence": 0.05}).configs] == [0.2, 0.4]
+    with pytest.raises(ConfigError, match=r"algo\.delta: the run has several"):
+        acting(swept, {"delta": 0.3})
+    with pytest.raises(ConfigError, match=r"algo\.delt: .* ambs acts by; did you mean 'delta'"):
+        acting(swept, {"delt": 0.3})
+    with pytest.raises(ConfigError, match=r"algo\.delta: expected one value"):
+        beside_a_run([TOY, "algo.delta=0.1,0.2"])
+    assert beside_a_run([TOY, "algo.delta=1e-1"]) == ([TOY], {"delta": 0.1})
 
 
 @pytest.mark.slow

@@ -1,17 +1,20 @@
 """One file is an algorithm: whatever is made from rows knows it."""
 
+import dataclasses
 import importlib
 import sys
 from pathlib import Path
 
+import jax
 import pytest
+from toys import START, Corridor
 
 from jaxsafe import algos
 from jaxsafe.config import ConfigError
 from jaxsafe.interop import migrate
 from jaxsafe.learn.on_policy import OnPolicyConfig
 from jaxsafe.run.arguments import compose
-from jaxsafe.run.settings import find_algo, preset_for
+from jaxsafe.run.settings import acts_by, find_algo, preset_for
 
 ROOT = Path(__file__).parent.parent.parent
 sys.path.insert(0, str(ROOT / "docs"))
@@ -49,6 +52,24 @@ ROWS = {
     )
 }
 '''
+
+
+@pytest.mark.parametrize("name", [name for name, row in algos.ALGOS.items() if acts_by(row)])
+def test_what_a_policy_acts_by_are_settings_that_change_nothing_it_learned(name):
+    """Counts are doubled. Networks, the multiplier and the normaliser keep their shapes."""
+    row = algos.ALGOS[name]
+    names = acts_by(row)
+    assert len({*names}) == len(names) and {*names} <= {f.name for f in dataclasses.fields(row.config)}
+    cfg = row.config()
+    counts = {x: 2 * n for x in names if type(n := getattr(cfg, x)) is int}
+    algo = row.make(Corridor())
+
+    def learned(cfg):
+        return algo.learned(algo.init(jax.random.key(0), cfg, START))
+
+    before, after = (jax.eval_shape(learned, x) for x in (cfg, dataclasses.replace(cfg, **counts)))
+    for part in ("params", "dual", "normaliser"):
+        assert getattr(before, part) == getattr(after, part)
 
 
 @pytest.fixture
