@@ -325,7 +325,7 @@ def greeting(session: Session) -> str:
     where += f", engine {engine}" if engine else ""
     kernels = {
         "warp": ", and a minute of Warp's kernels the first time",
-        "c": ", about a minute at every start of engine c",
+        "c": ", 15 to 60 s at every start of engine c",
     }.get(engine or "", "")
     if engine == "jax" and "NVIDIA" in device_name() and (problem := warp_problem()):
         where += f" (warp would be faster, but {problem})"
