@@ -20,7 +20,7 @@ from jaxsafe.envs.velocity.task import Velocity
 from jaxsafe.envs.view.backend import gl_context
 from jaxsafe.envs.view.stage import drawable, stage_of
 from jaxsafe.envs.wrap import raw_steps
-from jaxsafe.learn.acting import Player, Playing
+from jaxsafe.learn.acting import Player, played
 from jaxsafe.types import Env, State
 
 FPS = 30
@@ -203,18 +203,10 @@ def side_by_side(films: Sequence[Sequence[np.ndarray]]) -> list[np.ndarray]:
 def run_episode(player: Player, key: jax.Array, length: int) -> tuple[State, dict[str, np.ndarray]]:
     """An episode of mean actions, on the host: its states, [length + 1, ...], from the reset on; and
     what the policy says beside its actions, [length] by name."""
-    reset_key, _ = jax.random.split(key)
-
-    def step(now: Playing, _: None) -> tuple[Playing, tuple[State, dict[str, jax.Array]]]:
-        action, carry, said = player.decide(now.carry, now.state)
-        state = player.task.step(now.state, action)
-        return Playing(state, carry, now.alive & ~state.ended), (state, said)
 
     def episode() -> tuple[State, dict[str, jax.Array]]:
-        start = player.start(reset_key)
-        _, (rest, said) = jax.lax.scan(step, start, None, length)
-        states = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start.state, rest)
-        return states, said
+        start, (rest, said) = played(player, key, lambda step: (step.after, step.said), steps=length)
+        return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start, rest), said
 
     return jax.device_get(jax.jit(episode)())
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import flax.struct
 import jax
@@ -11,6 +11,8 @@ import jax.numpy as jnp
 from jaxsafe.learn.batch import select_rows
 from jaxsafe.learn.observations import vector_of
 from jaxsafe.types import Env, Policy, PyTree, State
+
+T = TypeVar("T")
 
 # action [N, A], carry [N, ...], what is said beside it, float [N] by name
 Acted = tuple[jax.Array, PyTree, dict[str, jax.Array]]
@@ -82,6 +84,42 @@ class Player(NamedTuple):
         return action, carry, jax.tree.map(jnp.float32, said)
 
 
+class Step(NamedTuple):
+    """A step of an episode: where it began, what was done there and reported beside it, what the policy
+    remembers after it, and where it led."""
+
+    now: Playing
+    action: jax.Array
+    said: dict[str, Any]
+    carry: PyTree
+    after: State
+
+
+def played(
+    player: Player, key: jax.Array, seen: Callable[[Step], T], sampled: bool = False, steps: int = 0
+) -> tuple[State, T]:
+    """An episode, pure: the state in which it begins, and what `seen` makes of each step, [T, ...].
+
+    It goes on after its end, and what comes then may be anything, NaN included.
+
+    Args:
+        sampled: whether actions are sampled, or the mean ones. Both begin with the same reset.
+        steps: T; 0 is up to the time limit.
+    """
+    reset_key, act_key = jax.random.split(key)
+    env = player.task
+
+    def step(now: Playing, t: jax.Array) -> tuple[Playing, T]:
+        sample_key = jax.random.fold_in(act_key, t) if sampled else None
+        action, carry, said = player.decide(now.carry, now.state, sample_key)
+        after = env.step(now.state, action)
+        found = seen(Step(now, action, said, carry, after))
+        return Playing(after, carry, now.alive & ~after.ended), found
+
+    start = player.start(reset_key)
+    return start.state, jax.lax.scan(step, start, jnp.arange(steps or env.episode_length))[1]
+
+
 class Course(NamedTuple):
     """T steps of an episode, [T, ...]. Those after its end are not `alive`: they earn and cost 0.
 
@@ -100,23 +138,17 @@ class Course(NamedTuple):
 
 
 def course(player: Player, key: jax.Array, sampled: bool = False) -> Course:
-    """A whole episode, pure, of mean or of `sampled` actions; both begin with the same reset."""
-    reset_key, act_key = jax.random.split(key)
-    env = player.task
+    """A whole episode, pure, of mean or of `sampled` actions."""
 
-    def step(now: Playing, t: jax.Array) -> tuple[Playing, Course]:
-        sample_key = jax.random.fold_in(act_key, t) if sampled else None
-        action, carry, said = player.decide(now.carry, now.state, sample_key)
-        state = env.step(now.state, action)
-        # what comes after the end may be anything, NaN included
+    def seen(step: Step) -> Course:
+        alive, after = step.now.alive, step.after
         reward, cost, costs, goal_met = (
-            jnp.where(now.alive, x, 0.0)
-            for x in (state.reward, state.cost, state.costs, state.info.get("goal_met", jnp.nan))
+            jnp.where(alive, x, 0.0)
+            for x in (after.reward, after.cost, after.costs, after.info.get("goal_met", jnp.nan))
         )
-        found = Course(now.alive, reward, cost, costs, state.terminated & now.alive, goal_met, said)
-        return Playing(state, carry, now.alive & ~state.ended), found
+        return Course(alive, reward, cost, costs, after.terminated & alive, goal_met, step.said)
 
-    return jax.lax.scan(step, player.start(reset_key), jnp.arange(env.episode_length))[1]
+    return played(player, key, seen, sampled)[1]
 
 
 def first_carries(policy: Policy, learned: PyTree, num_envs: int) -> PyTree:

@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxsafe.algos import ALGOS, ambs
 from jaxsafe.config import ConfigError
-from jaxsafe.learn.acting import Player, Playing
+from jaxsafe.learn.acting import Player, Step, played
 from jaxsafe.learn.observations import vector_of, with_vector
 from jaxsafe.learn.world_model import WorldModelConfig, world_of
 from jaxsafe.nn.rssm import Latent
@@ -40,19 +40,12 @@ def play(player: Player, key: jax.Array, steps: int | None = None) -> Episode:
         ConfigError: the policy has no world model.
     """
     check_model(player, WorldModelConfig, "no world model")
-    reset_key, act_key = jax.random.split(key)
 
-    def step(now: Playing, key: jax.Array) -> tuple[Playing, Episode]:
-        action, carry, said = player.decide(now.carry, now.state, key)
-        state = player.task.step(now.state, action)
-        found = Episode(now.state, carry.latent, carry.action, said, now.alive)
-        return Playing(state, carry, now.alive & ~state.ended), found
+    def seen(step: Step) -> Episode:
+        now, carry = step.now, step.carry
+        return Episode(now.state, carry.latent, carry.action, step.said, now.alive)
 
-    def episode() -> Episode:
-        keys = jax.random.split(act_key, steps or player.task.episode_length)
-        return jax.lax.scan(step, player.start(reset_key), keys)[1]
-
-    return jax.jit(episode)()
+    return jax.jit(lambda: played(player, key, seen, sampled=True, steps=steps or 0)[1])()
 
 
 def decoded(player: Player, latents: Latent) -> PyTree:

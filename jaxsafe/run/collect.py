@@ -12,7 +12,7 @@ import numpy as np
 
 import jaxsafe
 from jaxsafe.config import Bounds, ConfigError, one_line
-from jaxsafe.learn.acting import Player, Playing
+from jaxsafe.learn.acting import Player, Step, played
 from jaxsafe.learn.constraints import cost_title, limits_of
 from jaxsafe.learn.observations import observation_like, vector_of, with_vector
 from jaxsafe.learn.offline import DataSet, data_set
@@ -105,32 +105,23 @@ def episode(player: Player, key: jax.Array, obs_size: int, sampled: bool) -> Ste
     What an augmentation appends to the observation is left out. Actions are clipped to [-1, 1], as
     environments clip them.
     """
-    reset_key, act_key = jax.random.split(key)
-    env = player.task
 
-    def seen(state: State) -> PyTree:
+    def observed(state: State) -> PyTree:
         return with_vector(state.obs, vector_of(state.obs)[:obs_size])
 
-    def step(now: Playing, t: jax.Array) -> tuple[Playing, Steps]:
-        sample_key = jax.random.fold_in(act_key, t) if sampled else None
-        action, carry = player.act(now.carry, now.state, sample_key)
-        action = jnp.clip(action, -1.0, 1.0)
-        after = env.step(now.state, action)
-        made = Steps(
-            obs=seen(after),
-            action=action,
-            reward=after.reward,
-            cost=after.cost,
-            costs=after.costs,
-            terminated=after.terminated,
-            alive=now.alive,
+    def seen(step: Step) -> Steps:
+        return Steps(
+            obs=observed(step.after),
+            action=jnp.clip(step.action, -1.0, 1.0),
+            reward=step.after.reward,
+            cost=step.after.cost,
+            costs=step.after.costs,
+            terminated=step.after.terminated,
+            alive=step.now.alive,
         )
-        return Playing(after, carry, now.alive & ~after.ended), made
 
-    start = player.start(reset_key)
-    _, steps = jax.lax.scan(step, start, jnp.arange(env.episode_length))
-    first = seen(start.state)
-    obs = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, steps.obs)
+    start, steps = played(player, key, seen, sampled)
+    obs = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), observed(start), steps.obs)
     return steps._replace(obs=obs)
 
 
