@@ -597,9 +597,9 @@ def examine(
     """
     env, cfg = algo.task(jax.tree.map(lambda x: x[0], learned)), learned.config
     violations = violated(env, shielded, cfg) & shielded.alive
-    measures = {"violations": violations.sum(2).astype(jnp.float32)}
+    counted = np.asarray(violations.sum(2), np.float32)
     if cfg.shield == "none":
-        return Examined(jax.tree.map(np.asarray, measures))
+        return Examined({"violations": counted})
 
     def play(sampled: bool, **settings: Any) -> Course:
         def of_one(learned: PyTree, keys: jax.Array) -> Course:
@@ -615,13 +615,14 @@ def examine(
     found = Foreseen(runs, drawn.said["risk"], violated(env, drawn, cfg) & runs, drawn.terminated)
     scores, parts = jax.jit(jax.vmap(jax.vmap(partial(compared, horizon=horizon))))(found)
     acts = (shielded.said["overruled"] & shielded.alive).sum(2)
-    measures |= {
+    measures = {
         "override rate": acts / jnp.maximum(shielded.alive.sum(2), 1),
+        "violations": counted,
         "violations, no shield": (violated(env, bare, cfg) & bare.alive).sum(2).astype(jnp.float32),
         "return, no shield": bare.reward.sum(2),
         "Brier score": scores,
     }
-    return Examined(jax.tree.map(np.asarray, measures), np.asarray(parts.sum(1)))
+    return Examined({k: np.asarray(x) for k, x in measures.items()}, np.asarray(parts.sum(1)))
 
 
 # ---- rows --------------------------------------------------------------------------------------
