@@ -335,16 +335,14 @@ def acting(settings: Settings, given: Mapping[str, Any]) -> Settings:
         ConfigError: a setting by which they do not act, one in which the run's settings differ, or a
             wrong value.
     """
-    known = acts_by(settings.row)
+    known, whose = acts_by(settings.row), settings.algo_name
     for name in given:
         if not known:
-            raise ConfigError(
-                f"algo.{name}: a trained policy of {settings.algo_name} acts by no setting"
-            )
+            raise ConfigError(f"algo.{name}: no setting of {whose} may change after training")
         if name not in known:
             raise ConfigError(
-                f"algo.{name}: expected a setting that a trained policy of {settings.algo_name} acts "
-                f"by{nearest(name, known)}"
+                f"algo.{name}: expected a setting of {whose} that may change after training"
+                f"{nearest(name, known)}"
             )
         if len({getattr(cfg, name) for cfg in settings.configs}) > 1:
             raise ConfigError(f"algo.{name}: the run has several; expected a run of one")
