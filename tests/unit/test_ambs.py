@@ -33,7 +33,10 @@ from jaxsafe.report import evaluation
 from jaxsafe.run.evaluate import make_evaluation
 from jaxsafe.types import Algorithm, Policy
 
-CFG = ambs.AMBSConfig(discount=1 - 1 / 333, rule="hoeffding", shield_rollouts=512, delta=0.1)
+CFG = ambs.AMBSConfig(
+    discount=1 - 1 / 333, least_penalty_scale=1.0, rule="hoeffding", delta=0.1,
+    shield_rollouts=512, shield_horizon=30, shield_steps=15,
+)  # fmt: skip
 
 
 @cache
@@ -442,6 +445,8 @@ def test_the_presets_of_the_penalties_have_the_numbers_of_the_paper_and_its_code
     assert ambs.overruled_from(cfg) == 6
     learning = (cfg.cost_discount, cfg.td_lambda, cfg.replay_value, cfg.imagine_steps, cfg.tau)
     assert learning == (0.997, 0.95, 0.0, 15, 0.02)
+    assert (cfg.batch_size, cfg.model_lr, cfg.lr, cfg.critic_lr) == (1024, 1e-4, 3e-5, 3e-5)
+    assert (cfg.least_scale, cfg.least_penalty_scale) == (1.0, 1.0)
     assert (cfg.actor_grad, cfg.limit_ends, cfg.overshoot) == ("backprop", True, 0)
     pixels = row.config(**row.published["pixels"])
     same = dataclasses.replace(cfg, encoder="cnn", size="medium")
