@@ -25,6 +25,7 @@ from jaxsafe.run.settings import (
     Extras,
     Settings,
     acting,
+    as_options,
     check_read_from,
     load,
     make_env,
@@ -103,8 +104,9 @@ def open_run(
     env = make_env(settings)
     if acts_by:
         settings = acting(settings, acts_by)
-        for cfg in settings.configs:
-            settings.row.check(cfg, env, ())
+        with as_options(settings.row):
+            for cfg in settings.configs:
+                settings.row.check(cfg, env, ())
     return RunPolicies(folder, settings, env, *member_policies(settings, env, folder))
 
 

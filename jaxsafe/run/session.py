@@ -29,6 +29,7 @@ from jaxsafe.run.settings import (
     Settings,
     TrainConfig,
     algo_options,
+    as_options,
     make_env,
     preset_for,
     settings_of_run,
@@ -170,14 +171,15 @@ def prepare(settings: Settings) -> tuple[Env, Program]:
     check_devices(train)
     check_logger(train.logger)
     env = make_env(settings)
-    memory.check_memory(env, settings)
-    data: Any = ()
-    if train.dataset is not None:
-        data = dataset.read_dataset(train.dataset, env.episode_length)
-    for cfg in settings.configs:
-        settings.row.check(cfg, env, data)
-    program = build(env, settings.row.make, settings.configs, train, data)
-    memory.check_state_memory(program, env, settings)
+    with as_options(settings.row):
+        memory.check_memory(env, settings)
+        data: Any = ()
+        if train.dataset is not None:
+            data = dataset.read_dataset(train.dataset, env.episode_length)
+        for cfg in settings.configs:
+            settings.row.check(cfg, env, data)
+        program = build(env, settings.row.make, settings.configs, train, data)
+        memory.check_state_memory(program, env, settings)
     return env, program
 
 

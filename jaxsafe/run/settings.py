@@ -6,11 +6,13 @@ caller left out. The names of a run's environment and algorithm are resolved her
 and `find_algo`.
 """
 
+import contextlib
 import dataclasses
 import difflib
 import functools
 import math
-from collections.abc import Callable, Collection, Mapping
+import re
+from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -446,8 +448,20 @@ def changed_options(options: dict[str, Any], entry: EnvEntry) -> dict[str, Any]:
 
 def make_env(settings: Settings) -> Env:
     env = settings.env_entry.make(**changed_options(settings.env_options, settings.env_entry))
-    check_cost_names("cost_limits", limits_by_name(settings.algo), env)
+    check_cost_names("algo.cost_limits", limits_by_name(settings.algo), env)
     return env
+
+
+@contextlib.contextmanager
+def as_options(row: Row) -> Iterator[None]:
+    """Where a ConfigError in the block says NAME=VALUE or NAME: of a setting of the algorithm, it says
+    algo.NAME, as the user does. Algorithms name their settings without it."""
+    try:
+        yield
+    except ConfigError as error:
+        names = "|".join(field.name for field in dataclasses.fields(row.config))
+        error.args = (re.sub(rf"(?<![\w.])({names})(?=:| ?[=*])", r"algo.\1", str(error)),)
+        raise
 
 
 # ---- options by group --------------------------------------------------------------------------
