@@ -25,6 +25,7 @@ FORMATS = ("png", "svg")
 WIDE = 10.5  # inches of the widest figure, which a page shrinks little
 LONG = 30  # letters of a name in the legend that leave the panels too little room
 LETTER = 0.06  # inches, of the legend
+FINE = 100  # points of a run's curve, if it has more than twice as many iterations
 ESTIMATED = "estimate, no episode ended yet"
 RATES = {
     "train/cost_rate": "cost rate so far,\nper step of the policy",
@@ -46,6 +47,15 @@ def by_seed(metrics: dict[str, np.ndarray], name: str) -> tuple[np.ndarray, np.n
     return steps, values
 
 
+def thinned(metrics: dict[str, np.ndarray], name: str) -> tuple[np.ndarray, np.ndarray]:
+    """As `by_seed`. Where there are many steps, the values are means over a hundred equal stretches."""
+    steps, values = by_seed(metrics, name)
+    if len(steps) <= 2 * FINE:
+        return steps, values
+    edges = np.linspace(0, steps[-1], FINE + 1)
+    return edges[1:], stretches(metrics, name, edges)
+
+
 def curves(
     metrics: dict[str, np.ndarray],
     path: Path,
@@ -53,8 +63,9 @@ def curves(
     cost_limit: float,
     own_limits: Mapping[str, float] = MappingProxyType({}),
 ) -> None:
-    """Write the PNG: a line a seed, and for three seeds or more their mean and 95% interval. Offline
-    there may be nothing to draw, and then there is none.
+    """Write the PNG: a line a seed, and for three seeds or more their mean and 95% interval. A point is
+    an iteration or, of more than two hundred, the mean over a hundredth of training. Offline there may
+    be nothing to draw, and then there is none.
 
     Evaluations during training are points on dashed lines, each the mean over seeds.
 
@@ -73,13 +84,14 @@ def curves(
     figure = Figure(figsize=(5 * len(panels), 4), layout="constrained")
     FigureCanvasAgg(figure)
     settings, drawn = run_folder.by_setting(metrics), False
-    for axes, (name, what) in zip(figure.subplots(1, len(panels)), panels, strict=True):
+    drawn_in = figure.subplots(1, len(panels))
+    for axes, (name, what) in zip(drawn_in, panels, strict=True):
         for i, (setting, table) in enumerate(settings.items()):
             trained = name in table and len(table["steps"])
             drawn = drawn or trained
             if trained:
                 column, estimated = drawn_of(table, name)
-                draw_setting(axes, name, *by_seed(table, column), f"C{i % 10}", setting, estimated)
+                draw_setting(axes, name, *thinned(table, column), f"C{i % 10}", setting, estimated)
             for end, (called, marker) in EVALUATED.items():
                 if (column := name.replace("train/", "eval/") + end) in table:
                     look = {"marker": marker, "mfc": "none" if end else None, "color": f"C{i % 10}"}
@@ -92,9 +104,8 @@ def curves(
             for limit, i in (swept or {common: 3}).items():
                 axes.axhline(limit, color=f"C{i % 10}", ls="--", lw=1, label=f"limit {limit:g}")
         axes.set(xlabel=axis_of(metrics), ylabel=what)
-        if axes.get_legend_handles_labels()[0]:
-            axes.legend(frameon=False, fontsize="small")
     figure.suptitle(title)
+    legend(figure, drawn_in)
     if drawn:
         write(figure, path, dpi=120)
 

@@ -173,6 +173,31 @@ def test_a_single_point_is_a_dot_and_more_are_a_line(seeds):
         assert {line.get_clip_on() for line in axes.lines} == {marker == "None"}  # a dot is whole
 
 
+@pytest.mark.parametrize(
+    "iterations, points, first", [(200, 200, 3.0), (201, 100, 2.0), (1000, 100, 2.0)]
+)
+def test_a_long_run_is_drawn_by_means_over_stretches_of_it(
+    iterations, points, first, tmp_path, monkeypatch
+):
+    """Returns of 3 and 1 in turn. Iterations of a short run are points, and means of a long one."""
+    figures = []
+    monkeypatch.setattr(plots, "write", lambda figure, *_, **__: figures.append(figure))
+    t = np.arange(1.0, iterations + 1)
+    table = {
+        "iteration": t,
+        "steps": 10 * t,
+        "seed": 0 * t,
+        "train/return": 2 - (-1) ** t,
+        "train/cost": t,
+    }
+    plots.curves(table, tmp_path / "curves.png", "", 25.0)
+    x, y = figures[0].axes[0].lines[0].get_data()
+    assert len(x) == len(y) == points and x[-1] == 10 * iterations
+    assert abs(y[0] - first) < 0.4 and abs(np.mean(y) - 2) < 0.01
+    (told,) = figures[0].legends
+    assert [text.get_text() for text in told.get_texts()] == ["limit 25"]
+
+
 def test_evaluations_of_settings_side_by_side_are_named_where_training_has_no_episodes(
     tmp_path, monkeypatch
 ):
