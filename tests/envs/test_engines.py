@@ -2,6 +2,7 @@
 # pyright: reportAttributeAccessIssue=false
 # (MuJoCo's bindings come without types)
 
+import subprocess
 import sys
 from functools import partial
 from pathlib import Path
@@ -45,6 +46,14 @@ def test_the_warp_engine_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "warp", None)
     with pytest.raises(ConfigError, match=r"warp-lang is not installed; pip install 'jaxsafe\[gpu\]'"):
         envs.make("point_goal0", engine="warp")
+
+
+def test_the_jax_engine_is_silent_where_warp_is_not_installed():
+    made = "jaxsafe.make('point_goal0', engine='jax')"
+    lines = ["sys.modules['warp'] = None", "import jaxsafe", made]
+    command = [sys.executable, "-c", "; ".join(["import sys", *lines])]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert (done.returncode, done.stdout) == (0, "")
 
 
 def test_on_a_gpu_whose_driver_is_too_old_for_warp_the_engine_is_jax_and_warp_says_why(monkeypatch):
