@@ -140,11 +140,11 @@ def test_a_run_that_has_lost_its_checkpoints_is_not_begun_anew_over_its_metrics(
             "a run keeps 72.6 GiB a device (train state 0.0, replay 72.6), this machine has 7.5 GiB; "
             "use a smaller algo.replay_size",
         ),
-        (["algo.n_step=300"], "replay_size=250 holds 64 steps of 4 environments"),
+        (["algo.n_step=300"], "algo.replay_size=250 holds 64 steps of 4 environments"),
         (["algo.batch_size=1000"], "the nearest that fit are"),
         (
             ["algo.batch_size=512", "algo.replay_ratio=32"],
-            "expected at least batch_size=512 transitions",
+            "expected at least algo.batch_size=512 transitions",
         ),
         (
             ["env.wrap.action_bounds=[-1,inf]"],
