@@ -94,11 +94,10 @@ class AMBSConfig(dreamer.ForesightConfig):
     has the authors'). An end of the episode also ends the costs that V_i foresee. Time limits are no
     ends (`limit_ends=true` has them). A violation of probability p costs p C, the mean of what the head
     says. In their code, the mean of symlogs, it costs (1 + C)^p - 1, a quarter of that at p = 0.1. Mean
-    actions are shielded, too. The defaults are from runs on
-    point_goal1 (docs/results/shielding): the model foresees cost, as Dreamer-PID's does, the critic of
-    rewards learns from replayed ones, too, cost is discounted sooner and its price is bounded, and the
-    shield looks less far ahead and lets more through, by the exact bound. `preset=plpg`, `penl` and
-    `copt` are the authors'.
+    actions are shielded, too. The defaults are from runs on point_goal1 (docs/results/shielding). The
+    model foresees cost, as Dreamer-PID's does. The critic of rewards learns from replayed ones, too.
+    Cost is discounted sooner, and its price is bounded. The shield looks less far ahead and lets more
+    through, by the exact bound. `preset=plpg`, `penl` and `copt` are the authors'.
     """
 
     ACTS_BY: ClassVar = (

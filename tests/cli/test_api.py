@@ -266,12 +266,12 @@ def test_a_policy_that_plans_in_the_simulator_acts_on_a_state_alone(tmp_path):
     player = other.player()
     _, plan = player.act(player.begin(), player.task.reset(jax.random.key(0)))
     assert plan.mean.shape == (2, 2) and player.learned.config.cost_limit == 7
-    with pytest.raises(jaxsafe.ConfigError, match="horizon: expected a setting of cce_pets that may"):
+    with pytest.raises(jaxsafe.ConfigError, match=r"algo\.horizon: expected a setting of cce_pets"):
         jaxsafe.Run(run.folder, Corridor(), horizon=3)
 
 
 def test_most_trained_policies_act_by_no_setting(run):
-    with pytest.raises(jaxsafe.ConfigError, match="cost_limit: no setting of ppo_saute may change"):
+    with pytest.raises(jaxsafe.ConfigError, match=r"algo\.cost_limit: no setting of ppo_saute"):
         jaxsafe.Run(run.folder, Corridor(), cost_limit=3)
 
 

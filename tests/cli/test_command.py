@@ -74,11 +74,16 @@ BAD = {
     "algo.discount=1.1": "expected a number between 0 and 1",
     "algo.gae_lambda=nan": "expected a number between 0 and 1",
     "algo.clip=wide": "expected a number",
-    "algo.minibatches=7": "algo.minibatches=7: expected a divisor of algo.num_envs * algo.horizon = ",
+    "algo.minibatches=7": (
+        "algo.minibatches=7: expected a divisor of algo.num_envs * algo.horizon = 20480; "
+        "the nearest is 8"
+    ),
     "algo=cce_pets algo.elites=513": "algo.elites=513: expected at most algo.plans=512",
     "algo=ambs algo.delta=0.01": "algo.delta=0.01: expected at least 0.07 with algo.shield_rollouts=64",
     "algo=ambs algo.labels=[hazad]": "algo.labels: unknown cost 'hazad'; did you mean 'hazards'?",
-    "algo.min_std=0.7": "algo.min_std=0.7: expected less than 0.607, the standard deviation at the",
+    "algo.min_std=0.7": (
+        "algo.min_std=0.7: expected less than 0.607, the standard deviation at the start"
+    ),
     "algo.min_std=[0,0.7]": "min_std=0.7: expected less than 0.607",
     "algo.cost_limit=[5,5]": "algo.cost_limit=5 occurs twice",
     "algo.cost_limit=[]": "not 0 of algo.cost_limit",

@@ -88,7 +88,7 @@ def test_a_setting_in_which_a_run_s_policies_differ_is_not_replaced():
     assert [cfg.delta for cfg in acting(swept, {"confidence": 0.05}).configs] == [0.2, 0.4]
     with pytest.raises(ConfigError, match=r"algo\.delta: the run has several"):
         acting(swept, {"delta": 0.3})
-    with pytest.raises(ConfigError, match=r"delt: .* may change after training; did you mean 'delta'"):
+    with pytest.raises(ConfigError, match=r"algo\.delt: .* may change .*; did you mean 'delta'"):
         acting(swept, {"delt": 0.3})
     with pytest.raises(ConfigError, match=r"algo\.delta: expected one value"):
         beside_a_run([TOY, "algo.delta=0.1,0.2"])

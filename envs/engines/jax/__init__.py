@@ -3,5 +3,7 @@
 import contextlib
 import io
 
-with contextlib.redirect_stdout(io.StringIO()):  # MJX prints that it lacks Warp, without which it does
+# MJX prints that Warp is missing when it is first imported. This engine needs none, so that is here,
+# in silence.
+with contextlib.redirect_stdout(io.StringIO()):
     import mujoco.mjx  # noqa: F401
