@@ -255,7 +255,7 @@ class Ledge:
 SHIELDED: dict[str, Any] = dreamer.LEVER | {  # settings of AMBS that hold it on the ledge
     "overshoot": 0, "discount": 0.9, "imagine_steps": 6, "penalty": "plpg", "penalty_coef": 0.8,
     "rule": "hoeffding", "delta": 0.1, "eps": 0.05, "shield_rollouts": 32, "shield_steps": 6,
-    "shield_horizon": 4,
+    "shield_horizon": 4, "least_penalty_scale": 1.0, "replay_value": 0.0,
 }  # fmt: skip
 
 
