@@ -14,7 +14,7 @@ import scipy
 
 from jaxsafe.algos import dreamer
 from jaxsafe.config import Amount, Bounds, ConfigError, Iterations, Rate, Share, Weight, config
-from jaxsafe.learn.acting import Course, Learned, Player, course
+from jaxsafe.learn.acting import Course, Learned, Play
 from jaxsafe.learn.constraints import Costs, check_cost_names, signal
 from jaxsafe.learn.dreaming import (
     Behaviour,
@@ -589,11 +589,9 @@ def compared(found: Foreseen, horizon: int) -> tuple[jax.Array, jax.Array]:
     return brier_score(found, horizon), calibration(found, horizon)
 
 
-def examine(
-    algo: Algorithm, learned: PyTree, shielded: Course, keys: jax.Array, sampled: bool
-) -> Examined:
-    """What the shield does in the `shielded` episodes of `keys` [S, N], of mean or of `sampled` actions
-    by the S policies in `learned`; and what the same episodes are without it.
+def examine(algo: Algorithm, learned: PyTree, shielded: Course, play: Play, sampled: bool) -> Examined:
+    """What the shield does in the `shielded` episodes, which the S policies in `learned` played with
+    mean or with `sampled` actions; and what the same episodes are without it.
 
     The Brier score and the calibration are always of sampled actions without the shield: the shield
     dreams of those.
@@ -604,16 +602,13 @@ def examine(
     if cfg.shield == "none":
         return Examined({"violations": counted})
 
-    def play(sampled: bool, **settings: Any) -> Course:
-        def of_one(learned: PyTree, keys: jax.Array) -> Course:
-            player = Player(algo.policy, learned, algo.task(learned))
-            return jax.vmap(lambda key: course(player, key, sampled))(keys)
+    def unshielded(sampled: bool, **settings: Any) -> Course:
+        other = dataclasses.replace(learned, config=dataclasses.replace(cfg, **settings))
+        actions = "sampled" if sampled else "mean"
+        return play(other, sampled, f"evaluating without the shield, {actions} actions")
 
-        bare = dataclasses.replace(learned, config=dataclasses.replace(cfg, **settings))
-        return jax.jit(jax.vmap(of_one))(bare, keys)
-
-    drawn = play(True, delta=jnp.full_like(cfg.delta, jnp.inf))  # it dreams, and never acts
-    bare = drawn if sampled else play(False, shield="none")
+    drawn = unshielded(True, delta=jnp.full_like(cfg.delta, jnp.inf))  # it dreams, and never acts
+    bare = drawn if sampled else unshielded(False, shield="none")
     horizon, runs = cfg.shield_horizon, drawn.alive
     found = Foreseen(runs, drawn.said["risk"], violated(env, drawn, cfg) & runs, drawn.terminated)
     scores, parts = jax.jit(jax.vmap(jax.vmap(partial(compared, horizon=horizon))))(found)

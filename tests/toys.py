@@ -15,7 +15,7 @@ from jaxsafe.algos import dreamer
 from jaxsafe.learn.acting import Player
 from jaxsafe.learn.certificate import interval_barrier
 from jaxsafe.learn.steps import Context, Trainable
-from jaxsafe.run.evaluate import Episodes, keys_of_episodes, make_evaluation
+from jaxsafe.run.evaluate import Episodes, evaluated, keys_of_episodes, make_play
 from jaxsafe.types import Algorithm, Env, Metrics, Policy, PyTree, Shared, State
 
 START = Shared(np.int32(0))
@@ -45,7 +45,7 @@ def run_episodes(
     Actions are the mean ones, or `sampled`.
     """
     keys = keys_of_episodes(seed, num_episodes, range(len(jax.tree.leaves(learned)[0])))
-    return make_evaluation(algo, keys, sampled)(learned)[0]
+    return evaluated(make_play(algo, keys), learned, sampled)[0]
 
 
 def momentum(nets: Trainable, name: str) -> PyTree:

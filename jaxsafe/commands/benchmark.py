@@ -95,7 +95,7 @@ def training(env, algo: str, cfg, seeds: int, devices: int, data=()):
     """(state, fn): one update of `algo`, with `data` for one that learns offline."""
     length = {"total_updates": cfg.updates} if data else {}
     settings = TrainConfig(num_seeds=seeds, devices=devices, **length)
-    check_devices(settings)
+    check_devices(settings.devices)
     program = build(env, algos.ALGOS[algo].make, [cfg], settings, data)
     shared = program.shared()
     state = jax.jit(program.init)(jax.device_put(program.start, program.sharding), shared)

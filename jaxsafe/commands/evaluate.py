@@ -3,6 +3,8 @@
 import functools
 from pathlib import Path
 
+from rich.console import Console
+
 from jaxsafe.commands.guard import guarded
 from jaxsafe.config import EpisodeCount, Seed
 from jaxsafe.learn.constraints import limits_in_words, limits_of
@@ -12,6 +14,7 @@ from jaxsafe.run.devices import use_compilation_cache
 from jaxsafe.run.flags import Parser, number
 from jaxsafe.run.interrupts import Interrupts
 from jaxsafe.run.policies import CODE, open_run
+from jaxsafe.run.progress import Reporter
 
 
 def main() -> int:
@@ -56,9 +59,10 @@ def command() -> int:
         + "".join(f" | {text}" for text in args.code if text not in code),
         flush=True,
     )
-    with Interrupts(functools.partial(print, flush=True)) as stop:
+    report = Reporter(Console(stderr=True, highlight=False, soft_wrap=True))
+    with report, Interrupts(functools.partial(print, flush=True)) as stop:
         stop.nothing_to_save = "stopped"
-        scores = evaluate(run, args.episodes, args.seed, sampled=args.sampled)
+        scores = evaluate(run, args.episodes, args.seed, sampled=args.sampled, told=report.going)
     for s in scores:
         if not alone:
             print(f"\n{s.name} | cost limit {limits_in_words(s.limits)}")

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import flax.struct
 import jax
@@ -106,18 +106,40 @@ def played(
         sampled: whether actions are sampled, or the mean ones. Both begin with the same reset.
         steps: T; 0 is up to the time limit.
     """
-    reset_key, act_key = jax.random.split(key)
-    env = player.task
+    start, times = begun(player, key), jnp.arange(steps or player.task.episode_length)
+    return start.state, played_on(player, key, seen, start, times, sampled)[1]
+
+
+def begun(player: Player, key: jax.Array) -> Playing:
+    """The beginning of the episode that `played` plays with this key."""
+    return player.start(jax.random.split(key)[0])
+
+
+def played_on(
+    player: Player,
+    key: jax.Array,
+    seen: Callable[[Step], T],
+    now: Playing,
+    times: jax.Array,
+    sampled: bool = False,
+) -> tuple[Playing, T]:
+    """A stretch of the episode that `played` plays with this key: where it leads, and what `seen` makes
+    of each step.
+
+    Args:
+        now: where it begins.
+        times: which steps of the episode they are, int [T]: one after the other.
+    """
+    act_key = jax.random.split(key)[1]
 
     def step(now: Playing, t: jax.Array) -> tuple[Playing, T]:
         sample_key = jax.random.fold_in(act_key, t) if sampled else None
         action, carry, said = player.decide(now.carry, now.state, sample_key)
-        after = env.step(now.state, action)
+        after = player.task.step(now.state, action)
         found = seen(Step(now, action, said, carry, after))
         return Playing(after, carry, now.alive & ~after.ended), found
 
-    start = player.start(reset_key)
-    return start.state, jax.lax.scan(step, start, jnp.arange(steps or env.episode_length))[1]
+    return jax.lax.scan(step, now, times)
 
 
 class Course(NamedTuple):
@@ -139,16 +161,28 @@ class Course(NamedTuple):
 
 def course(player: Player, key: jax.Array, sampled: bool = False) -> Course:
     """A whole episode, pure, of mean or of `sampled` actions."""
+    return played(player, key, of_course, sampled)[1]
 
-    def seen(step: Step) -> Course:
-        alive, after = step.now.alive, step.after
-        reward, cost, costs, goal_met = (
-            jnp.where(alive, x, 0.0)
-            for x in (after.reward, after.cost, after.costs, after.info.get("goal_met", jnp.nan))
-        )
-        return Course(alive, reward, cost, costs, after.terminated & alive, goal_met, step.said)
 
-    return played(player, key, seen, sampled)[1]
+def of_course(step: Step) -> Course:
+    """One step of a course, without the axis of time."""
+    alive, after = step.now.alive, step.after
+    reward, cost, costs, goal_met = (
+        jnp.where(alive, x, 0.0)
+        for x in (after.reward, after.cost, after.costs, after.info.get("goal_met", jnp.nan))
+    )
+    return Course(alive, reward, cost, costs, after.terminated & alive, goal_met, step.said)
+
+
+class Play(Protocol):
+    """What plays N whole episodes with each of S policies: learned [S, ...] -> [S, N, T, ...], on the
+    device.
+
+    They begin alike, whatever has been learned. Actions are the mean ones, or `sampled`. `about` says
+    what they are played for, to who waits.
+    """
+
+    def __call__(self, learned: PyTree, sampled: bool, about: str = "") -> Course: ...
 
 
 def first_carries(policy: Policy, learned: PyTree, num_envs: int) -> PyTree:

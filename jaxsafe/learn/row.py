@@ -4,10 +4,9 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
-import jax
 import numpy as np
 
-from jaxsafe.learn.acting import Course
+from jaxsafe.learn.acting import Course, Play
 from jaxsafe.types import Algorithm, Env, PyTree
 
 NOTHING: Mapping[str, Any] = MappingProxyType({})
@@ -43,9 +42,10 @@ class Row(NamedTuple):
     lever: options with which it learns Lever, the small exact problem of tests/toys.py, if its
         defaults do not.
     note: note(cfg), a line to print before training: what its settings promise; '' for nothing.
-    examine: examine(algo, learned, course, keys, sampled) -> Examined, what else evaluation measures in
-        the episodes of `keys` [S, N], which the S policies in `learned` played with mean or with
-        `sampled` actions. `course` are their steps, [S, N, T, ...].
+    examine: examine(algo, learned, course, play, sampled) -> Examined, what else evaluation measures in
+        the N episodes that each of the S policies in `learned` played with mean or with `sampled`
+        actions. `course` are their steps, [S, N, T, ...]. `play` plays them again, as with other
+        settings in `learned`.
     check: check(cfg, env, data) raises ConfigError for settings, or a data set, that cannot serve.
         `data` is () where there is none.
     """
@@ -60,4 +60,4 @@ class Row(NamedTuple):
     lever: Mapping[str, Any] = NOTHING
     check: Callable[[Any, Env, Any], None] = lambda cfg, env, data: None
     note: Callable[[Any], str] = lambda cfg: ""
-    examine: Callable[[Algorithm, PyTree, Course, jax.Array, bool], Examined] = lambda *_: Examined()
+    examine: Callable[[Algorithm, PyTree, Course, Play, bool], Examined] = lambda *_: Examined()

@@ -14,7 +14,7 @@ from jaxsafe.report import scores, stats
 from jaxsafe.report.stats import Estimate
 from jaxsafe.run import memory, run_folder
 from jaxsafe.run.divergence import read_lost, seeds_in_words
-from jaxsafe.run.evaluate import Episodes, keys_of_episodes, make_evaluation, measures
+from jaxsafe.run.evaluate import Episodes, Told, evaluated, keys_of_episodes, make_play, measures, quiet
 from jaxsafe.run.policies import RunPolicies
 from jaxsafe.run.programs import members
 from jaxsafe.types import PyTree
@@ -38,17 +38,24 @@ class Scores(NamedTuple):
 
 
 def evaluate(
-    run: RunPolicies, num: int, seed: int, data: PyTree = (), sampled: bool = False
+    run: RunPolicies,
+    num: int,
+    seed: int,
+    data: PyTree = (),
+    sampled: bool = False,
+    told: Told = quiet,
 ) -> list[Scores]:
     """`num` fresh episodes of each seed in each setting, with mean actions or `sampled` ones.
 
-    Of a run on a data set there are DSRL's scores too and, with `data`, the data's own episodes.
+    Of a run on a data set there are DSRL's scores too and, with `data`, the data's own episodes. How
+    far it is, is `told`.
     """
     settings = run.settings
     keys = keys_of_episodes(seed, num, settings.train.seeds, len(settings.configs))
     memory.check_episodes(run.env, num, len(keys))
-    episodes, course = make_evaluation(run.algo, keys, sampled)(run.learned)
-    examined = settings.row.examine(run.algo, run.learned, course, keys, sampled)
+    play = make_play(run.algo, keys, told)
+    episodes, course = evaluated(play, run.learned, sampled)
+    examined = settings.row.examine(run.algo, run.learned, course, play, sampled)
     tables = list(run_folder.by_setting(run_folder.read_metrics(run.folder)).values())
     cost_names = run.algo.task(jax.tree.map(lambda x: x[0], run.learned)).cost_names
     seeds, by_setting, lost = settings.train.num_seeds, [], read_lost(run.folder)

@@ -36,7 +36,11 @@ def finish(session: Session, report: Reporter, stop: Interrupts) -> None:
     )
 
     def scores() -> None:
-        found.extend(evaluation.evaluate(run(), train.eval_episodes, TRAINING, session.program.data))
+        found.extend(
+            evaluation.evaluate(
+                run(), train.eval_episodes, TRAINING, session.program.data, told=report.going
+            )
+        )
         keep_scores(found, session, report)
 
     def video() -> None:

@@ -2,12 +2,13 @@
 
 import contextlib
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
 
 from jaxsafe.config import ConfigError
-from jaxsafe.run.settings import TrainConfig
+from jaxsafe.types import PyTree
 
 
 def use_compilation_cache() -> None:
@@ -20,15 +21,15 @@ def use_compilation_cache() -> None:
             jax.config.update("jax_compilation_cache_dir", str(folder))
 
 
-def check_devices(train_cfg: TrainConfig) -> None:
-    if jax.process_count() > 1 and train_cfg.devices != jax.device_count():
+def check_devices(devices: int) -> None:
+    if jax.process_count() > 1 and devices != jax.device_count():
         raise ConfigError(
-            f"devices={train_cfg.devices}: expected {jax.device_count()}, which the "
+            f"devices={devices}: expected {jax.device_count()}, which the "
             f"{jax.process_count()} processes have together ({jax.default_backend()})"
         )
-    if train_cfg.devices > jax.device_count():
+    if devices > jax.device_count():
         raise ConfigError(
-            f"devices={train_cfg.devices}: JAX sees {jax.device_count()} ({jax.default_backend()})"
+            f"devices={devices}: JAX sees {jax.device_count()} ({jax.default_backend()})"
             + ("; set JAX_NUM_CPU_DEVICES to split the CPU" if jax.default_backend() == "cpu" else "")
         )
 
@@ -36,3 +37,9 @@ def check_devices(train_cfg: TrainConfig) -> None:
 def device_name() -> str:
     device = jax.local_devices()[0]
     return f"cpu ({os.cpu_count()} cores)" if device.platform == "cpu" else str(device.device_kind)
+
+
+def jit_once(fn: Callable[..., PyTree]) -> Callable[..., PyTree]:
+    """`jax.jit` of what runs only a few times. On a CPU it is less optimised, which saves seconds."""
+    on_cpu = {"xla_backend_optimization_level": 1, "xla_llvm_disable_expensive_passes": True}
+    return jax.jit(fn, compiler_options=on_cpu if jax.default_backend() == "cpu" else None)

@@ -1,5 +1,6 @@
 """Fresh episodes of a trained policy, and what is measured of each."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -7,13 +8,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsafe.learn.acting import Course, Player, course
+from jaxsafe.learn.acting import Course, Play, Player, Playing, begun, of_course, played_on
+from jaxsafe.run.devices import jit_once
 from jaxsafe.types import Algorithm, PyTree
 
 # the seed of the episodes that training plays, on the way and at its end: the same of every run
 TRAINING = 0
 # columns of metrics.csv where training is evaluated, of mean and of sampled actions
 COLUMNS = ("eval/return", "eval/cost", "eval/return_sampled", "eval/cost_sampled")
+PARTS = 10  # of an episode, after each of which progress is told and Ctrl-C is seen
+
+# told(about, share): how much of the steps of these episodes is done, from 0 to 1
+Told = Callable[[str, float], None]
+
+
+def quiet(about: str, share: float) -> None:
+    """Says nothing."""
 
 
 class Episodes(NamedTuple):
@@ -67,28 +77,61 @@ def keys_of_episodes(
     return each(jnp.array([*seeds] * settings))
 
 
-def make_evaluation(
-    algo: Algorithm, keys: jax.Array, sampled: bool = False
-) -> Callable[[PyTree], tuple[Episodes, Course]]:
-    """What plays the episodes of `keys` [S, N] with S policies: learned [S, ...] -> their sums, and
-    their steps, [S, N, T, ...], on the device.
+def make_play(algo: Algorithm, keys: jax.Array, told: Told = quiet) -> Play:
+    """What plays the episodes of `keys` [S, N] with S policies, in `PARTS` calls one after the other.
 
-    Actions are the mean ones, or `sampled`. It compiles once.
+    It compiles once for mean and once for sampled actions, and anew for other settings that are not
+    numbers.
     """
 
-    def one_seed(learned: PyTree, keys: jax.Array) -> tuple[Episodes, Course]:
-        player = Player(algo.policy, learned, algo.task(learned))
+    def player_of(learned: PyTree) -> Player:
+        return Player(algo.policy, learned, algo.task(learned))
+
+    def begin(learned: PyTree, keys: jax.Array) -> Playing:
+        return jax.vmap(lambda key: begun(player_of(learned), key))(keys)
+
+    def go_on(
+        learned: PyTree, keys: jax.Array, now: Playing, times: jax.Array, sampled: bool
+    ) -> tuple[Playing, Course]:
+        def one(key: jax.Array, now: Playing) -> tuple[Playing, Course]:
+            return played_on(player_of(learned), key, of_course, now, times, sampled)
+
+        return jax.vmap(one)(keys, now)
+
+    begin_all = jit_once(jax.vmap(begin))
+    go_on_all = jax.jit(jax.vmap(go_on, (0, 0, 0, None, None)), static_argnums=4)
+
+    def play(learned: PyTree, sampled: bool, about: str = "") -> Course:
+        length = algo.task(jax.tree.map(lambda x: x[0], learned)).episode_length
+        each = math.ceil(length / PARTS)
+        told(about, 0.0)
+        now, parts = begin_all(learned, keys), []
+        for first in range(0, length, each):
+            times = first + jnp.arange(each)  # the last may go beyond the end
+            now, part = jax.block_until_ready(go_on_all(learned, keys, now, times, sampled))
+            parts.append(part)
+            told(about, min(first + each, length) / length)
+        return jax.tree.map(lambda *x: jnp.concatenate(x, 2)[:, :, :length], *parts)
+
+    return play
+
+
+@jax.jit
+def totals_of_all(learned: PyTree, played: Course) -> Episodes:
+    """The sums of the episodes `played` [S, N, T, ...] by the S policies in `learned`."""
+
+    def of_one(learned: PyTree, played: Course) -> Episodes:
         discounts = learned.config.discount, learned.config.cost_discount
-        played = jax.vmap(lambda key: course(player, key, sampled))(keys)
-        return jax.vmap(lambda x: totals(x, *discounts))(played), played
+        return jax.vmap(lambda x: totals(x, *discounts))(played)
 
-    play = jax.jit(jax.vmap(one_seed))
+    return jax.vmap(of_one)(learned, played)
 
-    def evaluate(learned: PyTree) -> tuple[Episodes, Course]:
-        episodes, played = play(learned, keys)
-        return jax.tree.map(np.asarray, episodes), played
 
-    return evaluate
+def evaluated(play: Play, learned: PyTree, sampled: bool = False) -> tuple[Episodes, Course]:
+    """The sums of the episodes that `play` plays with S policies, learned [S, ...], and their steps,
+    [S, N, T, ...], on the device. Actions are the mean ones, or `sampled`."""
+    played = play(learned, sampled, "evaluating")
+    return jax.tree.map(np.asarray, totals_of_all(learned, played)), played
 
 
 def make_training_evaluation(
@@ -100,11 +143,11 @@ def make_training_evaluation(
     The programs with mean and with sampled actions run one after the other, as two that call the host
     at once can wait for each other.
     """
-    players = [make_evaluation(algo, keys, sampled) for sampled in (False, True)]
+    play = make_play(algo, keys)
 
     def evaluate(learned: PyTree) -> dict[str, np.ndarray]:
-        played = [play(learned)[0] for play in players]
-        means = [x.mean(1) for episodes in played for x in (episodes.ret, episodes.cost)]
+        both = [evaluated(play, learned, sampled)[0] for sampled in (False, True)]
+        means = [x.mean(1) for episodes in both for x in (episodes.ret, episodes.cost)]
         return dict(zip(COLUMNS, means, strict=True))
 
     return evaluate

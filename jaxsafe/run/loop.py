@@ -15,6 +15,7 @@ import numpy as np
 
 from jaxsafe.learn.constraints import limits_by_name
 from jaxsafe.run import checkpoint, clock, distributed, divergence, files, programs, run_folder
+from jaxsafe.run.devices import jit_once
 from jaxsafe.run.divergence import Diverged
 from jaxsafe.run.evaluate import COLUMNS
 from jaxsafe.run.interrupts import Interrupts
@@ -24,9 +25,6 @@ from jaxsafe.run.programs import Member, Program
 from jaxsafe.run.progress import Reporter
 from jaxsafe.run.settings import TrainConfig
 from jaxsafe.types import PyTree
-
-# For XLA on a CPU. To optimise what runs once takes seconds, and saves none.
-RUN_ONCE = {"xla_backend_optimization_level": 1, "xla_llvm_disable_expensive_passes": True}
 
 
 class Hooks(NamedTuple):
@@ -146,8 +144,7 @@ def train(
 def fresh(program: Program, hooks: Hooks) -> Start:
     """The train state before the first update."""
     given = distributed.place(program.start, program.sharding)
-    options = RUN_ONCE if jax.default_backend() == "cpu" else None
-    ts = jax.jit(program.init, compiler_options=options)(given, program.shared())
+    ts = jit_once(program.init)(given, program.shared())
     return Start(distributed.place(hooks.adapt(ts), program.sharding))
 
 

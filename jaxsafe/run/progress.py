@@ -13,6 +13,7 @@ from rich.text import Text
 
 PLAIN_EVERY = 5.0  # s between lines when stdout is no terminal
 NOTEBOOK_EVERY = 0.25  # s between changes of the line
+MOMENT = 1.0  # s, after which a task is worth a word
 
 
 def short(value: float) -> str:
@@ -59,7 +60,7 @@ class Reporter:
         self.console = console or plain
         self.hosted = hosted
         self.live: Progress | None = None
-        self.width = 0  # of the changing line in a notebook
+        self.width = 0  # of the changing line
 
     def __enter__(self) -> "Reporter":
         return self
@@ -131,15 +132,50 @@ class Reporter:
         elif self.notebook:
             if now - self.printed >= NOTEBOOK_EVERY or done >= self.total:
                 self.printed, text = now, f"{100 * done / self.total:3.0f}%  {text}"
-                print("\r" + text.ljust(self.width), end="", flush=True)
-                self.width = len(text)
+                self._change(text)
         elif now - self.printed >= PLAIN_EVERY or done >= self.total:
             self.printed = now
             self.line(f"{100 * done / self.total:3.0f}%  {text}")
 
+    def going(self, about: str, share: float) -> None:
+        """Say which share of a task is done, if it takes more than a moment. 0 begins it, 1 ends it.
+
+        On a terminal and in a notebook it is one changing line, which is gone at the end, elsewhere
+        plain lines.
+        """
+        now = time.perf_counter()
+        if share == 0:
+            self.begun = self.printed = now
+            self.first = None
+            return
+        if self.first is None:
+            self.first = now, share  # until here it may have compiled
+        changing = self.notebook or self.console.is_terminal
+        if share == 1:
+            with self._showing():
+                self._change("")
+        elif now - self.begun >= MOMENT and (changing or now - self.printed >= PLAIN_EVERY):
+            text = f"{100 * share:3.0f}%  {about}"
+            if share > self.first[1]:
+                rate = (share - self.first[1]) / max(now - self.first[0], 1e-9)
+                text += f"  left {duration_text((1 - share) / rate)}"
+            self.printed = now
+            if changing:
+                with self._showing():
+                    self._change(text[: self.console.width - 1])
+            else:
+                self.line(text)
+
+    def _change(self, text: str) -> None:
+        """Put `text` where the changing line is; '' leaves the place empty."""
+        if text or self.width:
+            ends = "" if text else "\r"
+            print("\r" + text.ljust(self.width), end=ends, file=self.console.file, flush=True)
+        self.width = len(text)
+
     def _end_changing(self) -> None:
         if self.width:
-            print()
+            print(file=self.console.file)
             self.width = 0
 
     def stop(self) -> None:

@@ -168,7 +168,7 @@ def prepare(settings: Settings) -> tuple[Env, Program]:
     """
     train = settings.train
     use_compilation_cache()
-    check_devices(train)
+    check_devices(train.devices)
     check_logger(train.logger)
     env = make_env(settings)
     with as_options(settings.row):

@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import rich.console
 from toys import Corridor, run_episodes
 
 import jaxsafe
@@ -435,20 +434,3 @@ def test_a_sweep_has_a_row_a_setting_and_opens_its_runs():
     (run,) = found.runs
     assert run.metrics["train/lam"][0].tolist() == [0, 0, 1, 1]
     assert run.policy(jnp.zeros(4), index=3).shape == (2,)
-
-
-# ---- notebooks -------------------------------------------------------------------------------
-
-
-def test_a_notebook_has_one_line_that_changes(monkeypatch, capsys):
-    monkeypatch.setattr(rich.console, "_is_jupyter", lambda: True)
-    monkeypatch.setattr(progress, "NOTEBOOK_EVERY", 0.0)
-    with progress.Reporter() as report:
-        report.line("first")
-        report.start(100, 0, [25.0])
-        for steps in (50, 100):
-            report.update(steps, 1, ret=1.0, cost=2.0, lam=0.0)
-        report.line("last")
-    first, changing, last = capsys.readouterr().out.removesuffix("\n").split("\n")
-    assert (first, last) == ("first", "last")
-    assert [part[:4] for part in changing.split("\r")] == ["", " 50%", "100%"]

@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import json
-import math
 import shutil
 from typing import Any
 
@@ -17,7 +16,7 @@ from jaxsafe.algos import ALGOS
 from jaxsafe.config import ConfigError, flat
 from jaxsafe.learn.offline import DataSet, OfflineConfig, data_set
 from jaxsafe.report import read
-from jaxsafe.run import checkpoint, dataset, progress, run_folder, session
+from jaxsafe.run import checkpoint, dataset, run_folder, session
 from jaxsafe.run.arguments import compose
 from jaxsafe.run.dataset import read_dataset, write_dataset
 from jaxsafe.run.policies import open_run
@@ -131,22 +130,6 @@ def test_a_comparison_holds_runs_without_training_episodes(whole):
     assert np.isnan(run.values["return"]).all() and np.isfinite(run.values["final return"]).all()
     assert run.clock == "updates" and not run.evaluated
     assert typed("plot", str(whole), "--out", str(whole.parent / "comparison")) == 0
-
-
-def test_the_progress_line_says_that_a_cost_is_the_learners_estimate(capsys):
-    def line(ret: float, cost: float) -> str:
-        report.update(5, 1, ret, cost, math.nan)
-        return capsys.readouterr().out
-
-    report = progress.Reporter()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(progress, "PLAIN_EVERY", 0.0)
-        report.start(10, 0, [25.0], "updates")
-        assert "return 3  cost 9/25  left" in line(3.0, 9.0)  # an evaluation
-        assert "return 3  estimated cost -0.549/25  left" in line(math.nan, -0.549)
-        assert "return 4  estimated cost -0.5/25  left" in line(4.0, -0.5)  # its return is evaluated
-        report.start(10, 0, [25.0])
-        assert "return -  cost 9/25  left" in line(math.nan, 9.0)  # of the steps of an iteration
 
 
 def test_a_sweep_falls_back_on_the_evaluation_of_a_named_cost_too(whole):
@@ -264,7 +247,7 @@ def test_numbers_that_no_environment_gives_are_a_line_each(data):
 
 
 def test_a_lone_seed_without_environments_does_not_split_over_devices(data, monkeypatch):
-    monkeypatch.setattr(session, "check_devices", lambda train: None)
+    monkeypatch.setattr(session, "check_devices", lambda devices: None)
     with pytest.raises(ConfigError, match="devices=2: a lone seed has no environments to split"):
         session.prepare(compose([*BC, f"dataset={data}", "devices=2"]))
 

@@ -17,7 +17,6 @@ from jaxsafe.config import ConfigError
 from jaxsafe.run import checkpoint, distributed, run_folder
 from jaxsafe.run.devices import check_devices
 from jaxsafe.run.distributed import Position
-from jaxsafe.run.settings import TrainConfig
 
 ARGS = (
     "env=toys:Corridor", "algo=pg", "num_envs=4", "algo.horizon=16", "algo.minibatches=1",
@@ -202,4 +201,4 @@ def test_more_devices_than_the_processes_have_are_refused(monkeypatch):
     monkeypatch.setattr(jax, "process_count", lambda: 2)
     with pytest.raises(ConfigError, match="devices=1: expected"):
         monkeypatch.setattr(jax, "device_count", lambda: 2)
-        check_devices(TrainConfig(devices=1))
+        check_devices(1)

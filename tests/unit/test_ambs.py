@@ -30,7 +30,7 @@ from jaxsafe.learn.world_model import Dreams, dream, dream_returns, world_of
 from jaxsafe.nn.gaussian import Gaussian
 from jaxsafe.nn.rssm import Latent
 from jaxsafe.report import evaluation
-from jaxsafe.run.evaluate import make_evaluation
+from jaxsafe.run.evaluate import make_play
 from jaxsafe.types import Algorithm, Policy
 
 CFG = ambs.AMBSConfig(
@@ -999,10 +999,11 @@ def test_nothing_counts_after_the_end_of_an_episode():
     algo: Any = SimpleNamespace(policy=policy, task=lambda learned: Ticker(lives=(2, 2)))
     learned = Learned(jax.tree.map(lambda x: jnp.full(1, x), CFG), {}, (), ())
     keys = jax.random.split(jax.random.key(0), (1, 1))
-    _, shielded = make_evaluation(algo, keys)(learned)
+    play = make_play(algo, keys)
+    shielded = play(learned, False)
     np.testing.assert_array_equal(shielded.alive, [[[1, 1, 0, 0, 0]]])
     np.testing.assert_array_equal(shielded.terminated, [[[0, 1, 0, 0, 0]]])
-    found = ambs.examine(algo, learned, shielded, keys, False)
+    found = ambs.examine(algo, learned, shielded, play, False)
     assert [(k, x.item()) for k, x in found.measures.items()] == [  # in the order of the table
         ("override rate", 1), ("violations", 2), ("violations, no shield", 2),
         ("return, no shield", 2), ("Brier score", 0),
@@ -1015,8 +1016,8 @@ def test_without_a_shield_evaluation_counts_violations_alone():
     learned = jax.tree.map(lambda x: jnp.asarray(x)[None], learned)
     bare = dataclasses.replace(learned, config=dataclasses.replace(learned.config, shield="none"))
     keys = jax.random.split(jax.random.key(0), (1, 2))
-    _, played = make_evaluation(algo, keys)(bare)
-    found = ambs.examine(algo, bare, played, keys, False)
+    play = make_play(algo, keys)
+    found = ambs.examine(algo, bare, play(bare, False), play, False)
     assert found.calibration is None and [*found.measures] == ["violations"]
     assert ambs.note(bare.config) == ""
     ambs.check(dataclasses.replace(CFG, shield="none", delta=0.0), Corridor())  # it has no bound
@@ -1041,8 +1042,8 @@ def test_the_risk_is_scored_by_sampled_actions_without_the_shield(sampled, viola
     cfg = jax.tree.map(lambda x: jnp.full(1, x), dataclasses.replace(CFG, shield_horizon=4))
     keys = jax.random.split(jax.random.key(0), (1, 2))
     learned = Learned(cfg, {}, (), ())
-    _, shielded = make_evaluation(algo, keys, sampled)(learned)
-    found = ambs.examine(algo, learned, shielded, keys, sampled)
+    play = make_play(algo, keys)
+    found = ambs.examine(algo, learned, play(learned, sampled), play, sampled)
     measures = found.measures
     assert (measures["Brier score"] == 0).all()
     assert (measures["violations, no shield"] == violations).all()

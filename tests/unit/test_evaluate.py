@@ -6,12 +6,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from toys import Ticker, reflex
 
 from jaxsafe.algos.bc import BCConfig
-from jaxsafe.learn.acting import Learned
-from jaxsafe.run.evaluate import keys_of_episodes, make_evaluation
+from jaxsafe.learn.acting import Learned, Player, course
+from jaxsafe.run.evaluate import evaluated, keys_of_episodes, make_play
 from jaxsafe.run.settings import TrainConfig
+from jaxsafe.types import Policy
 
 
 def keys(*args):
@@ -41,6 +43,44 @@ def test_each_policy_s_rewards_and_costs_are_discounted_as_in_its_training():
     algo: Any = SimpleNamespace(policy=policy, task=lambda learned: env)
     cfgs = BCConfig(discount=0.5, cost_discount=0.25), BCConfig(discount=1.0, cost_discount=0.0)
     cfg = jax.tree.map(lambda *x: jnp.array(x), *cfgs)
-    found, _ = make_evaluation(algo, keys_of_episodes(0, 1, range(2)))(Learned(cfg, {}, (), ()))
+    play = make_play(algo, keys_of_episodes(0, 1, range(2)))
+    found, _ = evaluated(play, Learned(cfg, {}, (), ()))
     np.testing.assert_array_equal(found.discounted_ret, [[1.5], [2]])
     np.testing.assert_array_equal(found.discounted_cost, [[2.5], [2]])
+
+
+@pytest.mark.parametrize("length", [5, 12])
+@pytest.mark.parametrize("sampled", [False, True])
+def test_episodes_are_played_in_parts_and_are_the_same(length, sampled):
+    """Twelve steps are six parts of two, and five steps five of one."""
+
+    def noisy(learned, carry, obs, key):
+        noise = jnp.zeros(()) if key is None else jax.random.uniform(key)
+        return obs[:1], (), {"noise": noise}
+
+    env = Ticker(length, lives=(2, length + 2))
+    policy = Policy(lambda learned: (), noisy)
+    algo: Any = SimpleNamespace(policy=policy, task=lambda learned: env)
+    learned = Learned(jax.tree.map(lambda x: jnp.stack([x, x]), BCConfig()), {}, (), ())
+    keys, told = keys_of_episodes(0, 3, range(2)), []
+    parts = make_play(algo, keys, lambda *said: told.append(said))(learned, sampled, "playing")
+    whole = jax.vmap(jax.vmap(lambda key: course(Player(algo.policy, learned, env), key, sampled)))(
+        keys
+    )
+    assert parts.alive.shape == (2, 3, length)
+    jax.tree.map(np.testing.assert_array_equal, parts, whole)
+    assert told[0] == ("playing", 0.0) and told[-1] == ("playing", 1.0)
+    assert len(told) == 1 + min(length, 6)
+
+
+def test_ctrl_c_is_seen_between_parts():
+    env = Ticker()
+    algo: Any = SimpleNamespace(policy=reflex(lambda obs: obs[:1], env).policy, task=lambda _: env)
+
+    def stop(about, share):
+        if share > 0.3:
+            raise KeyboardInterrupt
+
+    play = make_play(algo, keys_of_episodes(0, 1, [0]), stop)
+    with pytest.raises(KeyboardInterrupt):
+        play(Learned(jax.tree.map(lambda x: jnp.full(1, x), BCConfig()), {}, (), ()), False)
