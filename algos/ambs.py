@@ -136,7 +136,7 @@ class AMBSConfig(dreamer.ForesightConfig):
     # tell of the exact bound.
     shield_rollouts: Annotated[int, Bounds(1, MOST_ROLLOUTS)] = 64
     shield_horizon: Iterations = 10  # T, steps within which a violation counts. The paper has 30.
-    # H, steps of the shield's dreams with verdict=summed. The paper has 15.
+    # H, steps of the shield's dreams with verdict=summed, at most T. The paper has 15.
     shield_steps: Iterations = 5
     # Delta, the probability of a violation that is still let through. The paper has 0.1.
     delta: Share = 0.3
@@ -301,12 +301,15 @@ def risk(env: Env, learned: Learned, latent: Latent, proposed: jax.Array, key: j
 
 
 def dreamt(env: Env, learned: Learned, latent: Latent, proposed: jax.Array, key: jax.Array) -> Dreamt:
-    """Dreams of the task's policy from `latent`: of T steps if violations are drawn, else of H.
+    """Dreams of the task's policy from `latent`: of T steps if violations are drawn, else of H, or of T
+    where that is less.
 
     proposed: float [A], with which they begin where `verify_action` is set.
     """
     cfg, params = learned.config, learned.params
-    steps = cfg.shield_horizon if cfg.verdict == "drawn" else cfg.shield_steps
+    steps = cfg.shield_horizon
+    if cfg.verdict == "summed":
+        steps = min(cfg.shield_steps, steps)  # what comes after T does not count
     world = world_of(env, shielded_behaviour.all_heads(cfg), cfg)
     start = particles_of(latent, (cfg.shield_rollouts,))
 
