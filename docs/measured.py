@@ -179,11 +179,14 @@ def held(training: Sequence[Group], final: Sequence[Group]) -> str:
     trained = [(g.cost.mean, float(cost)) for g, cost in ends if cost]
 
     def count(pairs: Sequence[tuple[float, float]]) -> str:
-        ours, theirs = (sum(cost <= 30 for cost in costs) for costs in zip(*pairs, strict=True))
-        return f"{ours} of {len(pairs)} cells, OmniSafe's in {theirs}"
+        (ours, at), (theirs, their_at) = (
+            [sum(cost <= most for cost in costs) for most in (30, 25)]
+            for costs in zip(*pairs, strict=True)
+        )
+        return f"{ours} of {len(pairs)} cells, OmniSafe's in {theirs} (to 25 in {at} and {their_at})"
 
     return (
-        f"A cost of at most 30 is a fifth over the limit. A cell is an algorithm with a limit on one "
+        f"A cost of 30 is a fifth over the limit. A cell is an algorithm with a limit on one "
         f"task. Counted are those that OmniSafe published. Our evaluated policies keep to 30 in "
         f"{count(known)}. At the end of training ours do in {count(trained)}."
     )
