@@ -715,7 +715,7 @@ def test_a_dream_is_read_state_by_state_and_the_critics_are_asked_at_its_end(mon
     np.testing.assert_array_equal(found.alive, [[True, True], [False, False], [True, True]])
     np.testing.assert_array_equal(found.value, [3, 3])
     # no dream goes beyond the steps within which a violation counts
-    near = learned.replace(config=dataclasses.replace(cfg, shield_horizon=2))
+    near = dataclasses.replace(learned, config=dataclasses.replace(cfg, shield_horizon=2))
     found = ambs.dreamt(Corridor(), near, latent, jnp.zeros(2), jax.random.key(0))
     np.testing.assert_array_equal(found.cost, [[0, 0], [4, 4]])
     np.testing.assert_array_equal(found.value, [2, 2])
