@@ -30,7 +30,7 @@ from jaxsafe.learn.dreaming import (
     seen,
 )
 from jaxsafe.learn.off_policy import off_policy
-from jaxsafe.learn.planning import particles_of
+from jaxsafe.learn.planning import key_of_step, particles_of
 from jaxsafe.learn.row import Examined, Row
 from jaxsafe.learn.world_model import CHANCE, dream_returns, read, value_of, world_of
 from jaxsafe.nn.rssm import Latent
@@ -396,6 +396,15 @@ def overrules(p: jax.Array, cfg: Any) -> jax.Array:
     return (jnp.where(count < m, likely, 1.0) > cfg.confidence) & (cfg.delta <= 1)
 
 
+class Watched(NamedTuple):
+    """What the policy remembers: where it was, what it did there, and how many steps it has acted,
+    int []."""
+
+    latent: Latent
+    action: jax.Array
+    step: jax.Array
+
+
 def shielded(env: Env, policy: Policy) -> Policy:
     """`policy`, under a shield: where what it proposes looks unsafe, the safe policy acts instead. What
     is remembered is the action that is taken."""
@@ -403,22 +412,29 @@ def shielded(env: Env, policy: Policy) -> Policy:
     def privileged(learned: Learned) -> bool:
         return learned.config.shield == "true_dynamics"
 
-    def keys_of(key: jax.Array | None) -> tuple[jax.Array | None, jax.Array | None, jax.Array]:
+    def init(learned: Learned) -> Watched:
+        return Watched(*policy.init(learned), jnp.int32(0))
+
+    def keys_of(
+        key: jax.Array | None, step: jax.Array
+    ) -> tuple[jax.Array | None, jax.Array | None, jax.Array]:
         """Of both policies and of the dreams. The mean action has dreams, too."""
         if key is None:
-            return None, None, jax.random.key(0)
+            return None, None, key_of_step(step)
         act_key, shield_key = jax.random.split(key)
         backup_key, dream_key = jax.random.split(shield_key)
         return act_key, backup_key, dream_key
 
     def act(
-        learned: Learned, carry: Memory, obs: Any, key: jax.Array | None
-    ) -> tuple[jax.Array, Memory, dict[str, Any]]:
-        act_key, backup_key, dream_key = keys_of(key)
-        if learned.config.shield == "none":
-            return policy.act(learned, carry, obs, act_key)
+        learned: Learned, carry: Watched, obs: Any, key: jax.Array | None
+    ) -> tuple[jax.Array, Watched, dict[str, Any]]:
+        act_key, backup_key, dream_key = keys_of(key, carry.step)
         in_simulator = privileged(learned)
-        proposed, after, said = policy.act(learned, carry, obs.obs if in_simulator else obs, act_key)
+        memory = Memory(carry.latent, carry.action)
+        shown = obs.obs if in_simulator else obs
+        proposed, after, said = policy.act(learned, memory, shown, act_key)
+        if learned.config.shield == "none":
+            return proposed, Watched(*after, carry.step + 1), said
         if in_simulator:
             p = true_risk(env, learned, after.latent, proposed, obs, dream_key)
         else:
@@ -426,9 +442,9 @@ def shielded(env: Env, policy: Policy) -> Policy:
         overruled = overrules(p, learned.config)
         action = jnp.where(overruled, chosen(env, learned, "safe", after.latent, backup_key), proposed)
         said = {**said, "overruled": overruled, "risk": p}
-        return action, after._replace(action=action), said
+        return action, Watched(after.latent, action, carry.step + 1), said
 
-    return policy._replace(act=act, privileged=privileged)
+    return policy._replace(init=init, act=act, privileged=privileged)
 
 
 def make(env: Env, axis_name: str | None = None) -> Algorithm:

@@ -259,8 +259,8 @@ def moved_on(mean: jax.Array) -> jax.Array:
 
 
 def key_of_step(step: jax.Array) -> jax.Array:
-    """The draws of a plan whose actions are to be the same each time. They differ from step to step:
-    one that errs to the left does so once."""
+    """The draws of a plan or of a shield whose actions are to be the same each time. They differ from
+    step to step: one that errs to the left does so once."""
     return jax.random.fold_in(jax.random.key(0), step)
 
 

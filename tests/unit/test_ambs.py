@@ -997,6 +997,18 @@ def test_without_a_shield_the_same_policy_plays_the_same_episodes(sampled):
     assert len({*none.reward.sum(1).tolist()}) > 1
 
 
+def test_with_mean_actions_the_shield_draws_other_dreams_at_each_step(monkeypatch):
+    """And the same ones in the same step of each evaluation."""
+    algo, learned = newborn()
+    monkeypatch.setattr(ambs, "risk", lambda *args: jax.random.uniform(args[-1]))
+    obs = Corridor().reset(jax.random.key(0)).obs
+    act = jax.jit(lambda carry: algo.policy.act(learned, carry, obs, None), compiler_options=FAST)
+    begin = algo.policy.init(learned)
+    (_, after, first), (_, _, again) = act(begin), act(begin)
+    _, _, second = act(after)
+    assert first["risk"] == again["risk"] != second["risk"]
+
+
 def test_nothing_counts_after_the_end_of_an_episode():
     """It fails with its second step of five. Each step is a violation, and the shield overrules."""
     said = {"risk": jnp.float32(1), "overruled": jnp.bool_(True)}

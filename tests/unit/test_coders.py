@@ -17,8 +17,10 @@ from jaxsafe.nn.rssm import SIZES, Latent
 
 
 def test_squares_are_a_convolution_of_the_picture_and_of_one_twice_as_large():
-    def both(x, grows):
-        layer = coders.Convolution(4, grows)
+    """With more results than a square holds, and with fewer."""
+
+    def both(x, out, grows):
+        layer = coders.Convolution(out, grows)
         found: Any = layer.init_with_output(jax.random.key(1), x)
         squares, params = found
         of = x.repeat(2, 1).repeat(2, 2) if grows else x
@@ -26,10 +28,10 @@ def test_squares_are_a_convolution_of_the_picture_and_of_one_twice_as_large():
         conv = partial(jax.lax.conv_general_dilated, dimension_numbers=axes)
         return squares, conv(of, kernel, (1, 1), "SAME")
 
-    x = jax.random.normal(jax.random.key(0), (2, 6, 10, 3))
-    for grows, shape in ((False, (2, 3, 5, 2, 2, 4)), (True, (2, 6, 10, 2, 2, 4))):
-        squares, expected = jax.jit(lambda x, grows=grows: both(x, grows), compiler_options=FAST)(x)
-        assert squares.shape == shape
+    for grows, channels, out in ((False, 3, 4), (False, 3, 2), (True, 3, 4), (True, 9, 2)):
+        x = jax.random.normal(jax.random.key(0), (2, 6, 10, channels))
+        squares, expected = jax.jit(partial(both, out=out, grows=grows), compiler_options=FAST)(x)
+        assert squares.shape == ((2, 6, 10, 2, 2, out) if grows else (2, 3, 5, 2, 2, out))
         np.testing.assert_allclose(coders.picture_of(squares), expected, atol=1e-5)
 
 
