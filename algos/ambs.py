@@ -654,7 +654,6 @@ PENALTIES: dict[str, dict[str, Any]] = {
     "penl": PAPER | {"penalty": "penl", "penalty_coef": 1.0},
     "copt": PAPER | {"penalty": "copt", "penalty_coef": 1.0},
 }
-PIXELS: dict[str, Any] = PENALTIES["plpg"] | dreamer.PIXELS
 # for two cores, on which foresight takes too long
 CPU: dict[str, Any] = dreamer.CPU_FORESIGHT | {
     "overshoot": 0, "shield_rollouts": 32, "model_lr": 1e-3, "lr": 5e-4, "critic_lr": 1e-3,
@@ -665,7 +664,8 @@ ROWS = {
         AMBSConfig,
         make,
         "Dreamer with a shield that dreams ahead, and a safe policy",
-        PENALTIES | {"pixels": PIXELS, "cpu": CPU, "true_dynamics": {"shield": "true_dynamics"}},
+        PENALTIES
+        | {"pixels": dreamer.PIXELS, "cpu": CPU, "true_dynamics": {"shield": "true_dynamics"}},
         total_steps=1_000_000,
         holds="nothing",
         check=check,

@@ -311,14 +311,19 @@ PROPRIO: dict[str, Any] = PAPER | {
     "num_envs": 16, "learn_every": 1, "replay_ratio": 1024, "replay_size": 5_000_000, "size": "1m",
     "learning_starts": 1024, "model_lr": 4e-5, "lr": 4e-5, "critic_lr": 4e-5,
 }  # fmt: skip
-# sacktock/AMBS @5184901: its settings of Safety Gym's vectors, for env.wrap.action_repeat=2
+# sacktock/AMBS @5184901: its settings of Safety Gym's vectors, for env.wrap.action_repeat=2. For
+# pictures it has algo.encoder=cnn algo.size=medium
 AMBS: dict[str, Any] = PAPER | {
     "num_envs": 8, "horizon": 128, "learn_every": 2, "stagger": False, "replay_ratio": 64,
     "learning_starts": 1024, "model_lr": 1e-4, "lr": 3e-5, "critic_lr": 3e-5, "dyn_scale": 0.5,
     "replay_value": 0.0, "limit_ends": True, "actor_grad": "backprop", "size": "small",
 }  # fmt: skip
-# its `medium` networks, for pictures of 64 x 64 alone
-PIXELS: dict[str, Any] = {"encoder": "cnn", "size": "medium"}
+# for pictures of 64 x 64 alone, on a GPU: AMBS's `medium` networks and as many rows for each step
+PIXELS: dict[str, Any] = {
+    "encoder": "cnn", "size": "medium", "hidden_dtype": "bfloat16", "replay_ratio": 64,
+    "batch_size": 2048, "model_lr": 3e-4, "lr": 2e-4, "critic_lr": 3e-4, "imagine_steps": 10,
+    "overshoot": 8,
+}  # fmt: skip
 # PKU-Alignment/SafeDreamer @529221f: on vectors, for env.wrap.action_repeat=4, and 5 for osrp; the
 # size is the nearest to its own
 VECTORS: dict[str, Any] = PAPER | {
@@ -364,7 +369,7 @@ ROWS = {
         "Dreamer with an augmented Lagrangian on the cost of its dreams",
         {
             "ambs": LAGRANGIAN,
-            "pixels": LAGRANGIAN | PIXELS,
+            "pixels": PIXELS,
             "safe_dreamer": SAFE_DREAMER,
             "cpu": CPU_FORESIGHT,
         },
@@ -377,7 +382,7 @@ ROWS = {
         DreamerPIDConfig,
         partial(make, behaviour=billed, treatment=capped_pid),
         "Dreamer whose dreams pay for cost, at a price that a controller sets by real episodes",
-        {"cpu": CPU_PID},
+        {"cpu": CPU_PID, "pixels": PIXELS},
         total_steps=1_000_000,
         lever=LEVER | {"overshoot": 0, "dual_every": 256, "pid_kp": 0.05, "pid_ki": 0.02},
     ),

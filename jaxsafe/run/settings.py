@@ -430,9 +430,9 @@ def preset_for(env_name: str, row: Row, preset: str = "auto") -> str:
 
 
 def first_published(row: Row) -> str:
-    """The name of the setting that `preset=published` stands for; '' if none was published. `cpu` is
-    ours."""
-    return next((name for name in row.published if name != "cpu"), "")
+    """The name of the setting that `preset=published` stands for; '' if none was published. `cpu` and
+    `pixels` are ours."""
+    return next((name for name in row.published if name not in ("cpu", "pixels")), "")
 
 
 def presets(row: Row) -> dict[str, Mapping[str, Any]]:
