@@ -41,6 +41,7 @@ MOST_ROLLOUTS = 2**16  # beyond that 32 bits do not tell the exact bound
 PARTS = 10  # of [0, 1], by which the risk is compared with what came
 LEAST_SHARE = 1e-6  # more than float32 is off by, and less than one of the most rollouts
 ROUNDING = 1e-5  # a sum of costs that is above a bound by less is at the bound
+MOST_DISCOUNT = 0.9999  # with more, a step is hardly told from the next
 
 
 @config
@@ -413,7 +414,8 @@ def shielded(env: Env, policy: Policy) -> Policy:
         return learned.config.shield == "true_dynamics"
 
     def init(learned: Learned) -> Watched:
-        return Watched(*policy.init(learned), jnp.int32(0))
+        begin = policy.init(learned)
+        return Watched(begin.latent, begin.action, jnp.int32(0))
 
     def keys_of(
         key: jax.Array | None, step: jax.Array
@@ -434,7 +436,7 @@ def shielded(env: Env, policy: Policy) -> Policy:
         shown = obs.obs if in_simulator else obs
         proposed, after, said = policy.act(learned, memory, shown, act_key)
         if learned.config.shield == "none":
-            return proposed, Watched(*after, carry.step + 1), said
+            return proposed, Watched(after.latent, after.action, carry.step + 1), said
         if in_simulator:
             p = true_risk(env, learned, after.latent, proposed, obs, dream_key)
         else:
@@ -488,9 +490,10 @@ def check(cfg: Any, env: Env, data: Any = ()) -> None:
     check_cost_names("labels", cfg.labels, env)
     if cfg.shield == "none":
         return
-    if cfg.shield == "dreams" and cfg.verdict == "summed" and cfg.discount == 1:
+    if cfg.shield == "dreams" and cfg.verdict == "summed" and cfg.discount > MOST_DISCOUNT:
         raise ConfigError(
-            "discount=1: expected less, as verdict=summed tells steps within shield_horizon by it"
+            f"discount={float(cfg.discount):g}: expected at most {MOST_DISCOUNT:g}, as verdict=summed "
+            "tells steps within shield_horizon by it"
         )
     least, delta, confidence = overruled_from(cfg), float(cfg.delta), float(cfg.confidence)
     if least > cfg.shield_rollouts:

@@ -118,7 +118,7 @@ def test_the_exact_bound_allows_more_than_hoeffdings(rollouts, allowed):
       "delta=0.1: expected at least 0.11 with shield_rollouts=43, or shield_rollouts of at least 44,"),
      ({"rule": "binomial", "delta": 0.0}, "at least 0.009 with shield_rollouts=512, or the shield"),
      ({"rule": "binomial", "confidence": 1.0}, "confidence=1: expected less"),
-     ({"discount": 1.0}, "discount=1: expected less")],
+     ({"discount": 0.99999}, "discount=0.99999: expected at most 0.9999, as verdict=summed")],
 )  # fmt: skip
 def test_a_shield_that_always_or_never_acts_is_refused(options, told):
     ambs.check(CFG, Corridor())
