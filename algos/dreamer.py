@@ -318,7 +318,8 @@ AMBS: dict[str, Any] = PAPER | {
     "learning_starts": 1024, "model_lr": 1e-4, "lr": 3e-5, "critic_lr": 3e-5, "dyn_scale": 0.5,
     "replay_value": 0.0, "limit_ends": True, "actor_grad": "backprop", "size": "small",
 }  # fmt: skip
-# for pictures of 64 x 64 alone, on a GPU: AMBS's `medium` networks and as many rows for each step
+# for pictures of 64 x 64 alone, on a GPU and with env.wrap.action_repeat=2: AMBS's `medium` networks
+# and as many rows for each step
 PIXELS: dict[str, Any] = {
     "encoder": "cnn", "size": "medium", "hidden_dtype": "bfloat16", "replay_ratio": 64,
     "batch_size": 2048, "model_lr": 3e-4, "lr": 2e-4, "critic_lr": 3e-4, "imagine_steps": 10,

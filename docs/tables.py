@@ -115,7 +115,7 @@ PRESETS = {  # all but `fast`, which has no settings of its own
     "plpg": "AMBS's settings of vectors, and its penalty PLPG",
     "penl": "the same with PENL",
     "copt": "the same with COPT",
-    "pixels": "for pictures of 64 x 64 on a GPU: networks of 50 million weights in bfloat16",
+    "pixels": "for pictures of 64 x 64 on a GPU, with `env.wrap.action_repeat=2`: large networks",
     "true_dynamics": "a shield that looks ahead in the simulator",
     "safe_dreamer": "SafeDreamer's settings of vectors, with `env.wrap.action_repeat=4`",
     "paper": "the authors' settings",

@@ -32,7 +32,7 @@ class Row(NamedTuple):
     make: make(env, axis_name=None) -> Algorithm.
     summary: what it does, in a few words.
     published: setting -> options of the config that reproduce it; `preset=published` is the
-        first of them. `cpu`, which is ours, does not count.
+        first of them. `cpu` and `pixels`, which are ours, do not count.
         A class of the config may name in `SUITS` the tasks whose default one of them is, and in
         `ACTS_BY` settings that a trained policy acts by, of which it may have other values.
     omnisafe: OmniSafe's name for it, from which scripts/migrate.py translates; '' if it has none.

@@ -60,7 +60,7 @@ class WorldModelConfig(EncoderConfig, RoundConfig):
     # names.
     size: SizeName = "300k"
     # What hidden layers are computed in. bfloat16 has 8 bits, and is meant for large networks on a GPU:
-    # with those of `preset=pixels` it learns. What it gains there over float32 was not measured.
+    # those of 50 million weights learn with it. What it gains there over float32 was not measured.
     hidden_dtype: Literal["float32", "bfloat16"] = "float32"
     model_lr: Rate = 1e-3  # The model's learning rate, by LaProp. The authors have 4e-5.
     lr: Rate = 5e-4  # The actor's learning rate, by LaProp. The authors have 4e-5.

@@ -14,6 +14,7 @@ from jaxsafe.learn.dreaming import Judged, Range, Scene, no_range
 from jaxsafe.learn.treatments import CappedPID
 from jaxsafe.learn.world_model import CHANCE
 from jaxsafe.nn.two_hot import BINS
+from jaxsafe.run.settings import first_published
 
 CFG = dreamer.DreamerLagConfig(mu_least=1.0, cost_limit=3.0)
 BATCH: Any = SimpleNamespace(rows=SimpleNamespace(cost=jnp.full((3, 2), 2.0)))
@@ -110,6 +111,13 @@ def test_the_preset_of_ambs_has_the_numbers_of_its_lagrangian():
     numbers = (cfg.mu_growth, cfg.mu_least, cfg.cost_discount, cfg.td_lambda, cfg.replay_value)
     assert numbers == (1e-6, 1.0, 0.997, 0.95, 0.0)
     assert (cfg.actor_grad, cfg.limit_ends, cfg.overshoot) == ("backprop", True, 0)
+
+
+def test_the_preset_of_pictures_is_ours_and_so_never_the_published_one():
+    rows = {name: row for name, row in ALGOS.items() if "pixels" in row.published}
+    published = {name: first_published(row) for name, row in rows.items()}
+    assert published == {"ambs": "plpg", "dreamer_lag": "ambs", "dreamer_pid": ""}
+    assert all(row.config(**row.published["pixels"]).encoder == "cnn" for row in rows.values())
 
 
 def test_the_model_says_what_a_step_costs_or_with_ambs_preset_how_likely_it_costs():
