@@ -41,7 +41,7 @@ MOST_ROLLOUTS = 2**16  # beyond that 32 bits do not tell the exact bound
 PARTS = 10  # of [0, 1], by which the risk is compared with what came
 LEAST_SHARE = 1e-6  # more than float32 is off by, and less than one of the most rollouts
 ROUNDING = 1e-5  # a sum of costs that is above a bound by less is at the bound
-MOST_DISCOUNT = 0.9999  # with more, a step is hardly told from the next
+MOST_DISCOUNT = 0.9999  # steps differ by a share of 1e-4 then, ten times ROUNDING
 
 
 @config
@@ -370,7 +370,7 @@ def true_risk(
         action = chosen(env, learned, "actor", now.latent, act_key)
         action = jnp.where((h == 0) & cfg.verify_action, proposed, action)
         after = env.step(now.state, action)
-        memory = Memory(now.latent, action)
+        memory = Memory(now.latent, action, h)
         latent = seen(env, shielded_behaviour, learned, memory, after.obs, latent_key)
         hit = now.hit | (now.alive & violated(env, after, cfg))
         return Ahead(latent, after, hit, now.alive & ~after.ended), None
@@ -397,25 +397,12 @@ def overrules(p: jax.Array, cfg: Any) -> jax.Array:
     return (jnp.where(count < m, likely, 1.0) > cfg.confidence) & (cfg.delta <= 1)
 
 
-class Watched(NamedTuple):
-    """What the policy remembers: where it was, what it did there, and how many steps it has acted,
-    int []."""
-
-    latent: Latent
-    action: jax.Array
-    step: jax.Array
-
-
 def shielded(env: Env, policy: Policy) -> Policy:
     """`policy`, under a shield: where what it proposes looks unsafe, the safe policy acts instead. What
     is remembered is the action that is taken."""
 
     def privileged(learned: Learned) -> bool:
         return learned.config.shield == "true_dynamics"
-
-    def init(learned: Learned) -> Watched:
-        begin = policy.init(learned)
-        return Watched(begin.latent, begin.action, jnp.int32(0))
 
     def keys_of(
         key: jax.Array | None, step: jax.Array
@@ -428,15 +415,13 @@ def shielded(env: Env, policy: Policy) -> Policy:
         return act_key, backup_key, dream_key
 
     def act(
-        learned: Learned, carry: Watched, obs: Any, key: jax.Array | None
-    ) -> tuple[jax.Array, Watched, dict[str, Any]]:
+        learned: Learned, carry: Memory, obs: Any, key: jax.Array | None
+    ) -> tuple[jax.Array, Memory, dict[str, Any]]:
         act_key, backup_key, dream_key = keys_of(key, carry.step)
-        in_simulator = privileged(learned)
-        memory = Memory(carry.latent, carry.action)
-        shown = obs.obs if in_simulator else obs
-        proposed, after, said = policy.act(learned, memory, shown, act_key)
         if learned.config.shield == "none":
-            return proposed, Watched(after.latent, after.action, carry.step + 1), said
+            return policy.act(learned, carry, obs, act_key)
+        in_simulator = privileged(learned)
+        proposed, after, said = policy.act(learned, carry, obs.obs if in_simulator else obs, act_key)
         if in_simulator:
             p = true_risk(env, learned, after.latent, proposed, obs, dream_key)
         else:
@@ -444,9 +429,9 @@ def shielded(env: Env, policy: Policy) -> Policy:
         overruled = overrules(p, learned.config)
         action = jnp.where(overruled, chosen(env, learned, "safe", after.latent, backup_key), proposed)
         said = {**said, "overruled": overruled, "risk": p}
-        return action, Watched(after.latent, action, carry.step + 1), said
+        return action, after._replace(action=action), said
 
-    return policy._replace(init=init, act=act, privileged=privileged)
+    return policy._replace(act=act, privileged=privileged)
 
 
 def make(env: Env, axis_name: str | None = None) -> Algorithm:

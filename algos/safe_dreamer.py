@@ -169,15 +169,15 @@ def dream_planning_policy(env: Env, behaviour: Behaviour, treatment: Treatment) 
     acting = dreaming_policy(env, behaviour)
 
     def init(learned: Learned) -> PlanMemory:
-        latent, action = acting.init(learned)
+        begin = acting.init(learned)
         mean = jnp.zeros((learned.config.plan_steps, env.action_size))
-        return PlanMemory(latent, action, mean, jnp.int32(0))
+        return PlanMemory(begin.latent, begin.action, mean, begin.step)
 
     def act(
         learned: Learned, carry: PlanMemory, obs: PyTree, key: jax.Array | None
     ) -> tuple[jax.Array, PlanMemory, Metrics]:
         latent_key, plan_key = (None, key_of_step(carry.step)) if key is None else jax.random.split(key)
-        memory = Memory(carry.latent, carry.action)
+        memory = Memory(carry.latent, carry.action, carry.step)
         latent = seen(env, behaviour, learned, memory, obs, latent_key)
         score = partial(scores, env, behaviour, treatment, learned, latent)
         mean = cem(score, elites, carry.mean, (), plan_key, learned.config)

@@ -221,10 +221,12 @@ class Behaviour(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """What the policy remembers: where it was, and what it did there."""
+    """What the policy remembers: where it was, what it did there, and how many steps it has acted,
+    int []."""
 
     latent: Latent
     action: jax.Array
+    step: jax.Array
 
 
 def dreaming_policy(env: Env, behaviour: Behaviour) -> Policy:
@@ -233,7 +235,7 @@ def dreaming_policy(env: Env, behaviour: Behaviour) -> Policy:
     def init(learned: Learned) -> Memory:
         world = world_of(env, behaviour.all_heads(learned.config), learned.config)
         start: Any = world.apply({}, method="start")
-        return Memory(start, jnp.zeros(env.action_size))
+        return Memory(start, jnp.zeros(env.action_size), jnp.int32(0))
 
     def act(
         learned: Learned, carry: Memory, obs: Any, key: jax.Array | None
@@ -241,7 +243,7 @@ def dreaming_policy(env: Env, behaviour: Behaviour) -> Policy:
         latent_key, act_key = (None, None) if key is None else jax.random.split(key)
         latent = seen(env, behaviour, learned, carry, obs, latent_key)
         action = chosen(env, learned, "actor", latent, act_key)
-        return action, Memory(latent, action), {}
+        return action, Memory(latent, action, carry.step + 1), {}
 
     return Policy(init=init, act=act)
 
@@ -258,7 +260,7 @@ def seen(
     cfg, params = learned.config, learned.params["model"]
     world = world_of(env, behaviour.all_heads(cfg), cfg)
     embedded = world.apply(params, obs, method="embed")
-    latent: Any = world.apply(params, *carry, embedded, key, method="observe")
+    latent: Any = world.apply(params, carry.latent, carry.action, embedded, key, method="observe")
     return latent
 
 

@@ -188,8 +188,8 @@ def working_sizes(cfg: Any, pictures: list[str], envs: list[str]) -> list[str]:
 
     Gradient steps and acting take turns, so the larger one counts. With a world model its rows tell
     which: AMBS with its authors' settings and pictures, compiled for a CPU, takes half as much with
-    half the `batch_size`.
-    It takes the same with an eighth of the `shield_rollouts`, or with half as many environments.
+    half the `batch_size`. It takes the same with an eighth of the `shield_rollouts`, or with half as
+    many environments.
     """
     horizon = ["algo.horizon"] * isinstance(cfg, OnPolicyConfig)
     learning, acting = [*named(cfg, LEARNING), *horizon, *pictures], [*named(cfg, ACTING), *envs]

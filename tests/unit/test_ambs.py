@@ -963,7 +963,7 @@ def test_a_shield_in_the_simulator_of_a_real_task_leaves_the_world_as_it_was():
                 act_key, latent_key = jax.random.split(step_key)
                 doing = doing if h == 0 else act(here, act_key)
                 world = step_one(world, doing)
-                here = see(dreaming.Memory(here, doing), world.obs, latent_key)
+                here = see(dreaming.Memory(here, doing, jnp.int32(h)), world.obs, latent_key)
                 hit |= bool(world.cost > 0)
             unsafe.append(hit)
         assert said["risk"][t] == np.mean(unsafe)

@@ -39,9 +39,11 @@ def test_what_is_lived_seen_and_foreseen_belongs_to_its_step(monkeypatch):
 
     def act(learned, carry, obs, key):
         action = jax.random.uniform(key, (2,), minval=-1.0)
-        return action, Memory(Latent(obs, jnp.zeros(1)), action), {"risk": obs[0]}
+        return action, Memory(Latent(obs, jnp.zeros(1)), action, carry.step + 1), {"risk": obs[0]}
 
-    policy = Policy(lambda learned: Memory(Latent(jnp.zeros(4), jnp.zeros(1)), jnp.zeros(2)), act)
+    policy = Policy(
+        lambda learned: Memory(Latent(jnp.zeros(4), jnp.zeros(1)), jnp.zeros(2), jnp.int32(0)), act
+    )
     learned: Any = SimpleNamespace(config=dreamer.DreamerConfig(), params={"model": None})
     player = Player(policy, learned, env)
     monkeypatch.setattr(dreams, "world_of", lambda *_: Adding())
